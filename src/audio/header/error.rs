@@ -1,0 +1,123 @@
+//! What can be wrong with an audio file's header, each as one sentence.
+
+use symphonia::core::errors::Error;
+
+/// Why a file's audio header could not be read.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum AudioHeaderError {
+    /// No bytes at all.
+    #[error(
+        "audio file is empty (0 bytes); the download or copy that made it failed, fetch it again"
+    )]
+    Empty,
+    /// Bytes of another kind.
+    #[error("not audio: it starts with {found}; {way_out}")]
+    NotAudio { found: String, way_out: String },
+    /// An audio container that ends or breaks off within its header.
+    #[error(
+        "audio header cannot be read from {found_bytes} bytes that start with {found}: {reason}; \
+         the file may be cut short, copy or download it again"
+    )]
+    Unreadable { found_bytes: usize, found: String, reason: String },
+    /// A container without audio, such as a silent video.
+    #[error("{container} file holds no audio track; is it a video without sound?")]
+    NoAudioTrack { container: &'static str },
+    /// No sample rate, or one of 0 Hz.
+    #[error(
+        "{container} header gives its {codec} track a sample rate of 0 Hz; encode the file again"
+    )]
+    NoSampleRate { container: &'static str, codec: &'static str },
+    /// No channels.
+    #[error("{container} header gives its {codec} track 0 channels; encode the file again")]
+    NoChannels { container: &'static str, codec: &'static str },
+    /// A readable header before nothing.
+    #[error(
+        "{container} file has 0 samples of {codec} at {sample_rate_hz} Hz; \
+         the recording or conversion that made it failed, make it again"
+    )]
+    NoSamples { container: &'static str, codec: &'static str, sample_rate_hz: u32 },
+}
+
+impl AudioHeaderError {
+    /// The error's class in reports: `audio_header` or `empty_file`.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Empty => "empty_file",
+            _ => "audio_header",
+        }
+    }
+}
+
+/// Starts of files that are not audio; a search for markers within them could still find some.
+const OTHER_FORMATS: [(&[u8], &str); 13] = [
+    (b"\x89PNG", "it is a PNG picture"),
+    (b"\xff\xd8\xff", "it is a JPEG picture"),
+    (b"GIF8", "it is a GIF picture"),
+    (b"%PDF", "it is a PDF document"),
+    (b"PK\x03\x04", "it is a zip archive, unpack it first"),
+    (b"\x1f\x8b", "it is a gzip file, unpack it first"),
+    (b"\x93NUMPY", "it is a NumPy array"),
+    (b"\x1a\x45\xdf\xa3", "it is a Matroska or WebM file, convert it to FLAC or Ogg"),
+    (b"\x30\x26\xb2\x75", "it is a Windows Media file, convert it to FLAC or Ogg"),
+    (b"PAR1", "it is a Parquet table"),
+    (b"SQLite format", "it is a SQLite database"),
+    (b"\x7fELF", "it is a program"),
+    (b"glTF", "it is a glTF model"),
+];
+
+/// The error for bytes that are surely of another format.
+pub(super) fn other_format(bytes: &[u8]) -> Option<AudioHeaderError> {
+    let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes).trim_ascii_start();
+    let way_out = match text.first() {
+        Some(b'<') => "was an error page saved as audio?",
+        Some(b'{' | b'[') => "was an error message saved as audio?",
+        _ => OTHER_FORMATS.iter().find(|(start, _)| bytes.starts_with(start))?.1,
+    };
+    Some(AudioHeaderError::NotAudio { found: preview(text), way_out: way_out.to_owned() })
+}
+
+/// The error for bytes that symphonia refuses.
+pub(super) fn unreadable(bytes: &[u8], extension: &str, error: &Error) -> AudioHeaderError {
+    let known = [&b"RIFF"[..], b"FORM", b"fLaC", b"OggS", b"ID3"];
+    let mp4 = bytes.get(4..8) == Some(b"ftyp");
+    // The bare start of a marker is a header cut short, too.
+    let audio = mp4
+        || known.iter().any(|start| bytes.starts_with(start) || start.starts_with(bytes))
+        || matches!(bytes, [0xff, second, ..] if second & 0xe0 == 0xe0);
+    if audio {
+        let found = preview(bytes);
+        let reason = match error {
+            Error::IoError(_) => "it ends before a known codec's header does".to_owned(),
+            Error::DecodeError(reason) | Error::Unsupported(reason) => {
+                reason.trim_start_matches("core (probe): ").to_owned()
+            }
+            other => other.to_string(),
+        };
+        return AudioHeaderError::Unreadable { found_bytes: bytes.len(), found, reason };
+    }
+    unknown(bytes, extension)
+}
+
+/// The error for bytes that start like no audio format.
+pub(super) fn unknown(bytes: &[u8], extension: &str) -> AudioHeaderError {
+    let name = match extension {
+        "" => String::new(),
+        extension => format!(" under the name .{}", extension.chars().take(8).collect::<String>()),
+    };
+    let way_out =
+        format!("WAV, AIFF, FLAC, MP3, Ogg and MP4 are read, was another format saved{name}?");
+    AudioHeaderError::NotAudio { found: preview(bytes), way_out }
+}
+
+/// Quotes the text that the bytes start with, up to the first line's end, or lists the first bytes
+/// in hexadecimal when that text is shorter than a format's marker.
+fn preview(bytes: &[u8]) -> String {
+    let start = &bytes[..bytes.len().min(24)];
+    let n_text = start.iter().take_while(|byte| matches!(byte, b' '..=b'~' | b'\t')).count();
+    if n_text >= 4 || n_text == bytes.len() {
+        return format!("{:?}", String::from_utf8_lossy(&start[..n_text]));
+    }
+    let hex: Vec<String> = start.iter().take(8).map(|byte| format!("{byte:02x}")).collect();
+    format!("bytes {}", hex.join(" "))
+}

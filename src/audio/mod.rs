@@ -1,0 +1,3 @@
+//! Audio files: what their headers say.
+
+pub mod header;

@@ -1,0 +1,5 @@
+//! The front door: every stage as a subcommand.
+
+fn main() -> std::process::ExitCode {
+    motiongen::cli::front_door()
+}

@@ -1,0 +1,63 @@
+//! The one place that prints errors and chooses the exit code.
+
+use std::process::ExitCode;
+
+use crate::stages::Summary;
+
+/// Done, but some items failed; they are in the `failures` table.
+const SOME_FAILED: u8 = 1;
+/// Could not run.
+const COULD_NOT_RUN: u8 = 2;
+
+/// Prints what a stage did, or why it could not run, and returns the exit code.
+#[expect(clippy::print_stderr, reason = "this is where errors are printed")]
+pub fn report(outcome: anyhow::Result<Box<dyn Summary>>) -> ExitCode {
+    let mut summary = match outcome {
+        Ok(summary) => summary,
+        Err(error) => {
+            eprintln!("error: {}", chain(&error));
+            return ExitCode::from(COULD_NOT_RUN);
+        }
+    };
+    if let Err(error) = super::print(summary.as_mut()) {
+        eprintln!("error: could not write to standard output: {error}");
+        return ExitCode::from(COULD_NOT_RUN);
+    }
+    if summary.n_failed() > 0 { ExitCode::from(SOME_FAILED) } else { ExitCode::SUCCESS }
+}
+
+/// Prints clap's own words: help and version end well, a wrong flag could not run.
+pub fn usage(error: &clap::Error) -> ExitCode {
+    // The reader of a help text may be gone; there is nobody left to tell.
+    error.print().ok();
+    if error.use_stderr() { ExitCode::from(COULD_NOT_RUN) } else { ExitCode::SUCCESS }
+}
+
+/// Joins an error and its causes, leaving out a cause that its parent has quoted already.
+fn chain(error: &anyhow::Error) -> String {
+    let mut text = String::new();
+    for cause in error.chain() {
+        let cause = cause.to_string();
+        if text.contains(&cause) {
+            continue;
+        }
+        if !text.is_empty() {
+            text.push_str(": ");
+        }
+        text.push_str(&cause);
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cause_is_told_once() {
+        let error = anyhow::anyhow!("disk full").context("could not write x").context("stage");
+        assert_eq!(chain(&error), "stage: could not write x: disk full");
+        let quoted = anyhow::anyhow!("disk full").context("could not write x: disk full");
+        assert_eq!(chain(&quoted), "could not write x: disk full");
+    }
+}

@@ -1,0 +1,171 @@
+//! The command line: flags, configuration, logging, progress and exit codes.
+//!
+//! This is the only room that prints, and [`exit::report`] is the only place that prints an error
+//! and chooses the exit code.
+
+mod config;
+mod exit;
+mod log;
+mod progress;
+
+use std::ffi::OsString;
+use std::io::Write as _;
+use std::process::ExitCode;
+
+use clap::{Arg, ArgAction, ArgMatches, Command, FromArgMatches as _};
+
+use crate::stages::ingest::Ingest;
+#[cfg(feature = "query")]
+use crate::stages::query::Query;
+use crate::stages::{Stage, Summary};
+use progress::Bars;
+
+/// A stage with its types taken away, for the front door.
+struct Entry {
+    name: &'static str,
+    about: &'static str,
+    command: fn() -> Command,
+    run: fn(&ArgMatches) -> anyhow::Result<Box<dyn Summary>>,
+}
+
+impl Entry {
+    fn of<S: Stage>() -> Self {
+        Self { name: S::NAME, about: S::ABOUT, command: command::<S>, run: run_stage::<S> }
+    }
+}
+
+/// Returns every stage, in the order in which a pipeline runs them.
+fn entries() -> Vec<Entry> {
+    vec![
+        Entry::of::<Ingest>(),
+        #[cfg(feature = "query")]
+        Entry::of::<Query>(),
+    ]
+}
+
+/// Runs one stage's own executable, `motiongen-<stage>`.
+pub fn stage<S: Stage>() -> ExitCode {
+    let command = command::<S>().name(format!("motiongen-{}", S::NAME)).version(VERSION);
+    let arguments: Vec<OsString> = std::env::args_os().collect();
+    let command = match config::apply(command, &[], &arguments) {
+        Ok(command) => command,
+        Err(e) => return exit::report(Err(e)),
+    };
+    let matches = match command.try_get_matches_from(&arguments) {
+        Ok(matches) => matches,
+        Err(e) => return exit::usage(&e),
+    };
+    exit::report(run_stage::<S>(&matches))
+}
+
+/// Runs `motiongen`, which has every stage as a subcommand.
+pub fn front_door() -> ExitCode {
+    let entries = entries();
+    let mut command = Command::new("motiongen")
+        .version(VERSION)
+        .about("Turns a music library into motion, stage by stage.")
+        .subcommand_value_name("STAGE")
+        .subcommand_help_heading("Stages, in the order of a pipeline");
+    for entry in &entries {
+        command = command.subcommand((entry.command)());
+    }
+    let arguments: Vec<OsString> = std::env::args_os().collect();
+    if arguments.len() < 2 {
+        return exit::report(list_stages(&entries));
+    }
+    let names: Vec<_> = entries.iter().map(|e| e.name).collect();
+    let command = match config::apply(command, &names, &arguments) {
+        Ok(command) => command,
+        Err(e) => return exit::report(Err(e)),
+    };
+    let matches = match command.try_get_matches_from(&arguments) {
+        Ok(matches) => matches,
+        Err(e) => return exit::usage(&e),
+    };
+    let chosen = matches.subcommand().and_then(|(name, matches)| {
+        entries.iter().find(|entry| entry.name == name).map(|entry| (entry, matches))
+    });
+    match chosen {
+        Some((entry, matches)) => exit::report((entry.run)(matches)),
+        None => exit::report(list_stages(&entries)),
+    }
+}
+
+const VERSION: &str = env!("CARGO_PKG_VERSION");
+
+/// Returns a stage's command: its parameters and the flags that every stage has.
+fn command<S: Stage>() -> Command {
+    use clap::Args as _;
+    let contract =
+        format!("Reads: {}\nWrites: {}\n\n{AFTER}", S::CONTRACT.reads, S::CONTRACT.writes);
+    // The parameters' own doc comment would become the text about the stage, so that comes after.
+    let command = S::Params::augment_args(Command::new(S::NAME))
+        .about(S::ABOUT)
+        .long_about(None::<String>)
+        .after_help(contract)
+        .arg(
+            Arg::new(config::FLAG)
+                .long(config::FLAG)
+                .value_name("FILE")
+                .help(
+                    "Take defaults from this TOML file: the keys above, top level or in a table \
+                       named like the stage",
+                )
+                .help_heading("General"),
+        )
+        .arg(
+            Arg::new(log::VERBOSE)
+                .long(log::VERBOSE)
+                .short('v')
+                .action(ArgAction::Count)
+                .help("Log more: -v progress of the work, -vv details, -vvv requests")
+                .help_heading("General"),
+        )
+        .arg(
+            Arg::new(log::QUIET)
+                .long(log::QUIET)
+                .short('q')
+                .action(ArgAction::SetTrue)
+                .help("Show neither progress nor warnings")
+                .help_heading("General"),
+        );
+    config::with_environment(command)
+}
+
+const AFTER: &str = "A value comes from the flag, else from the environment, else from the --config \
+                     file, else it is the default shown.\nExit codes: 0 done, 1 done but some items \
+                     failed (see the failures table), 2 could not run.";
+
+fn run_stage<S: Stage>(matches: &ArgMatches) -> anyhow::Result<Box<dyn Summary>> {
+    let quiet = matches.get_flag(log::QUIET);
+    let bars = Bars::new(quiet);
+    log::start(matches.get_count(log::VERBOSE), quiet, bars.clone());
+    let params = S::Params::from_arg_matches(matches)?;
+    S::run(params, &bars)
+}
+
+fn list_stages(entries: &[Entry]) -> anyhow::Result<Box<dyn Summary>> {
+    struct Stages(Vec<(&'static str, &'static str)>);
+    impl Summary for Stages {
+        fn write(&mut self, out: &mut dyn std::io::Write) -> std::io::Result<()> {
+            writeln!(out, "motiongen {VERSION}: the stages, in the order of a pipeline\n")?;
+            for (name, about) in &self.0 {
+                writeln!(out, "  {name:<10} {about}")?;
+            }
+            writeln!(out, "\nmotiongen STAGE --help tells the rest.")
+        }
+        fn n_failed(&self) -> u64 {
+            0
+        }
+    }
+    Ok(Box::new(Stages(entries.iter().map(|e| (e.name, e.about)).collect())))
+}
+
+/// Flushes what a stage has to say; a reader that went away is not an error.
+fn print(summary: &mut dyn Summary) -> std::io::Result<()> {
+    let mut out = std::io::BufWriter::new(std::io::stdout().lock());
+    match summary.write(&mut out).and_then(|()| out.flush()) {
+        Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
+        written => written,
+    }
+}

@@ -1,0 +1,156 @@
+//! Progress: a bar with rate and ETA on a terminal, a plain line every 10 s elsewhere.
+
+use std::io::IsTerminal as _;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+use crate::stages::Progress;
+
+/// Time between plain lines.
+const LINE_EVERY: Duration = Duration::from_secs(10);
+
+/// Draws the progress of a stage on standard error.
+#[derive(Clone)]
+pub struct Bars {
+    mode: Mode,
+    state: Arc<Mutex<State>>,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Mode {
+    Silent,
+    Bar,
+    Lines,
+}
+
+#[derive(Default)]
+struct State {
+    bar: Option<ProgressBar>,
+    count: Option<Count>,
+}
+
+struct Count {
+    what: String,
+    unit: String,
+    done: u64,
+    total: u64,
+    started: Instant,
+    last_line: Instant,
+}
+
+impl Bars {
+    pub fn new(quiet: bool) -> Self {
+        let mode = match (quiet, std::io::stderr().is_terminal()) {
+            (true, _) => Mode::Silent,
+            (false, true) => Mode::Bar,
+            (false, false) => Mode::Lines,
+        };
+        Self { mode, state: Arc::default() }
+    }
+
+    /// Runs `write` while no bar is on the screen.
+    pub fn suspend<T>(&self, write: impl FnOnce() -> T) -> T {
+        let bar = self.lock().bar.clone();
+        match bar {
+            Some(bar) => bar.suspend(write),
+            None => write(),
+        }
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Progress for Bars {
+    fn start(&self, what: &str, unit: &str, total: u64) {
+        let mut state = self.lock();
+        match self.mode {
+            Mode::Silent => {}
+            Mode::Bar => {
+                let template = format!(
+                    "{what} {{wide_bar}} {{human_pos}}/{{human_len}} {unit} {{per_sec}} ETA {{eta}}"
+                );
+                let style = ProgressStyle::with_template(&template)
+                    .unwrap_or_else(|_| ProgressStyle::default_bar());
+                state.bar = Some(ProgressBar::new(total).with_style(style));
+            }
+            Mode::Lines => {
+                let now = Instant::now();
+                state.count = Some(Count {
+                    what: what.to_owned(),
+                    unit: unit.to_owned(),
+                    done: 0,
+                    total,
+                    started: now,
+                    last_line: now,
+                });
+            }
+        }
+    }
+
+    #[expect(clippy::print_stderr, reason = "progress is for people, data for standard output")]
+    fn advance(&self, n: u64) {
+        let mut state = self.lock();
+        if let Some(bar) = &state.bar {
+            bar.inc(n);
+        }
+        if let Some(count) = &mut state.count {
+            count.done += n;
+            if count.last_line.elapsed() >= LINE_EVERY {
+                count.last_line = Instant::now();
+                eprintln!("{}", count.line(count.started.elapsed()));
+            }
+        }
+    }
+
+    fn finish(&self) {
+        let mut state = self.lock();
+        if let Some(bar) = state.bar.take() {
+            bar.finish_and_clear();
+        }
+        state.count = None;
+    }
+}
+
+impl Count {
+    fn line(&self, elapsed: Duration) -> String {
+        let Count { what, unit, done, total, .. } = self;
+        let rate = *done as f64 / elapsed.as_secs_f64().max(1e-9);
+        let eta_s = total.saturating_sub(*done) as f64 / rate.max(1e-9);
+        format!("{what}: {done} of {total} {unit}, {rate:.1}/s, ETA {}", duration(eta_s))
+    }
+}
+
+fn duration(seconds: f64) -> String {
+    let s = seconds.round() as u64;
+    match (s / 3600, s / 60 % 60, s % 60) {
+        (0, 0, s) => format!("{s} s"),
+        (0, m, s) => format!("{m} min {s} s"),
+        (h, m, _) => format!("{h} h {m} min"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_tells_count_rate_and_eta() {
+        let now = Instant::now();
+        let count = Count {
+            what: "ingest".into(),
+            unit: "phrases".into(),
+            done: 300,
+            total: 1200,
+            started: now,
+            last_line: now,
+        };
+        let line = count.line(Duration::from_secs(20));
+        assert_eq!(line, "ingest: 300 of 1200 phrases, 15.0/s, ETA 1 min 0 s");
+        assert_eq!(duration(7384.0), "2 h 3 min");
+        assert_eq!(duration(9.6), "10 s");
+    }
+}

@@ -1,0 +1,10 @@
+//! motiongen turns a music library into motion.
+//!
+//! The rooms and what they may use are in `docs/architecture.md`; a test keeps them so.
+
+pub mod audio;
+pub mod cli;
+pub mod motion;
+pub mod stages;
+pub mod store;
+pub mod units;

@@ -1,0 +1,32 @@
+//! Motion: the 25-channel root trajectory at [`crate::units::FPS`] and its making from captures.
+//!
+//! Conventions, the same in every file of this room:
+//!
+//! * metres, seconds, radians; +Y up, +Z forward, +X right, right-handed;
+//! * quaternions are Hamilton `(w, x, y, z)`, unit, and rotate body to world; their sign is
+//!   continuous in time (`q[t] · q[t+1] >= 0`), not fixed to `w >= 0`;
+//! * derivatives are forward differences: `v[t] = (p[t+1] - p[t]) FPS`,
+//!   `a[t] = (v[t+1] - v[t]) FPS`, and angular velocity is in world axes,
+//!   `ω[t] = 2 log(q[t+1] q[t]*) FPS`;
+//! * the phase is the bar phase in `[0, 1)`, 0 on the downbeat.
+//!
+//! Everything here is pure: text and numbers in, numbers or a named error out.
+
+pub mod bvh;
+pub mod capture;
+pub mod channels;
+pub mod lowpass;
+pub mod npy;
+pub mod npz;
+pub mod phase;
+pub mod quantile;
+pub mod quaternion;
+pub mod spline;
+pub mod style;
+pub mod trajectory;
+
+pub use bvh::{Bvh, BvhError};
+pub use capture::{CaptureError, convert_bvh};
+pub use channels::{CHANNEL_NAMES, Channel, MOTION_DIM, channel_unit};
+pub use phase::{Beats, BeatsError, BeatsPerBarSource, bar_phase};
+pub use trajectory::{ChannelLimits, Trajectory, TrajectoryError};

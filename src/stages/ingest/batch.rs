@@ -1,0 +1,312 @@
+//! Batches: phrases that are read, checked and committed together.
+//!
+//! A batch is a range of the phrases' stable hash, so what is in it depends on the source alone:
+//! whoever does it, whenever, after however many kills, writes the same bytes under the same name.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
+
+use super::failure::{Failure, FailureKind};
+use super::layout::{Planned, Role};
+use super::phrase::{Files, Phrase, Rules};
+use super::{Ingest, Refused, Tally};
+use crate::stages::{Progress, Stage as _};
+use crate::store::tables::{self, FailureRow, PhraseRow};
+use crate::store::{
+    Commit, Content, Item, Ledger, Location, Row as _, Source, SourceFile, StoreError, TimestampUs,
+    batch_of, sha256, split_of,
+};
+
+/// Bytes of source files that one batch holds at most, so that a kill costs little of a slow source.
+const MAX_BATCH_BYTES: u64 = 256 << 20;
+
+/// Everything that the batches of a run share.
+pub struct Job<'a> {
+    pub source: &'a Source,
+    pub store: &'a Location,
+    pub ledger: &'a Ledger,
+    pub rules: &'a Rules,
+    pub params_hash: &'a str,
+    pub progress: &'a dyn Progress,
+    /// Write phrases even when nothing about them changed.
+    pub force: bool,
+}
+
+/// Groups phrases into batches, in an order and cut that depend on the source alone.
+///
+/// `all` is the whole plan (it sets the number of batches), `todo` the phrases to do now.
+pub fn batches<'p>(
+    all: &[Planned],
+    todo: Vec<&'p Planned>,
+    batch_phrases: usize,
+) -> Vec<Vec<&'p Planned>> {
+    let n_bytes: u64 = all.iter().flat_map(|p| &p.files).map(|(_, file)| file.size_bytes).sum();
+    let by_count = all.len().div_ceil(batch_phrases.max(1)) as u64;
+    let by_bytes = n_bytes.div_ceil(MAX_BATCH_BYTES);
+    // A power of two, so that shards in powers of two hold whole batches.
+    let n_batches = by_count.max(by_bytes).max(1).next_power_of_two();
+    let mut batches: Vec<Vec<&Planned>> = vec![Vec::new(); n_batches as usize];
+    for phrase in todo {
+        batches[batch_of(&phrase.id, n_batches) as usize].push(phrase);
+    }
+    batches.retain(|batch| !batch.is_empty());
+    batches
+}
+
+impl Job<'_> {
+    /// Does all batches on `n_workers` threads.
+    ///
+    /// # Errors
+    /// The first [`StoreError`] of the store itself; what was committed stays.
+    pub fn run(&self, batches: &[Vec<&Planned>], n_workers: usize) -> Result<Tally, StoreError> {
+        let next = AtomicUsize::new(0);
+        let stop = AtomicBool::new(false);
+        let total: Mutex<Result<Tally, StoreError>> = Mutex::new(Ok(Tally::default()));
+        std::thread::scope(|scope| {
+            for _ in 0..n_workers.clamp(1, batches.len().max(1)) {
+                scope.spawn(|| {
+                    while !stop.load(Ordering::Relaxed) {
+                        let Some(batch) = batches.get(next.fetch_add(1, Ordering::Relaxed)) else {
+                            return;
+                        };
+                        let done = self.batch(batch);
+                        let mut total = total.lock().unwrap_or_else(PoisonError::into_inner);
+                        match (done, total.as_mut()) {
+                            (Ok(tally), Ok(sum)) => sum.add(tally),
+                            (Err(e), Ok(_)) => {
+                                stop.store(true, Ordering::Relaxed);
+                                *total = Err(e);
+                            }
+                            (_, Err(_)) => {}
+                        }
+                    }
+                });
+            }
+        });
+        total.into_inner().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn batch(&self, batch: &[&Planned]) -> Result<Tally, StoreError> {
+        let mut tally = Tally::default();
+        let mut commit =
+            Commit::new(self.store, Ingest::NAME, self.params_hash, self.source.location().url());
+        let mut rows = Vec::new();
+        let mut failures = Vec::new();
+        let readable = batch.iter().filter(|p| p.problem.is_none());
+        let files = readable.flat_map(|p| p.files.iter().map(|(_, f)| f.clone())).collect();
+        let mut contents = self.source.read_in_order(files);
+        for planned in batch {
+            let read = planned.problem.is_none();
+            // The read-ahead budget of these files is given back when the phrase is done.
+            let (files, _budget): (Vec<_>, Vec<_>) = planned
+                .files
+                .iter()
+                .filter(|_| read)
+                .map(|(role, file)| {
+                    let (content, permit) = contents.next().unwrap_or_else(|| (gone(file), None));
+                    ((*role, file.clone(), content), permit)
+                })
+                .unzip();
+            let (input_hash, outcome) = self.phrase(planned, files);
+            self.settle(planned, input_hash, outcome, &mut commit, &mut tally, |outcome| {
+                match outcome {
+                    Ok(phrase) => rows.push(phrase),
+                    Err(failure) => failures.push(failure),
+                }
+            })?;
+            self.progress.advance(1);
+        }
+        if !rows.is_empty() {
+            commit.part(PhraseRow::schema().name, PhraseRow::schema)?.write_rows(&rows)?;
+        }
+        if !failures.is_empty() {
+            commit.part(FailureRow::schema().name, FailureRow::schema)?.write_rows(&failures)?;
+        }
+        if !commit.is_empty() {
+            commit.publish()?;
+        }
+        Ok(tally)
+    }
+
+    /// Reads and checks one phrase; a defect of ours costs the phrase, not the job.
+    fn phrase(
+        &self,
+        planned: &Planned,
+        files: Vec<(Role, SourceFile, Result<Content, StoreError>)>,
+    ) -> (String, Result<Phrase, Failure>) {
+        let without_content = |failure: &Failure| sha256(failure.message.as_bytes());
+        if let Some(problem) = &planned.problem {
+            return (without_content(problem), Err(problem.clone()));
+        }
+        let files = match Files::take(files) {
+            Ok(files) => files,
+            Err(failure) => return (without_content(&failure), Err(failure)),
+        };
+        let input_hash = files.content_hash().to_owned();
+        let checked = catch_unwind(AssertUnwindSafe(|| files.check(self.rules)));
+        let outcome = checked.unwrap_or_else(|panic| {
+            let said = panic
+                .downcast_ref::<String>()
+                .map(String::as_str)
+                .or_else(|| panic.downcast_ref::<&str>().copied())
+                .unwrap_or("no message");
+            let path = planned.files.first().map_or(planned.id.as_str(), |(_, file)| &file.path);
+            let message = format!(
+                "the program broke on this phrase ({said}); please report it with the file"
+            );
+            Err(Failure::new(FailureKind::Panic, path, message))
+        });
+        (input_hash, outcome)
+    }
+
+    /// Writes an outcome into the commit unless the store has it already.
+    fn settle(
+        &self,
+        planned: &Planned,
+        input_hash: String,
+        mut outcome: Result<Phrase, Failure>,
+        commit: &mut Commit<'_>,
+        tally: &mut Tally,
+        mut add: impl FnMut(Result<PhraseRow, FailureRow>),
+    ) -> Result<(), StoreError> {
+        let mut id = planned.id.clone();
+        let contested = self.contested(&id);
+        if let Some(failure) = self.claimed_by_another_source(planned, &input_hash) {
+            id.clone_from(&contested);
+            outcome = Err(failure);
+        }
+        let failure = outcome.as_ref().err().map(failure_digest);
+        let unchanged = !self.force
+            && self.ledger.get(&id).is_some_and(|known| {
+                known.params_hash == self.params_hash
+                    && known.item.input_hash == input_hash
+                    && known.item.failure == failure
+            });
+        match &outcome {
+            Ok(_) if unchanged => tally.n_unchanged += 1,
+            Ok(phrase) => {
+                tally.n_done += 1;
+                tally.n_frames += phrase.motion.as_ref().map_or(0, |m| m.n_frames() as u64);
+                tally.duration_s += phrase.duration_s();
+            }
+            Err(failure) => {
+                tally.failed.push(Refused { id: id.clone(), failure: failure.clone() });
+            }
+        }
+        if unchanged {
+            return Ok(());
+        }
+        if let Ok(Phrase { motion: Some(motion), .. }) = &outcome {
+            let part = commit.part(tables::MOTION, tables::motion)?;
+            part.write_frames(&id, motion.view())?;
+        }
+        let fingerprint = fingerprint(planned);
+        if id != contested && self.ledger.get(&contested).is_some() {
+            // The claim of the other source is gone, and with it the failure.
+            let (fingerprint, input_hash) = (fingerprint.clone(), input_hash.clone());
+            let item = Item { id: contested, fingerprint, input_hash, failure: None };
+            commit.settle(item, self.ledger);
+        }
+        add(match outcome {
+            Ok(phrase) => Ok(self.phrase_row(planned, phrase)),
+            Err(failure) => Err(self.failure_row(&id, failure)),
+        });
+        commit.settle(Item { id, fingerprint, input_hash, failure }, self.ledger);
+        Ok(())
+    }
+
+    /// Returns the name under which a phrase fails whose own name belongs to another source.
+    fn contested(&self, id: &str) -> String {
+        format!("{id} @ {}", self.source.location().url())
+    }
+
+    /// Refuses a phrase whose name the store has from elsewhere with other content.
+    fn claimed_by_another_source(&self, planned: &Planned, input_hash: &str) -> Option<Failure> {
+        let known = self.ledger.get(&planned.id)?;
+        let here = self.source.location().url();
+        if self.force
+            || known.origin == here
+            || known.item.failure.is_some()
+            || known.item.input_hash == input_hash
+        {
+            return None;
+        }
+        let message = format!(
+            "phrase {} is in the store already, from {}, with other content; rename it, ingest it \
+             into another store, or replace the other one with --force",
+            planned.id, known.origin
+        );
+        let path = planned.files.first().map_or(planned.id.as_str(), |(_, file)| &file.path);
+        Some(Failure::new(FailureKind::DuplicateId, path, message))
+    }
+
+    fn phrase_row(&self, planned: &Planned, phrase: Phrase) -> PhraseRow {
+        let location = self.source.location();
+        let file = |name: &str| planned.files.iter().find(|(role, _)| role.name() == name);
+        let url = |name| file(name).map(|(_, f)| location.url_of(&f.path));
+        let bytes = |name| file(name).map(|(_, f)| f.size_bytes as i64);
+        let duration_s = phrase.duration_s();
+        let tempo = phrase.tempo;
+        let beats_per_bar = tempo.and_then(|t| t.beats_per_bar);
+        PhraseRow {
+            phrase_id: planned.id.clone(),
+            source: location.url().to_owned(),
+            motion_url: url("motion"),
+            features_url: url("features"),
+            audio_url: url("audio"),
+            beats_url: url("beats"),
+            motion_bytes: bytes("motion"),
+            features_bytes: bytes("features"),
+            audio_bytes: bytes("audio"),
+            beats_bytes: bytes("beats"),
+            content_hash: phrase.content_hash,
+            has_motion: phrase.motion.is_some(),
+            has_features: phrase.n_feature_frames.is_some(),
+            has_audio: phrase.audio.is_some(),
+            has_beats: phrase.has_beats,
+            motion_format: phrase.motion_format.map(str::to_owned),
+            audio_codec: phrase.audio.as_ref().map(|a| a.codec.clone()),
+            sample_rate_hz: phrase.audio.as_ref().map(|a| a.sample_rate_hz as i32),
+            n_channels: phrase.audio.as_ref().map(|a| i32::from(a.n_channels)),
+            duration_s,
+            n_frames: phrase.motion.as_ref().map(|m| m.n_frames() as i64),
+            n_feature_frames: phrase.n_feature_frames.map(|n| n as i64),
+            split: split_of(&planned.id).to_owned(),
+            tempo_bpm: tempo.map(|t| t.bpm),
+            tempo_source: tempo.map(|t| t.source.to_owned()),
+            beats_per_bar: beats_per_bar.map(|(n, _)| n as i32),
+            beats_per_bar_source: beats_per_bar.map(|(_, source)| source.to_owned()),
+        }
+    }
+
+    fn failure_row(&self, id: &str, failure: Failure) -> FailureRow {
+        FailureRow {
+            stage: Ingest::NAME.to_owned(),
+            phrase_id: id.to_owned(),
+            source: self.source.location().url_of(&failure.path),
+            kind: failure.kind.name().to_owned(),
+            message: failure.message,
+            time: TimestampUs::now(),
+        }
+    }
+}
+
+/// Returns what the storage says of a phrase's files, without reading them.
+pub fn fingerprint(planned: &Planned) -> String {
+    let lines: String = planned
+        .files
+        .iter()
+        .map(|(role, file)| format!("{} {} {}\n", role.name(), file.path, file.fingerprint))
+        .collect();
+    let problem = planned.problem.as_ref().map_or("", |p| p.message.as_str());
+    sha256(format!("{lines}{problem}").as_bytes())[..32].to_owned()
+}
+
+fn failure_digest(failure: &Failure) -> String {
+    sha256(format!("{}\n{}", failure.kind.name(), failure.message).as_bytes())[..32].to_owned()
+}
+
+fn gone(file: &SourceFile) -> Result<Content, StoreError> {
+    Err(StoreError::NotFound { place: file.path.clone(), hint: "" })
+}

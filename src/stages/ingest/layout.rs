@@ -1,0 +1,313 @@
+//! Which files make which phrase: a listing becomes a plan, without reading a file.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use crate::store::{Listing, SourceFile, SourceProblem, SourceProblemKind};
+
+use super::failure::{Failure, FailureKind};
+
+/// File name endings of audio.
+const AUDIO_EXTENSIONS: [&str; 8] = ["wav", "flac", "mp3", "ogg", "opus", "m4a", "aif", "aiff"];
+const BEATS_SUFFIX: &str = ".beats.txt";
+
+/// How a source is organised.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Layout {
+    /// Phrases if the source has `motion/` or `audio_features/`, or nothing but `audio/` and
+    /// `beats/`; else a music library.
+    Auto,
+    /// `motion/ID/trajectory.npy` or `motion.bvh`, `audio_features/ID/features.npz`,
+    /// `audio/ID.wav`, `beats/ID.beats.txt`.
+    Phrases,
+    /// Any tree of audio files; a phrase's id is its relative path, extension included.
+    Library,
+}
+
+/// What a file is to its phrase.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Role {
+    Audio,
+    Beats,
+    Features,
+    MotionBvh,
+    MotionNpy,
+}
+
+impl Role {
+    /// Returns the role's name, which digests and messages use.
+    pub fn name(self) -> &'static str {
+        match self {
+            Role::Audio => "audio",
+            Role::Beats => "beats",
+            Role::Features => "features",
+            Role::MotionBvh | Role::MotionNpy => "motion",
+        }
+    }
+}
+
+/// A phrase to ingest, or the reason why it cannot even be tried.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Planned {
+    pub id: String,
+    /// The phrase's files, sorted by role.
+    pub files: Vec<(Role, SourceFile)>,
+    pub problem: Option<Failure>,
+}
+
+/// Everything that a source offers, phrases sorted by id.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Plan {
+    pub phrases: Vec<Planned>,
+    /// Files that belong to no phrase.
+    pub ignored: Vec<String>,
+}
+
+/// Assigns every file of a listing to a phrase, to the ignored files, or to a failure.
+pub fn plan(listing: Listing, layout: Layout) -> Plan {
+    let phrases = match layout {
+        Layout::Phrases => true,
+        Layout::Library => false,
+        Layout::Auto => looks_like_phrases(&listing),
+    };
+    let mut drafts = Drafts::default();
+    if phrases {
+        phrase_layout(listing, &mut drafts);
+    } else {
+        library_layout(listing, &mut drafts);
+    }
+    drafts.finish()
+}
+
+fn looks_like_phrases(listing: &Listing) -> bool {
+    let paths = || {
+        let files = listing.files.iter().map(|f| f.path.as_str());
+        let problems = listing.problems.iter().map(|p| p.path.as_str());
+        files.chain(problems).chain(listing.folders.iter().map(String::as_str))
+    };
+    let below = |path: &str, folder: &str| {
+        path.strip_prefix(folder).is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
+    };
+    let has = |folder| paths().any(|path| below(path, folder));
+    let known = |path: &str| extension(path).is_some_and(is_audio) || path.ends_with(BEATS_SUFFIX);
+    has("motion")
+        || has("audio_features")
+        || has("audio")
+            && paths()
+                .filter(|path| known(path))
+                .all(|path| below(path, "audio") || below(path, "beats"))
+}
+
+fn phrase_layout(listing: Listing, drafts: &mut Drafts) {
+    // Folders of `motion/` and `audio_features/` that must hold a phrase's file.
+    let mut folders: BTreeMap<String, &'static str> = BTreeMap::new();
+    let mut filled: BTreeSet<String> = BTreeSet::new();
+    for folder in &listing.folders {
+        let is_parent = listing.folders.iter().any(|f| is_below(f, folder));
+        if let (Some((_, expects)), false) = (phrase_folder(folder), is_parent) {
+            folders.insert(folder.clone(), expects);
+        }
+    }
+    for folder in listing.folders {
+        if let Some((id, _)) = phrase_slot(&folder) {
+            folders.retain(|f, _| *f != folder);
+            if let Some((parent, _)) = folder.rsplit_once('/') {
+                filled.insert(parent.to_owned());
+            }
+            drafts.fail(id, not_a_file(&folder));
+        }
+    }
+    for file in listing.files {
+        if let Some((parent, _)) = file.path.rsplit_once('/') {
+            if let Some((_, expects)) = phrase_folder(parent) {
+                folders.insert(parent.to_owned(), expects);
+            }
+        }
+        match phrase_slot(&file.path) {
+            Some((id, role)) => {
+                if let Some((parent, _)) = file.path.rsplit_once('/') {
+                    filled.insert(parent.to_owned());
+                }
+                drafts.add(id, role, file);
+            }
+            None => drafts.ignored.push(file.path),
+        }
+    }
+    for problem in listing.problems {
+        if let Some((parent, _)) = problem.path.rsplit_once('/') {
+            filled.insert(parent.to_owned());
+        }
+        filled.insert(problem.path.clone());
+        let id = phrase_slot(&problem.path).map(|(id, _)| id);
+        let id = id.or_else(|| phrase_folder(&problem.path).map(|(id, _)| id));
+        drafts.problem(id, problem);
+    }
+    for (folder, expects) in folders {
+        if let (Some((id, _)), false) = (phrase_folder(&folder), filled.contains(&folder)) {
+            let message =
+                format!("folder {folder} holds no {expects}; add it or remove the folder");
+            drafts.fail(id, Failure::new(FailureKind::Layout, &folder, message));
+        }
+    }
+}
+
+/// Returns the phrase and role that a path of the phrase layout stands for.
+fn phrase_slot(path: &str) -> Option<(String, Role)> {
+    let (top, rest) = path.split_once('/')?;
+    let in_folder = |file: &str| rest.strip_suffix(file)?.strip_suffix('/').map(str::to_owned);
+    let slot = match top {
+        "motion" => in_folder("trajectory.npy")
+            .map(|id| (id, Role::MotionNpy))
+            .or_else(|| Some((in_folder("motion.bvh")?, Role::MotionBvh))),
+        "audio_features" => in_folder("features.npz").map(|id| (id, Role::Features)),
+        "beats" => Some((rest.strip_suffix(BEATS_SUFFIX)?.to_owned(), Role::Beats)),
+        "audio" => match rest.strip_suffix(BEATS_SUFFIX) {
+            Some(id) => Some((id.to_owned(), Role::Beats)),
+            None => {
+                let extension = extension(rest).filter(|e| is_audio(e))?;
+                Some((rest[..rest.len() - extension.len() - 1].to_owned(), Role::Audio))
+            }
+        },
+        _ => None,
+    };
+    slot.filter(|(id, _)| !id.is_empty() && !id.ends_with('/'))
+}
+
+/// Returns the phrase whose folder this is, and what the folder must hold.
+fn phrase_folder(path: &str) -> Option<(String, &'static str)> {
+    let (top, id) = path.split_once('/')?;
+    let expects = match top {
+        "motion" => "trajectory.npy or motion.bvh",
+        "audio_features" => "features.npz",
+        _ => return None,
+    };
+    Some((id.to_owned(), expects))
+}
+
+fn library_layout(listing: Listing, drafts: &mut Drafts) {
+    let stem = |path: &str| path.rsplit_once('.').map(|(stem, _)| stem.to_owned());
+    let mut beats: BTreeMap<String, SourceFile> = BTreeMap::new();
+    let mut songs = Vec::new();
+    for file in listing.files {
+        let hidden = file.path.rsplit('/').next().is_some_and(|name| name.starts_with('.'));
+        if let (Some(stem), false) = (file.path.strip_suffix(BEATS_SUFFIX), hidden) {
+            beats.insert(stem.to_owned(), file);
+        } else if !hidden && extension(&file.path).is_some_and(is_audio) {
+            songs.push(file);
+        } else {
+            drafts.ignored.push(file.path);
+        }
+    }
+    for folder in &listing.folders {
+        // A folder may be called `live.wav` for all that we know, as long as it holds something.
+        let holds = songs.iter().any(|s| is_below(&s.path, folder))
+            || listing.folders.iter().any(|f| is_below(f, folder))
+            || drafts.ignored.iter().any(|f| is_below(f, folder));
+        if extension(folder).is_some_and(is_audio) && !holds {
+            drafts.fail(folder.clone(), not_a_file(folder));
+        }
+    }
+    let with_song: BTreeSet<String> = songs.iter().filter_map(|s| stem(&s.path)).collect();
+    for song in songs {
+        let id = song.path.clone();
+        if let Some(file) = stem(&id).and_then(|stem| beats.get(&stem)) {
+            drafts.add(id.clone(), Role::Beats, file.clone());
+        }
+        drafts.add(id, Role::Audio, song);
+    }
+    let lone = beats.into_iter().filter(|(stem, _)| !with_song.contains(stem));
+    drafts.ignored.extend(lone.map(|(_, file)| file.path));
+    for problem in listing.problems {
+        drafts.problem(None, problem);
+    }
+}
+
+#[derive(Default)]
+struct Drafts {
+    phrases: BTreeMap<String, Planned>,
+    ignored: Vec<String>,
+}
+
+impl Drafts {
+    fn draft(&mut self, id: String) -> &mut Planned {
+        self.phrases.entry(id).or_insert_with_key(|id| Planned {
+            id: id.clone(),
+            files: Vec::new(),
+            problem: None,
+        })
+    }
+
+    fn add(&mut self, id: String, role: Role, file: SourceFile) {
+        self.draft(id).files.push((role, file));
+    }
+
+    fn fail(&mut self, id: String, failure: Failure) {
+        self.draft(id).problem.get_or_insert(failure);
+    }
+
+    fn problem(&mut self, id: Option<String>, problem: SourceProblem) {
+        let kind = match problem.kind {
+            SourceProblemKind::Name => FailureKind::Name,
+            SourceProblemKind::NotAFile => FailureKind::NotAFile,
+            SourceProblemKind::Symlink => FailureKind::Symlink,
+            SourceProblemKind::Unreadable => FailureKind::Unreadable,
+        };
+        let message = format!("{} {}", problem.path, problem.message);
+        let failure = Failure::new(kind, &problem.path, message);
+        self.fail(id.unwrap_or(problem.path), failure);
+    }
+
+    fn finish(self) -> Plan {
+        let mut plan = Plan { phrases: Vec::new(), ignored: self.ignored };
+        for mut phrase in self.phrases.into_values() {
+            phrase.files.sort_by(|a, b| (a.0, &a.1.path).cmp(&(b.0, &b.1.path)));
+            if phrase.problem.is_none() {
+                phrase.problem = conflict(&phrase);
+            }
+            plan.phrases.push(phrase);
+        }
+        plan.ignored.sort();
+        plan
+    }
+}
+
+/// Returns why the files of a phrase cannot be one phrase.
+fn conflict(phrase: &Planned) -> Option<Failure> {
+    for pair in phrase.files.windows(2) {
+        let [(a_role, a), (b_role, b)] = pair else { continue };
+        if a_role.name() == b_role.name() {
+            let message = format!(
+                "{} comes twice, from {} and {}; keep one of them",
+                a_role.name(),
+                a.path,
+                b.path
+            );
+            return Some(Failure::new(FailureKind::DuplicateId, &b.path, message));
+        }
+    }
+    if let [(Role::Beats, beats)] = phrase.files.as_slice() {
+        let message = format!(
+            "{} stands alone, without audio, motion or features; add one of them or remove it",
+            beats.path
+        );
+        return Some(Failure::new(FailureKind::Layout, &beats.path, message));
+    }
+    None
+}
+
+fn not_a_file(folder: &str) -> Failure {
+    let message = format!("{folder} is a folder where a file is expected; rename or remove it");
+    Failure::new(FailureKind::NotAFile, folder, message)
+}
+
+fn is_below(path: &str, folder: &str) -> bool {
+    path.strip_prefix(folder).is_some_and(|rest| rest.starts_with('/'))
+}
+
+fn extension(path: &str) -> Option<&str> {
+    let name = path.rsplit('/').next()?;
+    name.rsplit_once('.').map(|(_, extension)| extension)
+}
+
+fn is_audio(extension: &str) -> bool {
+    AUDIO_EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension))
+}

@@ -1,0 +1,248 @@
+//! `ingest`: phrases or a music library become the tables `phrases` and `motion`.
+
+mod batch;
+mod failure;
+mod layout;
+mod phrase;
+
+use std::io::{self, Write};
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+use std::time::Instant;
+
+use super::{ClientParams, Contract, Progress, Stage, Summary};
+use crate::store::{Cache, Ledger, Location, Shard, Source, StoreError, sha256};
+
+pub use failure::{Failure, FailureKind};
+pub use layout::{Layout, Plan, Planned, Role, plan};
+pub use phrase::Rules;
+
+/// Raised when ingest writes something else for the same input and rules.
+const OUTPUT_VERSION: u32 = 1;
+
+/// Failures that the summary spells out; the rest are in the table.
+const N_SHOWN: usize = 10;
+
+/// The stage.
+pub struct Ingest;
+
+/// What the user asks for.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Params {
+    /// Folder or bucket with phrases, or any tree of audio files.
+    #[arg(long, value_name = "URL")]
+    pub source: String,
+    /// Folder or bucket for the tables.
+    #[arg(long, value_name = "URL")]
+    pub store: String,
+    /// How the source is organised.
+    #[arg(long, value_enum, value_name = "LAYOUT", default_value_t = Layout::Auto)]
+    pub layout: Layout,
+    #[command(flatten)]
+    pub rules: Rules,
+    /// Part of the job that this process does: i/n, or auto inside an array job.
+    #[arg(long, value_name = "I/N", default_value_t = Shard::WHOLE.to_string())]
+    pub shard: String,
+    /// Batches under way at once.
+    #[arg(long, value_name = "N", default_value_t = default_workers())]
+    pub workers: NonZeroUsize,
+    /// Phrases committed together, about; also how many a kill can cost each worker.
+    #[arg(long, value_name = "N", default_value_t = NonZeroUsize::new(512).expect("512 is not 0"))]
+    pub batch_phrases: NonZeroUsize,
+    /// Keep copies of remote files in this folder and read them from there next time.
+    #[arg(long, value_name = "DIR", help_heading = "Remote storage")]
+    pub cache: Option<PathBuf>,
+    /// Size of the cache in GB (10^9 bytes); the least recently used files leave first.
+    #[arg(long, value_name = "GB", default_value_t = 20.0, help_heading = "Remote storage")]
+    pub cache_size_gb: f64,
+    #[command(flatten)]
+    pub client: ClientParams,
+    /// Say what would be done, and do nothing.
+    #[arg(long)]
+    pub dry_run: bool,
+    /// Do every phrase again, done or not.
+    #[arg(long)]
+    pub force: bool,
+    /// Read every file again instead of trusting its size and time (or entity tag).
+    #[arg(long)]
+    pub verify: bool,
+}
+
+fn default_workers() -> NonZeroUsize {
+    std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN)
+}
+
+impl Stage for Ingest {
+    const NAME: &'static str = "ingest";
+    const ABOUT: &'static str = "bring phrases or a music library into tables";
+    const CONTRACT: Contract =
+        Contract { reads: "a source of files", writes: "phrases, motion, failures" };
+    type Params = Params;
+
+    fn run(params: Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
+        let started = Instant::now();
+        let options = params.client.options();
+        let shard = Shard::parse(&params.shard, |name| std::env::var(name).ok())?;
+        let source = Source::open(&params.source, &options, open_cache(&params)?)?;
+        let store = Location::open(&params.store, &options)?;
+        let plan = plan(source.list()?, params.layout);
+        let ledger = Ledger::read(&store, Self::NAME)?;
+        let params_hash = params_hash(&params.rules);
+
+        let mine: Vec<_> = plan.phrases.iter().filter(|p| shard.takes(&p.id)).collect();
+        let is_done =
+            |p: &Planned| !params.force && !params.verify && is_settled(p, &ledger, &params_hash);
+        let (done, todo): (Vec<_>, Vec<_>) = mine.into_iter().partition(|p| is_done(p));
+        tracing::info!(
+            source = source.location().url(),
+            store = store.url(),
+            %shard,
+            found = plan.phrases.len(),
+            done = done.len(),
+            todo = todo.len(),
+            ignored = plan.ignored.len(),
+            "planned"
+        );
+        let mut report = Report {
+            source: source.location().to_string(),
+            store: store.to_string(),
+            dry_run: params.dry_run,
+            tally: Tally { n_unchanged: done.len() as u64, ..Tally::default() },
+            n_todo: todo.len() as u64,
+            ignored: plan.ignored,
+            took_s: 0.0,
+        };
+        if params.dry_run {
+            let problems = todo.iter().filter_map(|p| {
+                let failure = p.problem.clone()?;
+                Some(Refused { id: p.id.clone(), failure })
+            });
+            report.tally.failed = problems.collect();
+        } else {
+            progress.start("ingest", "phrases", todo.len() as u64);
+            let batches = batch::batches(&plan.phrases, todo, params.batch_phrases.get());
+            let job = batch::Job {
+                source: &source,
+                store: &store,
+                ledger: &ledger,
+                rules: &params.rules,
+                params_hash: &params_hash,
+                progress,
+                force: params.force,
+            };
+            report.tally.add(job.run(&batches, params.workers.get())?);
+            progress.finish();
+        }
+        report.tally.failed.sort_by(|a, b| a.id.cmp(&b.id));
+        report.took_s = started.elapsed().as_secs_f64();
+        Ok(Box::new(report))
+    }
+}
+
+fn open_cache(params: &Params) -> Result<Option<Cache>, StoreError> {
+    let Some(folder) = &params.cache else { return Ok(None) };
+    Cache::open(folder, (params.cache_size_gb * 1e9) as u64).map(Some)
+}
+
+/// Returns the digest of everything but the input that determines ingest's output.
+fn params_hash(rules: &Rules) -> String {
+    let text = serde_json::json!({ "output_version": OUTPUT_VERSION, "rules": rules }).to_string();
+    sha256(text.as_bytes())
+}
+
+/// Returns whether the store has a phrase's rows for these files and rules.
+fn is_settled(planned: &Planned, ledger: &Ledger, params_hash: &str) -> bool {
+    ledger.get(&planned.id).is_some_and(|known| {
+        known.params_hash == params_hash
+            && known.item.failure.is_none()
+            && known.item.fingerprint == batch::fingerprint(planned)
+    })
+}
+
+/// What became of the phrases.
+#[derive(Clone, Debug, Default)]
+struct Tally {
+    n_done: u64,
+    n_unchanged: u64,
+    n_frames: u64,
+    duration_s: f64,
+    failed: Vec<Refused>,
+}
+
+/// A phrase that failed, for the summary.
+#[derive(Clone, Debug)]
+struct Refused {
+    id: String,
+    failure: Failure,
+}
+
+impl Tally {
+    fn add(&mut self, other: Tally) {
+        self.n_done += other.n_done;
+        self.n_unchanged += other.n_unchanged;
+        self.n_frames += other.n_frames;
+        self.duration_s += other.duration_s;
+        self.failed.extend(other.failed);
+    }
+}
+
+struct Report {
+    source: String,
+    store: String,
+    dry_run: bool,
+    tally: Tally,
+    n_todo: u64,
+    ignored: Vec<String>,
+    took_s: f64,
+}
+
+impl Summary for Report {
+    fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
+        let Report { tally, n_todo, took_s, .. } = self;
+        let n_failed = tally.failed.len();
+        writeln!(out, "ingest {} → {}", self.source, self.store)?;
+        if self.dry_run {
+            writeln!(
+                out,
+                "  would read {n_todo} phrases ({} of them cannot be read), leave {} as they are",
+                n_failed, tally.n_unchanged
+            )?;
+        } else if *n_todo == 0 {
+            writeln!(out, "  nothing to do: {} phrases are up to date", tally.n_unchanged)?;
+        } else {
+            writeln!(
+                out,
+                "  {} ingested ({:.1} s of music or motion, {} motion frames), {} up to date, \
+                 {n_failed} failed; {took_s:.1} s, {:.0} phrases/s",
+                tally.n_done,
+                tally.duration_s,
+                tally.n_frames,
+                tally.n_unchanged,
+                *n_todo as f64 / took_s.max(1e-9)
+            )?;
+        }
+        if let Some(first) = self.ignored.first() {
+            let n = self.ignored.len();
+            writeln!(out, "  {n} files belong to no phrase and were left alone, such as {first}")?;
+        }
+        for Refused { id, failure } in tally.failed.iter().take(N_SHOWN) {
+            writeln!(out, "  failed [{}] phrase {id}: {}", failure.kind.name(), failure.message)?;
+        }
+        if n_failed > N_SHOWN {
+            writeln!(out, "  … and {} more", n_failed - N_SHOWN)?;
+        }
+        if n_failed > 0 && !self.dry_run {
+            let store = &self.store;
+            writeln!(
+                out,
+                "  all of them: motiongen query --store {store} \
+                 \"select phrase_id, kind, message from failures\""
+            )?;
+        }
+        Ok(())
+    }
+
+    fn n_failed(&self) -> u64 {
+        if self.dry_run { 0 } else { self.tally.failed.len() as u64 }
+    }
+}

@@ -1,0 +1,334 @@
+//! One phrase: its files' contents become a row and a trajectory, or one failure.
+
+use std::io::{Read as _, Seek as _};
+
+use ndarray::Array2;
+
+use super::failure::{Failure, FailureKind};
+use super::layout::Role;
+use crate::audio::header::{AudioHeader, AudioHeaderError, read_header};
+use crate::motion::npy::{self, NpyError};
+use crate::motion::npz::{Npz, NpzError};
+use crate::motion::{
+    Beats, BeatsPerBarSource, Bvh, BvhError, CaptureError, ChannelLimits, Trajectory,
+    TrajectoryError, convert_bvh,
+};
+use crate::store::{Content, SourceFile, StoreError, sha256, sha256_of};
+use crate::units::{FPS, frames_to_s, s_to_frames};
+
+/// Arrays of a feature file: key and channels (`None`: one value per frame).
+const FEATURE_KEYS: [(&str, Option<usize>); 6] = [
+    ("mel", Some(128)),
+    ("chroma", Some(12)),
+    ("mfcc", Some(20)),
+    ("rms", None),
+    ("spectral_centroid", None),
+    ("onset_strength", None),
+];
+
+/// Largest motion, feature or beat file that is read, in bytes.
+const MAX_FILE_BYTES: u64 = 1 << 30;
+
+/// What makes a phrase acceptable; a change of these makes every phrase be read again.
+#[derive(Clone, Copy, Debug, PartialEq, clap::Args, serde::Serialize)]
+pub struct Rules {
+    /// Which channel values a motion may have: `wide` allows ±20 rad/s of angular velocity, as real
+    /// spins need; `reference` allows ±10 rad/s.
+    #[arg(long, value_enum, value_name = "LIMITS", default_value_t = ChannelLimits::Wide)]
+    pub limits: ChannelLimits,
+    /// Frames by which the lengths of motion, features and audio may differ.
+    #[arg(long, value_name = "FRAMES", default_value_t = 1.0)]
+    pub length_tolerance_frames: f64,
+}
+
+/// A phrase that passed every check.
+#[derive(Clone, Debug)]
+pub struct Phrase {
+    pub content_hash: String,
+    pub motion: Option<Trajectory>,
+    pub motion_format: Option<&'static str>,
+    pub n_feature_frames: Option<usize>,
+    pub audio: Option<AudioHeader>,
+    pub tempo: Option<Tempo>,
+    pub has_beats: bool,
+}
+
+/// Tempo and metre, with where each came from.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Tempo {
+    pub bpm: f64,
+    pub source: &'static str,
+    pub beats_per_bar: Option<(u32, &'static str)>,
+}
+
+impl Phrase {
+    /// Returns the length of the audio, else of the motion or the features.
+    pub fn duration_s(&self) -> f64 {
+        let n_frames = self.motion.as_ref().map(Trajectory::n_frames).or(self.n_feature_frames);
+        self.audio.as_ref().map_or_else(|| frames_to_s(n_frames.unwrap_or(0)), |a| a.duration_s)
+    }
+}
+
+/// A phrase's files as they came from the source, digests first.
+pub struct Files {
+    content_hash: String,
+    files: Vec<(Role, SourceFile, Content)>,
+}
+
+impl Files {
+    /// Takes the contents of a phrase's files and digests them.
+    ///
+    /// # Errors
+    /// A [`Failure`] when a file could not be read.
+    pub fn take(
+        files: Vec<(Role, SourceFile, Result<Content, StoreError>)>,
+    ) -> Result<Self, Failure> {
+        let mut taken = Vec::with_capacity(files.len());
+        let mut lines = String::new();
+        for (role, file, content) in files {
+            let mut content = content.map_err(|e| unreadable(&file, &e))?;
+            let hash = match &mut content {
+                Content::Bytes(bytes) => sha256(bytes),
+                Content::File(file_content) => sha256_of(file_content)
+                    .and_then(|hash| file_content.rewind().map(|()| hash))
+                    .map_err(|e| Failure::new(FailureKind::Unreadable, &file.path, e))?,
+            };
+            lines += &format!("{} {hash}\n", role.name());
+            taken.push((role, file, content));
+        }
+        Ok(Self { content_hash: sha256(lines.as_bytes()), files: taken })
+    }
+
+    pub fn content_hash(&self) -> &str {
+        &self.content_hash
+    }
+
+    /// Reads and checks the phrase.
+    ///
+    /// # Errors
+    /// The first [`Failure`] in the order audio, beats, features, motion, then their lengths.
+    pub fn check(self, rules: &Rules) -> Result<Phrase, Failure> {
+        let mut phrase = Phrase {
+            content_hash: self.content_hash,
+            motion: None,
+            motion_format: None,
+            n_feature_frames: None,
+            audio: None,
+            tempo: None,
+            has_beats: false,
+        };
+        let mut beats: Option<Beats> = None;
+        let mut motion_path = String::new();
+        // Roles are sorted, so beats are known before the motion whose phase needs them.
+        for (role, file, content) in self.files {
+            let path = file.path.as_str();
+            match role {
+                Role::Audio => phrase.audio = Some(audio_header(path, content)?),
+                Role::Beats => {
+                    let read = read_beats(path, bytes_of(&file, content)?.as_ref())?;
+                    phrase.tempo = Some(tempo_of(&read));
+                    phrase.has_beats = true;
+                    beats = Some(read);
+                }
+                Role::Features => {
+                    let features = read_features(path, bytes_of(&file, content)?.as_ref())?;
+                    phrase.n_feature_frames = Some(features.n_frames);
+                    phrase.has_beats |= features.has_beats;
+                    // A beat list beside the audio was written by somebody; a tracker's was not.
+                    phrase.tempo = phrase.tempo.or(features.tempo);
+                }
+                Role::MotionNpy | Role::MotionBvh => {
+                    let bytes = bytes_of(&file, content)?;
+                    let (format, motion) = if role == Role::MotionNpy {
+                        ("npy", read_trajectory(path, &bytes)?)
+                    } else {
+                        ("bvh", read_bvh(path, &bytes, beats.as_ref())?)
+                    };
+                    motion.check(&rules.limits).map_err(|e| failed(path, e.kind(), &e))?;
+                    phrase.motion = Some(motion);
+                    phrase.motion_format = Some(format);
+                    path.clone_into(&mut motion_path);
+                }
+            }
+        }
+        check_lengths(&phrase, rules, &motion_path)?;
+        Ok(phrase)
+    }
+}
+
+fn check_lengths(phrase: &Phrase, rules: &Rules, motion_path: &str) -> Result<(), Failure> {
+    let lengths = [
+        ("audio", phrase.audio.as_ref().map(|a| a.duration_s)),
+        ("features", phrase.n_feature_frames.map(frames_to_s)),
+        ("motion", phrase.motion.as_ref().map(|m| frames_to_s(m.n_frames()))),
+    ];
+    let tolerance = rules.length_tolerance_frames;
+    for (i, (a, a_s)) in lengths.iter().enumerate() {
+        for (b, b_s) in &lengths[i + 1..] {
+            let (Some(a_s), Some(b_s)) = (a_s, b_s) else { continue };
+            // Half a sample's worth of slack, for lengths that are a whole number of frames.
+            if s_to_frames((a_s - b_s).abs()) > tolerance + 1e-3 {
+                let message = format!(
+                    "{a} is {a_s:.2} s but {b} is {b_s:.2} s; they must agree within {tolerance} \
+                     frame{} ({:.3} s)",
+                    if tolerance == 1.0 { "" } else { "s" },
+                    tolerance / FPS
+                );
+                return Err(Failure::new(FailureKind::LengthMismatch, motion_path, message));
+            }
+        }
+    }
+    Ok(())
+}
+
+fn unreadable(file: &SourceFile, error: &StoreError) -> Failure {
+    let cause = std::error::Error::source(error).map(|e| format!(" ({e})")).unwrap_or_default();
+    let message = format!("{error}{cause}");
+    Failure::new(FailureKind::Unreadable, &file.path, message)
+}
+
+/// Returns a file's bytes, refusing what no phrase can be.
+fn bytes_of(file: &SourceFile, content: Content) -> Result<bytes::Bytes, Failure> {
+    if file.size_bytes > MAX_FILE_BYTES {
+        let message = format!(
+            "{} has {} bytes, more than the {MAX_FILE_BYTES} that are read; split the phrase",
+            file.path, file.size_bytes
+        );
+        return Err(Failure::new(FailureKind::TooLarge, &file.path, message));
+    }
+    match content {
+        Content::Bytes(bytes) => Ok(bytes),
+        Content::File(mut open) => {
+            let mut bytes = Vec::new();
+            open.read_to_end(&mut bytes)
+                .map_err(|e| Failure::new(FailureKind::Unreadable, &file.path, e))?;
+            Ok(bytes.into())
+        }
+    }
+}
+
+fn audio_header(path: &str, content: Content) -> Result<AudioHeader, Failure> {
+    let extension = path.rsplit_once('.').map_or("", |(_, extension)| extension);
+    let read = match content {
+        Content::Bytes(bytes) => read_header(&bytes, extension),
+        Content::File(mut file) => {
+            let mut bytes = Vec::new();
+            file.read_to_end(&mut bytes)
+                .map_err(|e| Failure::new(FailureKind::Unreadable, path, e))?;
+            read_header(&bytes, extension)
+        }
+    };
+    read.map_err(|e: AudioHeaderError| failed(path, e.kind(), &e))
+}
+
+fn read_beats(path: &str, bytes: &[u8]) -> Result<Beats, Failure> {
+    let refuse = |message: &dyn std::fmt::Display| {
+        Failure::new(FailureKind::BeatsFormat, path, format!("{path}: {message}"))
+    };
+    if bytes.is_empty() {
+        let message = format!("{path} is empty; write one beat time in seconds per line");
+        return Err(Failure::new(FailureKind::EmptyFile, path, message));
+    }
+    let text = std::str::from_utf8(bytes)
+        .map_err(|_| refuse(&"is not UTF-8 text; write one beat time in seconds per line"))?;
+    Beats::parse(text).map_err(|e| refuse(&e))
+}
+
+fn tempo_of(beats: &Beats) -> Tempo {
+    let source = match beats.beats_per_bar_source() {
+        BeatsPerBarSource::Given | BeatsPerBarSource::Numbers => "beats_file",
+        BeatsPerBarSource::Default => "default",
+    };
+    let beats_per_bar = Some((beats.beats_per_bar(), source));
+    Tempo { bpm: beats.tempo_bpm(), source: "beats_file", beats_per_bar }
+}
+
+fn read_trajectory(path: &str, bytes: &[u8]) -> Result<Trajectory, Failure> {
+    let array = npy::read_f32(bytes).map_err(|e: NpyError| failed(path, e.kind(), &e))?;
+    let shape_failure = || {
+        let hint =
+            if array.shape.len() == 2 && array.shape[0] == 25 { "; transpose it" } else { "" };
+        let message = format!("{path} has shape {:?}, expected [frames, 25]{hint}", array.shape);
+        Failure::new(FailureKind::Shape, path, message)
+    };
+    let &[n_frames, n_channels] = array.shape.as_slice() else { return Err(shape_failure()) };
+    if n_frames == 0 || n_channels != crate::motion::MOTION_DIM {
+        return Err(shape_failure());
+    }
+    let frames = Array2::from_shape_vec((n_frames, n_channels), array.values)
+        .map_err(|e| Failure::new(FailureKind::Shape, path, e))?;
+    Trajectory::new(frames).map_err(|e: TrajectoryError| failed(path, e.kind(), &e))
+}
+
+fn read_bvh(path: &str, bytes: &[u8], beats: Option<&Beats>) -> Result<Trajectory, Failure> {
+    if bytes.is_empty() {
+        let message = format!("{path} is empty; export the capture again");
+        return Err(Failure::new(FailureKind::EmptyFile, path, message));
+    }
+    let bvh = Bvh::parse(bytes).map_err(|e: BvhError| failed(path, "bvh_format", &e))?;
+    convert_bvh(&bvh, beats).map_err(|e: CaptureError| failed(path, "bvh_format", &e))
+}
+
+struct Features {
+    n_frames: usize,
+    tempo: Option<Tempo>,
+    has_beats: bool,
+}
+
+fn read_features(path: &str, bytes: &[u8]) -> Result<Features, Failure> {
+    let from_npz = |e: NpzError| failed(path, e.kind(), &e);
+    let mut npz = Npz::open(bytes).map_err(from_npz)?;
+    let mut n_frames = None;
+    for (key, n_channels) in FEATURE_KEYS {
+        let array = npz.read_f32(key).map_err(from_npz)?;
+        let expected = n_channels.map_or("[frames]".into(), |n| format!("[{n}, frames]"));
+        let frames = match (array.shape.as_slice(), n_channels) {
+            (&[frames], None) | (&[1, frames], None) => Some(frames),
+            (&[rows, frames], Some(n)) if rows == n => Some(frames),
+            _ => None,
+        };
+        let Some(frames) = frames.filter(|&frames| frames > 0) else {
+            let message = format!("{path}: {key} has shape {:?}, expected {expected}", array.shape);
+            return Err(Failure::new(FailureKind::Shape, path, message));
+        };
+        let n = *n_frames.get_or_insert(frames);
+        if n != frames {
+            let message =
+                format!("{path}: {key} has {frames} frames but mel has {n}; extract them again");
+            return Err(Failure::new(FailureKind::Shape, path, message));
+        }
+        if let Some(i) = array.values.iter().position(|x| !x.is_finite()) {
+            let count = array.values.iter().filter(|x| !x.is_finite()).count();
+            let (value, frame) = (array.values[i], i % frames);
+            let message = format!(
+                "{path}: {key} is {value} at frame {frame} ({count} non-finite values in all); \
+                 extract the features again"
+            );
+            return Err(Failure::new(FailureKind::NonFinite, path, message));
+        }
+    }
+    let has = |npz: &Npz<'_>, key: &str| npz.keys().iter().any(|k| k == key);
+    let mut features = Features { n_frames: n_frames.unwrap_or(0), tempo: None, has_beats: false };
+    if has(&npz, "tempo") {
+        let tempo = npz.read_f64("tempo").map_err(from_npz)?;
+        let bpm = tempo.values.first().copied().filter(|bpm| bpm.is_finite() && *bpm > 0.0);
+        // librosa reports 0 for a song without a pulse; that is "no tempo", not a broken file.
+        features.tempo = bpm.map(|bpm| Tempo { bpm, source: "features", beats_per_bar: None });
+    }
+    if has(&npz, "beat_times") {
+        let beats = npz.read_f64("beat_times").map_err(from_npz)?;
+        if let Some(time_s) = beats.values.iter().find(|t| !t.is_finite() || **t < 0.0) {
+            let message =
+                format!("{path}: beat_times holds {time_s} s; times are finite and not negative");
+            return Err(Failure::new(FailureKind::NonFinite, path, message));
+        }
+        features.has_beats = !beats.values.is_empty();
+    }
+    Ok(features)
+}
+
+/// Builds a failure from a reader's own kind and sentence, naming the file.
+fn failed(path: &str, kind: &str, error: &dyn std::fmt::Display) -> Failure {
+    let kind = FailureKind::of_reader(kind);
+    Failure::new(kind, path, format!("{path}: {error}"))
+}

@@ -1,0 +1,94 @@
+//! Stages: what the user runs. Each has a contract, parameters, a run and a summary.
+
+pub mod ingest;
+#[cfg(feature = "query")]
+pub mod query;
+
+use std::io::{self, Write};
+
+use crate::store::ClientOptions;
+
+/// One stage of the pipeline.
+pub trait Stage {
+    /// The verb that the user types.
+    const NAME: &'static str;
+    /// One line for the list of stages.
+    const ABOUT: &'static str;
+    /// Tables read and written, for the help text.
+    const CONTRACT: Contract;
+    type Params: clap::Args;
+
+    /// Does the work.
+    ///
+    /// # Errors
+    /// Whatever keeps the stage from doing its work at all; items that fail alone are part of the
+    /// summary.
+    fn run(params: Self::Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>>;
+}
+
+/// The tables that a stage reads and writes.
+#[derive(Clone, Copy, Debug)]
+pub struct Contract {
+    pub reads: &'static str,
+    pub writes: &'static str,
+}
+
+/// What a stage tells of its progress; the command line draws it.
+pub trait Progress: Sync {
+    /// Starts counting `total` things called `unit` (in the plural).
+    fn start(&self, what: &str, unit: &str, total: u64);
+    /// Counts `n` more.
+    fn advance(&self, n: u64);
+    /// Ends the counting.
+    fn finish(&self);
+}
+
+/// Progress that nobody watches.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Silent;
+
+impl Progress for Silent {
+    fn start(&self, _what: &str, _unit: &str, _total: u64) {}
+    fn advance(&self, _n: u64) {}
+    fn finish(&self) {}
+}
+
+/// What a stage did.
+pub trait Summary {
+    /// Writes what the user asked for, or the account of what was done.
+    ///
+    /// # Errors
+    /// What the output says.
+    fn write(&mut self, out: &mut dyn Write) -> io::Result<()>;
+
+    /// Returns how many items failed; they are in the `failures` table.
+    fn n_failed(&self) -> u64;
+}
+
+/// How remote storage is used; the same flags in every stage.
+#[derive(Clone, Debug, clap::Args)]
+pub struct ClientParams {
+    /// Requests to remote storage under way at once.
+    #[arg(long, value_name = "N", default_value_t = ClientOptions::default().n_requests,
+          help_heading = "Remote storage")]
+    pub requests: usize,
+    /// Seconds that one request to remote storage may take.
+    #[arg(long, value_name = "S", default_value_t = ClientOptions::default().request_timeout_s,
+          help_heading = "Remote storage")]
+    pub request_timeout_s: f64,
+    /// Times that a throttled, failed or broken request is tried again, with jittered backoff.
+    #[arg(long, value_name = "N", default_value_t = ClientOptions::default().max_retries,
+          help_heading = "Remote storage")]
+    pub max_retries: usize,
+}
+
+impl ClientParams {
+    /// Returns the options of the store's client.
+    pub fn options(&self) -> ClientOptions {
+        ClientOptions {
+            n_requests: self.requests,
+            request_timeout_s: self.request_timeout_s,
+            max_retries: self.max_retries,
+        }
+    }
+}

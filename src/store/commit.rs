@@ -1,0 +1,362 @@
+//! Commits: how finished work becomes visible, whole and once.
+//!
+//! A batch of items writes its parts first and then one manifest, `commits/<stage>/<key>.json`,
+//! with create-if-absent; readers trust manifests only. The key is a digest of everything that
+//! determines the bytes: program version, parameters, each item's input and outcome, and the
+//! commits that it replaces. Two processes that do the same work therefore write the same names,
+//! and an item done again supersedes its earlier rows by a higher sequence number, not by a clock.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+
+use bytes::Bytes;
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use super::StoreError;
+use super::location::{Location, Put};
+use super::part::{FinishedPart, PartWriter};
+use super::schema::TableSchema;
+
+/// Layout of manifests; raised when a field changes its meaning.
+const MANIFEST_FORMAT: u32 = 1;
+const FOLDER: &str = "commits";
+
+/// One commit: the parts that it adds and the items that it settles.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Manifest {
+    pub format: u32,
+    pub stage: String,
+    pub key: String,
+    /// One more than the highest sequence among the commits that it replaces; 0 if none.
+    pub sequence: u64,
+    pub program: String,
+    pub params_hash: String,
+    /// Where the items' inputs came from, as a URL.
+    pub origin: String,
+    pub parts: Vec<Part>,
+    pub items: Vec<Item>,
+}
+
+/// A part of a table, as its commit describes it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Part {
+    pub table: String,
+    pub schema_version: u32,
+    /// Path below the store.
+    pub path: String,
+    pub n_rows: u64,
+    pub n_bytes: u64,
+}
+
+/// An item settled by a commit.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Item {
+    pub id: String,
+    /// What the storage said of the item's inputs, without reading them.
+    pub fingerprint: String,
+    /// Digest of the inputs' content.
+    pub input_hash: String,
+    /// Digest of the failure (kind and message); `None` when the item succeeded.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub failure: Option<String>,
+}
+
+/// What a store knows of one stage's items.
+#[derive(Debug, Default)]
+pub struct Ledger {
+    items: HashMap<String, Settled>,
+}
+
+/// The latest word on an item.
+#[derive(Clone, Debug)]
+pub struct Settled {
+    pub item: Item,
+    pub params_hash: String,
+    pub origin: String,
+    key: String,
+    sequence: u64,
+}
+
+impl Ledger {
+    /// Reads what `stage` has committed in `store`.
+    ///
+    /// # Errors
+    /// [`StoreError`] when commits cannot be read.
+    pub fn read(store: &Location, stage: &str) -> Result<Self, StoreError> {
+        Ok(Self::of(manifests(store, Some(stage))?.iter()))
+    }
+
+    fn of<'a>(manifests: impl Iterator<Item = &'a Manifest>) -> Self {
+        let mut items: HashMap<String, Settled> = HashMap::new();
+        for manifest in manifests {
+            for item in &manifest.items {
+                let newer = items.get(&item.id).is_none_or(|known| {
+                    (known.sequence, known.key.as_str())
+                        < (manifest.sequence, manifest.key.as_str())
+                });
+                if newer {
+                    let settled = Settled {
+                        item: item.clone(),
+                        params_hash: manifest.params_hash.clone(),
+                        origin: manifest.origin.clone(),
+                        key: manifest.key.clone(),
+                        sequence: manifest.sequence,
+                    };
+                    items.insert(item.id.clone(), settled);
+                }
+            }
+        }
+        Self { items }
+    }
+
+    pub fn get(&self, id: &str) -> Option<&Settled> {
+        self.items.get(id)
+    }
+}
+
+/// A part that a table's readers see.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LivePart {
+    pub part: Part,
+    /// Items whose rows in this part were superseded by a later commit.
+    pub superseded: Vec<String>,
+}
+
+/// Returns the live parts of every table of a store, tables and parts in order of name.
+///
+/// # Errors
+/// [`StoreError`] when commits cannot be read.
+pub fn live_parts(store: &Location) -> Result<BTreeMap<String, Vec<LivePart>>, StoreError> {
+    let mut by_stage: BTreeMap<String, Vec<Manifest>> = BTreeMap::new();
+    for manifest in manifests(store, None)? {
+        by_stage.entry(manifest.stage.clone()).or_default().push(manifest);
+    }
+    let mut tables: BTreeMap<String, Vec<LivePart>> = BTreeMap::new();
+    for manifests in by_stage.values() {
+        let ledger = Ledger::of(manifests.iter());
+        for manifest in manifests {
+            let is_live = |id: &str| ledger.get(id).is_some_and(|s| s.key == manifest.key);
+            let superseded: Vec<_> =
+                manifest.items.iter().map(|i| i.id.clone()).filter(|id| !is_live(id)).collect();
+            if superseded.len() == manifest.items.len() {
+                continue;
+            }
+            for part in &manifest.parts {
+                let live = LivePart { part: part.clone(), superseded: superseded.clone() };
+                tables.entry(part.table.clone()).or_default().push(live);
+            }
+        }
+    }
+    for parts in tables.values_mut() {
+        parts.sort_by(|a, b| a.part.path.cmp(&b.part.path));
+    }
+    Ok(tables)
+}
+
+fn manifests(store: &Location, stage: Option<&str>) -> Result<Vec<Manifest>, StoreError> {
+    let folder = stage.map_or(FOLDER.to_owned(), |stage| format!("{FOLDER}/{stage}"));
+    let listed = store.list(&folder)?;
+    let paths: Vec<_> =
+        listed.into_iter().map(|l| l.path).filter(|path| path.ends_with(".json")).collect();
+    let mut found = Vec::with_capacity(paths.len());
+    for (path, bytes) in paths.iter().zip(store.read_many(&paths)?) {
+        let damaged = |reason: String| StoreError::Manifest { place: store.url_of(path), reason };
+        let manifest: Manifest =
+            serde_json::from_slice(&bytes).map_err(|e| damaged(e.to_string()))?;
+        if manifest.format != MANIFEST_FORMAT {
+            return Err(damaged(format!(
+                "it has format {}, this program reads format {MANIFEST_FORMAT}",
+                manifest.format
+            )));
+        }
+        found.push(manifest);
+    }
+    Ok(found)
+}
+
+/// A batch of items on its way into the store.
+pub struct Commit<'a> {
+    store: &'a Location,
+    stage: &'static str,
+    params_hash: String,
+    origin: String,
+    parts: BTreeMap<&'static str, OpenPart>,
+    items: Vec<Item>,
+    replaces: BTreeSet<(u64, String)>,
+}
+
+struct OpenPart {
+    schema_version: u32,
+    writer: PartWriter,
+}
+
+/// What a commit added.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Committed {
+    pub n_rows: u64,
+    pub n_bytes: u64,
+    /// Whether another process had made the same commit already.
+    pub already_there: bool,
+}
+
+impl<'a> Commit<'a> {
+    /// Starts a commit of `stage` under parameters whose digest is `params_hash`, for items that
+    /// come from `origin`.
+    pub fn new(store: &'a Location, stage: &'static str, params_hash: &str, origin: &str) -> Self {
+        Self {
+            store,
+            stage,
+            params_hash: params_hash.to_owned(),
+            origin: origin.to_owned(),
+            parts: BTreeMap::new(),
+            items: Vec::new(),
+            replaces: BTreeSet::new(),
+        }
+    }
+
+    /// Returns the writer of this commit's part of a table, started when first asked for.
+    ///
+    /// # Errors
+    /// [`StoreError`] when no temporary file can be made.
+    pub fn part(
+        &mut self,
+        name: &'static str,
+        schema: impl FnOnce() -> TableSchema,
+    ) -> Result<&mut PartWriter, StoreError> {
+        use std::collections::btree_map::Entry;
+        match self.parts.entry(name) {
+            Entry::Occupied(open) => Ok(&mut open.into_mut().writer),
+            Entry::Vacant(vacant) => {
+                let schema = schema();
+                let file = self.store.temporary(&format!("{name}/part"))?;
+                let schema_version = schema.version;
+                let writer = PartWriter::new(schema, file)?;
+                Ok(&mut vacant.insert(OpenPart { schema_version, writer }).writer)
+            }
+        }
+    }
+
+    /// Settles an item, superseding what `ledger` knew of it. Items come in order of id.
+    pub fn settle(&mut self, item: Item, ledger: &Ledger) {
+        if let Some(known) = ledger.get(&item.id) {
+            self.replaces.insert((known.sequence, known.key.clone()));
+        }
+        self.items.push(item);
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.items.is_empty()
+    }
+
+    /// Publishes the parts, then the manifest that makes them visible.
+    ///
+    /// # Errors
+    /// [`StoreError`]; nothing of the commit is visible then.
+    pub fn publish(self) -> Result<Committed, StoreError> {
+        let sequence = self.replaces.iter().map(|(sequence, _)| sequence + 1).max().unwrap_or(0);
+        let key = self.key();
+        let program = program();
+        let mut committed = Committed::default();
+        let mut parts = Vec::new();
+        for (table, open) in self.parts {
+            let finished = open.writer.finish(&[
+                ("schema_version", open.schema_version.to_string()),
+                ("table", table.to_owned()),
+                ("program", program.clone()),
+                ("params_hash", self.params_hash.clone()),
+                ("input_hash", input_hash(&self.items)),
+            ])?;
+            let FinishedPart { file, n_rows } = finished;
+            let path = format!("{table}/{key}.parquet");
+            let n_bytes = file
+                .as_file()
+                .metadata()
+                .map_err(|e| StoreError::io("measure", &self.store.url_of(&path), e))?
+                .len();
+            self.store.put_file_new(&path, file)?;
+            committed.n_rows += n_rows;
+            committed.n_bytes += n_bytes;
+            let (table, schema_version) = (table.to_owned(), open.schema_version);
+            parts.push(Part { table, schema_version, path, n_rows, n_bytes });
+        }
+        let manifest = Manifest {
+            format: MANIFEST_FORMAT,
+            stage: self.stage.to_owned(),
+            key,
+            sequence,
+            program,
+            params_hash: self.params_hash,
+            origin: self.origin,
+            parts,
+            items: self.items,
+        };
+        let path = format!("{FOLDER}/{}/{}.json", manifest.stage, manifest.key);
+        let text = serde_json::to_vec_pretty(&manifest)
+            .expect("invariant: a manifest holds only strings and numbers");
+        committed.already_there =
+            self.store.put_new(&path, Bytes::from(text))? == Put::AlreadyThere;
+        Ok(committed)
+    }
+
+    fn key(&self) -> String {
+        let mut hash = Sha256::new();
+        let mut line = |text: &str| {
+            // Length before content: no two sequences of lines run together.
+            hash.update((text.len() as u64).to_le_bytes());
+            hash.update(text);
+        };
+        line(self.stage);
+        line(&program());
+        line(&self.params_hash);
+        line(&self.origin);
+        for (name, open) in &self.parts {
+            line(name);
+            line(&open.schema_version.to_string());
+        }
+        line("replaces");
+        for (_, key) in &self.replaces {
+            line(key);
+        }
+        line("items");
+        for item in &self.items {
+            line(&item.id);
+            line(&item.input_hash);
+            line(item.failure.as_deref().unwrap_or_default());
+        }
+        hex(&hash.finalize()[..16])
+    }
+}
+
+/// Returns the digest of bytes that a manifest or table stores: SHA-256, in hexadecimal.
+pub fn sha256(bytes: &[u8]) -> String {
+    hex(&Sha256::digest(bytes))
+}
+
+/// Returns the SHA-256 of everything left in a reader, in hexadecimal.
+///
+/// # Errors
+/// What the reader says.
+pub fn sha256_of(reader: &mut impl std::io::Read) -> std::io::Result<String> {
+    let mut hash = Sha256::new();
+    let mut buffer = vec![0; 1 << 20];
+    loop {
+        match reader.read(&mut buffer)? {
+            0 => return Ok(hex(&hash.finalize())),
+            n => hash.update(&buffer[..n]),
+        }
+    }
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|b| format!("{b:02x}")).collect()
+}
+
+/// Returns the name and version that parts and manifests carry.
+fn program() -> String {
+    format!("{} {}", env!("CARGO_PKG_NAME"), env!("CARGO_PKG_VERSION"))
+}
+
+fn input_hash(items: &[Item]) -> String {
+    let lines: String = items.iter().map(|i| format!("{}\n", i.input_hash)).collect();
+    sha256(lines.as_bytes())
+}

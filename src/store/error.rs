@@ -1,0 +1,98 @@
+//! What can go wrong between the program and its storage.
+
+use thiserror::Error;
+
+/// A failure of the store: it names the place as the user typed it; causes are in `source`.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum StoreError {
+    #[error(
+        "location \"{text}\" {reason}; use a path, file://, gs://, s3://, az:// or memory://NAME"
+    )]
+    BadLocation { text: String, reason: String },
+
+    #[error("{place}: not found{hint}")]
+    NotFound { place: String, hint: &'static str },
+
+    #[error("{place}: could not {action}")]
+    Io {
+        action: &'static str,
+        place: String,
+        #[source]
+        source: std::io::Error,
+    },
+
+    #[error("{place}: could not {action}{hint}")]
+    Remote {
+        action: &'static str,
+        place: String,
+        hint: &'static str,
+        #[source]
+        source: object_store::Error,
+    },
+
+    #[error("{place}: commit manifest is damaged ({reason}); move it away and run the stage again")]
+    Manifest { place: String, reason: String },
+
+    #[error(
+        "table {table}: {place} has schema version {found}, this program reads version {supported}; \
+         {remedy}"
+    )]
+    SchemaVersion { table: String, place: String, found: u32, supported: u32, remedy: String },
+
+    #[error("table {table}: {place} is not a readable Parquet part")]
+    Parquet {
+        table: String,
+        place: String,
+        #[source]
+        source: parquet::errors::ParquetError,
+    },
+
+    #[error("table {table}: {place} lacks columns {missing:?}; it has {found:?}")]
+    Columns { table: String, place: String, missing: Vec<String>, found: Vec<String> },
+
+    #[error("shard \"{text}\" {reason}; write it as i/n with 0 <= i < n, or \"auto\"")]
+    BadShard { text: String, reason: String },
+
+    #[error("cache {place}: {reason}")]
+    Cache { place: String, reason: String },
+
+    #[error("{0}")]
+    Query(String),
+}
+
+impl StoreError {
+    /// Wraps an object-store error with the action and the place; a missing object becomes
+    /// [`StoreError::NotFound`], and a refused one gets the variables that grant access.
+    pub(crate) fn remote(action: &'static str, place: &str, source: object_store::Error) -> Self {
+        let hint = match &source {
+            object_store::Error::NotFound { .. } => {
+                return StoreError::NotFound { place: place.to_owned(), hint: "" };
+            }
+            object_store::Error::PermissionDenied { .. }
+            | object_store::Error::Unauthenticated { .. } => credentials_hint(place),
+            _ => "",
+        };
+        StoreError::Remote { action, place: place.to_owned(), hint, source }
+    }
+
+    pub(crate) fn io(action: &'static str, place: &str, source: std::io::Error) -> Self {
+        if source.kind() == std::io::ErrorKind::NotFound {
+            return StoreError::NotFound { place: place.to_owned(), hint: "" };
+        }
+        StoreError::Io { action, place: place.to_owned(), source }
+    }
+}
+
+fn credentials_hint(place: &str) -> &'static str {
+    if place.starts_with("gs://") {
+        "; access was refused: set GOOGLE_APPLICATION_CREDENTIALS to a key file that may do this"
+    } else if place.starts_with("s3://") {
+        "; access was refused: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY to a key that may do \
+         this"
+    } else if place.starts_with("az://") {
+        "; access was refused: set AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY"
+    } else {
+        "; access was refused"
+    }
+}

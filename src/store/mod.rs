@@ -1,0 +1,34 @@
+//! Storage: the only room that names a path, a URL, object_store, parquet or polars.
+//!
+//! A store is a folder, here or in a bucket: `<table>/<key>.parquet` are its parts and
+//! `commits/<stage>/<key>.json` say which of them count. See `docs/architecture.md`.
+
+mod cache;
+mod client;
+mod commit;
+mod error;
+mod location;
+mod part;
+#[cfg(feature = "query")]
+mod query;
+mod reader;
+pub(crate) mod schema;
+mod shard;
+mod source;
+pub mod tables;
+
+pub use cache::Cache;
+pub use client::ClientOptions;
+pub use commit::{
+    Commit, Committed, Item, Ledger, LivePart, Manifest, Part, Settled, live_parts, sha256,
+    sha256_of,
+};
+pub use error::StoreError;
+pub use location::{Listed, Location, Put, write_file};
+pub use part::{FinishedPart, PartWriter};
+#[cfg(feature = "query")]
+pub use query::{Answer, Format, TableInfo, query, table_infos};
+pub use reader::Snapshot;
+pub use schema::{Cell, Column, ColumnType, Row, TableSchema, TimestampUs};
+pub use shard::{Shard, batch_of, split_of};
+pub use source::{Content, InOrder, Listing, Source, SourceFile, SourceProblem, SourceProblemKind};

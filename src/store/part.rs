@@ -1,0 +1,177 @@
+//! Writing parts: immutable Parquet files that hold some of a table's rows.
+
+use std::sync::Arc;
+
+use arrow_array::builder::StringBuilder;
+use arrow_array::{ArrayRef, Float32Array, Int32Array, RecordBatch};
+use arrow_schema::SchemaRef;
+use parquet::arrow::ArrowWriter;
+use parquet::basic::{Compression, ZstdLevel};
+use parquet::errors::ParquetError;
+use parquet::file::metadata::{KeyValue, SortingColumn};
+use parquet::file::properties::{EnabledStatistics, WriterProperties};
+use parquet::schema::types::ColumnPath;
+use tempfile::NamedTempFile;
+
+use super::StoreError;
+use super::schema::{Row, TableSchema};
+use super::tables::ITEM_COLUMN;
+
+/// Rows of a row group: large enough to compress, small enough to hold in memory.
+const ROW_GROUP_ROWS: usize = 64 << 10;
+/// Rows of a data page, the smallest unit that a filter can skip.
+const PAGE_ROWS: usize = 8 << 10;
+
+/// Writes one part to a temporary file, at most one row group of it in memory.
+pub struct PartWriter {
+    table: TableSchema,
+    schema: SchemaRef,
+    writer: ArrowWriter<NamedTempFile>,
+    frames: FrameBuffer,
+    n_rows: u64,
+}
+
+/// Rows of a frame table that wait for their row group.
+#[derive(Default)]
+struct FrameBuffer {
+    /// Items and how many frames each has here.
+    items: Vec<(String, usize)>,
+    frame: Vec<i32>,
+    channels: Vec<Vec<f32>>,
+}
+
+/// A finished part, not yet published.
+pub struct FinishedPart {
+    pub file: NamedTempFile,
+    pub n_rows: u64,
+}
+
+impl PartWriter {
+    /// Starts a part of `table` in `file`.
+    ///
+    /// # Errors
+    /// [`StoreError::Parquet`].
+    pub fn new(table: TableSchema, file: NamedTempFile) -> Result<Self, StoreError> {
+        let schema = table.arrow();
+        let sorting: Vec<_> = table
+            .sorted_by
+            .iter()
+            .filter_map(|name| table.columns.iter().position(|c| c.name == *name))
+            .map(|i| SortingColumn { column_idx: i as i32, descending: false, nulls_first: false })
+            .collect();
+        let mut properties = WriterProperties::builder()
+            .set_compression(Compression::ZSTD(ZstdLevel::try_new(1).expect("1 is a zstd level")))
+            // A dictionary of floats is larger than the floats and takes three times as long; names
+            // repeat once per frame, and there it pays.
+            .set_dictionary_enabled(false)
+            .set_statistics_enabled(EnabledStatistics::Page)
+            .set_max_row_group_row_count(Some(ROW_GROUP_ROWS))
+            .set_data_page_row_count_limit(PAGE_ROWS)
+            .set_sorting_columns(Some(sorting));
+        if table.sorted_by.len() > 1 {
+            let item = ColumnPath::from(ITEM_COLUMN);
+            properties = properties
+                .set_column_dictionary_enabled(item.clone(), true)
+                .set_column_bloom_filter_enabled(item.clone(), true)
+                .set_column_bloom_filter_max_ndv(item, ROW_GROUP_ROWS as u64 / 16);
+        }
+        let writer = ArrowWriter::try_new(file, Arc::clone(&schema), Some(properties.build()))
+            .map_err(|e| failed(&table, e))?;
+        let n_channels = table.columns.len().saturating_sub(2);
+        let frames = FrameBuffer { channels: vec![Vec::new(); n_channels], ..Default::default() };
+        Ok(Self { table, schema, writer, frames, n_rows: 0 })
+    }
+
+    /// Appends rows of a row type.
+    ///
+    /// # Errors
+    /// [`StoreError::Parquet`].
+    pub fn write_rows<R: Row>(&mut self, rows: &[R]) -> Result<(), StoreError> {
+        debug_assert_eq!(R::schema(), self.table, "rows of another table");
+        self.n_rows += rows.len() as u64;
+        self.writer.write(&R::to_batch(rows)).map_err(|e| failed(&self.table, e))
+    }
+
+    /// Appends the frames of one item to a frame table.
+    ///
+    /// Row groups hold whole items as long as an item is shorter than a row group.
+    ///
+    /// # Shapes
+    /// - `frames`: `[n_frames, n_channels]`
+    ///
+    /// # Errors
+    /// [`StoreError::Parquet`].
+    ///
+    /// # Panics
+    /// When `frames` has another number of channels than the table.
+    pub fn write_frames(
+        &mut self,
+        item: &str,
+        frames: ndarray::ArrayView2<f32>,
+    ) -> Result<(), StoreError> {
+        assert_eq!(frames.ncols(), self.frames.channels.len(), "channels of {}", self.table.name);
+        let waiting = self.frames.frame.len();
+        if waiting > 0 && waiting + frames.nrows() > ROW_GROUP_ROWS {
+            self.flush_frames()?;
+        }
+        for (start, piece) in frames.axis_chunks_iter(ndarray::Axis(0), ROW_GROUP_ROWS).enumerate()
+        {
+            let first = start * ROW_GROUP_ROWS;
+            let buffer = &mut self.frames;
+            buffer.items.push((item.to_owned(), piece.nrows()));
+            buffer.frame.extend((first..first + piece.nrows()).map(|i| i as i32));
+            for (channel, values) in buffer.channels.iter_mut().zip(piece.columns()) {
+                channel.extend(values);
+            }
+            if buffer.frame.len() >= ROW_GROUP_ROWS {
+                self.flush_frames()?;
+            }
+        }
+        Ok(())
+    }
+
+    fn flush_frames(&mut self) -> Result<(), StoreError> {
+        let buffer = &mut self.frames;
+        let n_rows = buffer.frame.len();
+        if n_rows == 0 {
+            return Ok(());
+        }
+        let mut item = StringBuilder::with_capacity(n_rows, n_rows * 16);
+        for (name, n) in buffer.items.drain(..) {
+            (0..n).for_each(|_| item.append_value(&name));
+        }
+        let frame = Int32Array::from(std::mem::take(&mut buffer.frame));
+        let mut columns: Vec<ArrayRef> = vec![Arc::new(item.finish()), Arc::new(frame)];
+        for channel in &mut buffer.channels {
+            columns.push(Arc::new(Float32Array::from(std::mem::take(channel))));
+        }
+        let batch = RecordBatch::try_new(Arc::clone(&self.schema), columns)
+            .expect("invariant: the buffer has the table's columns, all of one length");
+        self.n_rows += n_rows as u64;
+        self.writer
+            .write(&batch)
+            .and_then(|()| self.writer.flush())
+            .map_err(|e| failed(&self.table, e))
+    }
+
+    /// Ends the part, with `metadata` in its footer.
+    ///
+    /// # Errors
+    /// [`StoreError::Parquet`].
+    pub fn finish(mut self, metadata: &[(&str, String)]) -> Result<FinishedPart, StoreError> {
+        self.flush_frames()?;
+        for (key, value) in metadata {
+            self.writer.append_key_value_metadata(KeyValue::new(
+                format!("motiongen.{key}"),
+                value.clone(),
+            ));
+        }
+        let file = self.writer.into_inner().map_err(|e| failed(&self.table, e))?;
+        Ok(FinishedPart { file, n_rows: self.n_rows })
+    }
+}
+
+fn failed(table: &TableSchema, source: ParquetError) -> StoreError {
+    let place = "the part being written".to_owned();
+    StoreError::Parquet { table: table.name.to_owned(), place, source }
+}

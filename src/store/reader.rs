@@ -1,0 +1,212 @@
+//! Reading tables: the live rows of a store, one row group in memory at a time.
+
+use std::ops::Range;
+use std::sync::Arc;
+
+use arrow_array::{Array as _, BooleanArray, RecordBatch, StringArray};
+use bytes::Bytes;
+use futures::future::BoxFuture;
+use futures::{FutureExt as _, StreamExt as _, TryFutureExt as _};
+use object_store::path::Path as ObjectPath;
+use object_store::{ObjectStore, ObjectStoreExt as _};
+use parquet::arrow::ParquetRecordBatchStreamBuilder;
+use parquet::arrow::arrow_reader::{ArrowReaderOptions, ParquetRecordBatchReaderBuilder};
+use parquet::arrow::async_reader::AsyncFileReader;
+use parquet::errors::{ParquetError, Result as ParquetResult};
+use parquet::file::metadata::{ParquetMetaData, ParquetMetaDataReader};
+
+use super::StoreError;
+use super::client::block_on;
+use super::commit::{LivePart, live_parts};
+use super::location::{Kind, Location, join};
+use super::schema::{Row, TableSchema};
+use super::tables::ITEM_COLUMN;
+
+/// The batches of a part, in order.
+type Batches = Box<dyn Iterator<Item = Result<RecordBatch, ParquetError>>>;
+
+/// The live rows of one table, as they were when the snapshot was taken.
+#[derive(Clone, Debug)]
+pub struct Snapshot {
+    store: Location,
+    schema: TableSchema,
+    parts: Vec<LivePart>,
+}
+
+impl Snapshot {
+    /// Takes a snapshot of a table; a table that nobody has written is empty.
+    ///
+    /// # Errors
+    /// [`StoreError::SchemaVersion`] when a part is of another version; [`StoreError`] when the
+    /// commits cannot be read.
+    pub fn take(store: &Location, schema: TableSchema) -> Result<Self, StoreError> {
+        let parts = live_parts(store)?.remove(schema.name).unwrap_or_default();
+        for live in &parts {
+            check_version(store, &schema, live)?;
+        }
+        Ok(Self { store: store.clone(), schema, parts })
+    }
+
+    pub fn parts(&self) -> &[LivePart] {
+        &self.parts
+    }
+
+    /// Returns the live rows, part by part; within a part they are sorted as the schema says.
+    pub fn batches(&self) -> impl Iterator<Item = Result<RecordBatch, StoreError>> + '_ {
+        self.parts.iter().flat_map(move |live| {
+            let failed = move |source| StoreError::Parquet {
+                table: self.schema.name.to_owned(),
+                place: self.store.url_of(&live.part.path),
+                source,
+            };
+            let batches: Batches = match open(&self.store, &live.part.path) {
+                Ok(batches) => batches,
+                Err(e) => Box::new(std::iter::once(Err(e))),
+            };
+            batches.map(move |batch| {
+                let batch = batch.map_err(failed)?;
+                self.check_columns(&batch, &live.part.path)?;
+                without(&batch, &live.superseded).map_err(failed)
+            })
+        })
+    }
+
+    /// Reads the whole table into rows; for tables with one row per item.
+    ///
+    /// # Errors
+    /// [`StoreError`] when a part cannot be read or has other columns.
+    ///
+    /// # Panics
+    /// When `R` is a row of another table.
+    pub fn rows<R: Row>(&self) -> Result<Vec<R>, StoreError> {
+        assert_eq!(R::schema().name, self.schema.name, "rows of another table");
+        let mut rows = Vec::new();
+        for batch in self.batches() {
+            let batch = batch?;
+            let read = R::from_batch(&batch).ok_or_else(|| self.columns_error(&batch, ""))?;
+            rows.extend(read);
+        }
+        Ok(rows)
+    }
+
+    fn check_columns(&self, batch: &RecordBatch, path: &str) -> Result<(), StoreError> {
+        let expected = self.schema.arrow();
+        if expected.fields().iter().all(|f| {
+            batch
+                .schema_ref()
+                .field_with_name(f.name())
+                .is_ok_and(|g| g.data_type() == f.data_type())
+        }) {
+            return Ok(());
+        }
+        Err(self.columns_error(batch, path))
+    }
+
+    fn columns_error(&self, batch: &RecordBatch, path: &str) -> StoreError {
+        let found: Vec<_> = batch
+            .schema_ref()
+            .fields()
+            .iter()
+            .map(|f| format!("{}: {}", f.name(), f.data_type()))
+            .collect();
+        let missing = self
+            .schema
+            .arrow()
+            .fields()
+            .iter()
+            .map(|f| format!("{}: {}", f.name(), f.data_type()))
+            .filter(|f| !found.contains(f))
+            .collect();
+        let place = self.store.url_of(path);
+        StoreError::Columns { table: self.schema.name.to_owned(), place, missing, found }
+    }
+}
+
+pub(super) fn check_version(
+    store: &Location,
+    schema: &TableSchema,
+    live: &LivePart,
+) -> Result<(), StoreError> {
+    let found = live.part.schema_version;
+    if found == schema.version {
+        return Ok(());
+    }
+    let remedy = if found > schema.version {
+        "install a newer motiongen".to_owned()
+    } else {
+        "run the stage that wrote it again with --force".to_owned()
+    };
+    let place = store.url_of(&live.part.path);
+    let table = schema.name.to_owned();
+    Err(StoreError::SchemaVersion { table, place, found, supported: schema.version, remedy })
+}
+
+/// Returns the rows whose item is not among `superseded`.
+fn without(batch: &RecordBatch, superseded: &[String]) -> Result<RecordBatch, ParquetError> {
+    if superseded.is_empty() {
+        return Ok(batch.clone());
+    }
+    let items = batch
+        .column_by_name(ITEM_COLUMN)
+        .and_then(|c| c.as_any().downcast_ref::<StringArray>())
+        .ok_or_else(|| ParquetError::General(format!("no text column {ITEM_COLUMN}")))?;
+    let dead: std::collections::HashSet<&str> = superseded.iter().map(String::as_str).collect();
+    let keep: BooleanArray =
+        items.iter().map(|item| Some(item.is_some_and(|i| !dead.contains(i)))).collect();
+    Ok(arrow_select::filter::filter_record_batch(batch, &keep)?)
+}
+
+fn open(store: &Location, path: &str) -> ParquetResult<Batches> {
+    match store.kind() {
+        Kind::Local(root) => {
+            let file = std::fs::File::open(root.join(path))?;
+            Ok(Box::new(
+                ParquetRecordBatchReaderBuilder::try_new(file)?
+                    .build()?
+                    .map(|batch| batch.map_err(ParquetError::from)),
+            ))
+        }
+        Kind::Remote { store, prefix } => {
+            let path = join(prefix, path);
+            let stream = block_on(async {
+                let size = store.head(&path).await.map_err(external)?.size;
+                let object = RemotePart { store: Arc::clone(store), path, size };
+                ParquetRecordBatchStreamBuilder::new(object).await?.build()
+            })?;
+            let mut stream = Box::pin(stream);
+            Ok(Box::new(std::iter::from_fn(move || block_on(stream.next()))))
+        }
+    }
+}
+
+/// A Parquet part in an object store, read by ranges.
+struct RemotePart {
+    store: Arc<dyn ObjectStore>,
+    path: ObjectPath,
+    size: u64,
+}
+
+impl AsyncFileReader for RemotePart {
+    fn get_bytes(&mut self, range: Range<u64>) -> BoxFuture<'_, ParquetResult<Bytes>> {
+        async move { self.store.get_range(&self.path, range).await.map_err(external) }.boxed()
+    }
+
+    fn get_byte_ranges(
+        &mut self,
+        ranges: Vec<Range<u64>>,
+    ) -> BoxFuture<'_, ParquetResult<Vec<Bytes>>> {
+        async move { self.store.get_ranges(&self.path, &ranges).await.map_err(external) }.boxed()
+    }
+
+    fn get_metadata<'a>(
+        &'a mut self,
+        _options: Option<&'a ArrowReaderOptions>,
+    ) -> BoxFuture<'a, ParquetResult<Arc<ParquetMetaData>>> {
+        let size = self.size;
+        ParquetMetaDataReader::new().load_and_finish(self, size).map_ok(Arc::new).boxed()
+    }
+}
+
+fn external(error: object_store::Error) -> ParquetError {
+    ParquetError::External(Box::new(error))
+}

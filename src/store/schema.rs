@@ -1,0 +1,263 @@
+//! Table schemas: a column's name, type, unit and meaning, spelled once.
+
+use std::borrow::Cow;
+use std::sync::Arc;
+
+use arrow_array::{
+    Array, ArrayRef, BooleanArray, Float32Array, Float64Array, Int32Array, Int64Array, RecordBatch,
+    StringArray, TimestampMicrosecondArray,
+};
+use arrow_schema::{DataType, Field, Schema, SchemaRef, TimeUnit};
+
+/// A table: what one row is, its columns, and the order of its rows within a part.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TableSchema {
+    pub name: &'static str,
+    /// Raised when a column changes; parts of another version are refused, not guessed at.
+    pub version: u32,
+    /// What one row is.
+    pub description: &'static str,
+    pub columns: Vec<Column>,
+    /// Columns by which the rows of a part are sorted.
+    pub sorted_by: &'static [&'static str],
+}
+
+/// One column of a table.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Column {
+    pub name: Cow<'static, str>,
+    pub column_type: ColumnType,
+    pub nullable: bool,
+    /// Unit of the values; empty for names, flags and other unitless text.
+    pub unit: &'static str,
+    pub description: Cow<'static, str>,
+}
+
+/// The types that columns may have, named as Arrow names them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ColumnType {
+    Utf8,
+    Boolean,
+    Int32,
+    Int64,
+    Float32,
+    Float64,
+    /// Microseconds since 1970-01-01T00:00:00 UTC.
+    TimestampUs,
+}
+
+impl ColumnType {
+    pub fn name(self) -> &'static str {
+        match self {
+            ColumnType::Utf8 => "utf8",
+            ColumnType::Boolean => "boolean",
+            ColumnType::Int32 => "int32",
+            ColumnType::Int64 => "int64",
+            ColumnType::Float32 => "float32",
+            ColumnType::Float64 => "float64",
+            ColumnType::TimestampUs => "timestamp[us, UTC]",
+        }
+    }
+
+    fn data_type(self) -> DataType {
+        match self {
+            ColumnType::Utf8 => DataType::Utf8,
+            ColumnType::Boolean => DataType::Boolean,
+            ColumnType::Int32 => DataType::Int32,
+            ColumnType::Int64 => DataType::Int64,
+            ColumnType::Float32 => DataType::Float32,
+            ColumnType::Float64 => DataType::Float64,
+            ColumnType::TimestampUs => {
+                DataType::Timestamp(TimeUnit::Microsecond, Some("UTC".into()))
+            }
+        }
+    }
+}
+
+impl TableSchema {
+    /// Returns the Arrow schema of the table's parts.
+    pub fn arrow(&self) -> SchemaRef {
+        let field = |c: &Column| Field::new(c.name.as_ref(), c.column_type.data_type(), c.nullable);
+        Arc::new(Schema::new(self.columns.iter().map(field).collect::<Vec<_>>()))
+    }
+
+    /// Returns the schema as the JSON that `schemas/<table>.json` holds.
+    pub fn to_json(&self) -> serde_json::Value {
+        let columns: Vec<_> = self
+            .columns
+            .iter()
+            .map(|c| {
+                serde_json::json!({
+                    "name": c.name,
+                    "type": c.column_type.name(),
+                    "nullable": c.nullable,
+                    "unit": c.unit,
+                    "description": c.description,
+                })
+            })
+            .collect();
+        serde_json::json!({
+            "table": self.name,
+            "version": self.version,
+            "description": self.description,
+            "sorted_by": self.sorted_by,
+            "columns": columns,
+        })
+    }
+
+    /// Returns the table's section of `docs/tables.md`.
+    pub fn to_markdown(&self) -> String {
+        let mut text = format!(
+            "## `{}` (version {})\n\n{} Sorted by {}.\n\n\
+             | column | type | null | unit | meaning |\n|---|---|---|---|---|\n",
+            self.name,
+            self.version,
+            self.description,
+            self.sorted_by.iter().map(|c| format!("`{c}`")).collect::<Vec<_>>().join(", "),
+        );
+        for c in &self.columns {
+            let null = if c.nullable { "yes" } else { "" };
+            text += &format!(
+                "| `{}` | {} | {null} | {} | {} |\n",
+                c.name,
+                c.column_type.name(),
+                c.unit,
+                c.description
+            );
+        }
+        text
+    }
+}
+
+/// A moment, in microseconds since 1970-01-01T00:00:00 UTC.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct TimestampUs(pub i64);
+
+impl TimestampUs {
+    /// Returns the present moment.
+    pub fn now() -> Self {
+        let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+        Self(since.map_or(0, |d| i64::try_from(d.as_micros()).unwrap_or(i64::MAX)))
+    }
+}
+
+/// A Rust type that can be a column's cell.
+pub trait Cell: Sized {
+    const TYPE: ColumnType;
+    const NULLABLE: bool = false;
+
+    fn array(cells: impl Iterator<Item = Self>) -> ArrayRef;
+
+    /// Returns the cell of row `i`, or `None` when the array is of another type.
+    fn get(array: &dyn Array, i: usize) -> Option<Self>;
+}
+
+macro_rules! cell {
+    ($rust:ty, $array:ty, $variant:ident, |$v:ident| $get:expr) => {
+        impl Cell for $rust {
+            const TYPE: ColumnType = ColumnType::$variant;
+            fn array(cells: impl Iterator<Item = Self>) -> ArrayRef {
+                Arc::new(cells.map(Some).collect::<$array>())
+            }
+            fn get(array: &dyn Array, i: usize) -> Option<Self> {
+                let $v = array.as_any().downcast_ref::<$array>()?.value(i);
+                Some($get)
+            }
+        }
+        impl Cell for Option<$rust> {
+            const TYPE: ColumnType = ColumnType::$variant;
+            const NULLABLE: bool = true;
+            fn array(cells: impl Iterator<Item = Self>) -> ArrayRef {
+                Arc::new(cells.collect::<$array>())
+            }
+            fn get(array: &dyn Array, i: usize) -> Option<Self> {
+                if array.is_null(i) {
+                    return Some(None);
+                }
+                <$rust as Cell>::get(array, i).map(Some)
+            }
+        }
+    };
+}
+
+cell!(String, StringArray, Utf8, |v| v.to_owned());
+cell!(bool, BooleanArray, Boolean, |v| v);
+cell!(i32, Int32Array, Int32, |v| v);
+cell!(i64, Int64Array, Int64, |v| v);
+cell!(f32, Float32Array, Float32, |v| v);
+cell!(f64, Float64Array, Float64, |v| v);
+
+impl Cell for TimestampUs {
+    const TYPE: ColumnType = ColumnType::TimestampUs;
+    fn array(cells: impl Iterator<Item = Self>) -> ArrayRef {
+        let array: TimestampMicrosecondArray = cells.map(|t| Some(t.0)).collect();
+        Arc::new(array.with_timezone("UTC"))
+    }
+    fn get(array: &dyn Array, i: usize) -> Option<Self> {
+        let array = array.as_any().downcast_ref::<TimestampMicrosecondArray>()?;
+        Some(TimestampUs(array.value(i)))
+    }
+}
+
+/// A row type of a table; made by [`rows!`].
+pub trait Row: Sized {
+    fn schema() -> TableSchema;
+
+    /// Returns rows as a batch of the table's Arrow schema.
+    fn to_batch(rows: &[Self]) -> RecordBatch;
+
+    /// Returns the rows of a batch, or `None` when a column is missing or of another type.
+    fn from_batch(batch: &RecordBatch) -> Option<Vec<Self>>;
+}
+
+/// Declares a table and its row type at once, so that neither can drift from the other.
+macro_rules! rows {
+    (
+        $description:literal
+        $row:ident in $name:literal version $version:literal sorted by [$($sort:ident),+]
+        { $($field:ident: $type:ty, $unit:literal, $meaning:literal;)+ }
+    ) => {
+        #[doc = $description]
+        #[derive(Clone, Debug, PartialEq)]
+        pub struct $row {
+            $(#[doc = $meaning] pub $field: $type,)+
+        }
+
+        impl $crate::store::schema::Row for $row {
+            fn schema() -> $crate::store::schema::TableSchema {
+                use $crate::store::schema::{Cell, Column, TableSchema};
+                TableSchema {
+                    name: $name,
+                    version: $version,
+                    description: $description,
+                    columns: vec![$(Column {
+                        name: stringify!($field).into(),
+                        column_type: <$type as Cell>::TYPE,
+                        nullable: <$type as Cell>::NULLABLE,
+                        unit: $unit,
+                        description: $meaning.into(),
+                    },)+],
+                    sorted_by: &[$(stringify!($sort)),+],
+                }
+            }
+
+            fn to_batch(rows: &[Self]) -> arrow_array::RecordBatch {
+                use $crate::store::schema::Cell;
+                let columns = vec![$(
+                    <$type as Cell>::array(rows.iter().map(|r| r.$field.clone())),
+                )+];
+                arrow_array::RecordBatch::try_new(Self::schema().arrow(), columns)
+                    .expect("invariant: the arrays are made from the schema's own cell types")
+            }
+
+            fn from_batch(batch: &arrow_array::RecordBatch) -> Option<Vec<Self>> {
+                use $crate::store::schema::Cell;
+                $(let $field = batch.column_by_name(stringify!($field))?;)+
+                (0..batch.num_rows())
+                    .map(|i| Some($row { $($field: <$type as Cell>::get($field.as_ref(), i)?,)+ }))
+                    .collect()
+            }
+        }
+    };
+}
+pub(crate) use rows;

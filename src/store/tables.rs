@@ -1,0 +1,163 @@
+//! The tables of a store. `schemas/*.json` and `docs/tables.md` are generated from this file.
+
+use std::borrow::Cow;
+
+use super::schema::{Column, ColumnType, Row, TableSchema, TimestampUs, rows};
+use crate::motion::{CHANNEL_NAMES, channel_unit};
+
+/// The column that names the item a row belongs to, in every table.
+pub const ITEM_COLUMN: &str = "phrase_id";
+
+rows! {
+    "One row per phrase that ingest accepted."
+    PhraseRow in "phrases" version 1 sorted by [phrase_id]
+    {
+        phrase_id: String, "", "Name of the phrase: its folder in a phrase layout, its relative path in a music library.";
+        source: String, "URL", "The source it came from.";
+        motion_url: Option<String>, "URL", "The file that the motion was read from.";
+        features_url: Option<String>, "URL", "The feature file (`features.npz`).";
+        audio_url: Option<String>, "URL", "The audio file.";
+        beats_url: Option<String>, "URL", "The beat list (`.beats.txt`).";
+        motion_bytes: Option<i64>, "bytes", "Size of the motion file.";
+        features_bytes: Option<i64>, "bytes", "Size of the feature file.";
+        audio_bytes: Option<i64>, "bytes", "Size of the audio file.";
+        beats_bytes: Option<i64>, "bytes", "Size of the beat list.";
+        content_hash: String, "SHA-256", "Digest of the phrase's files: SHA-256 over one line `role sha256` per file, roles sorted.";
+        has_motion: bool, "", "Whether the phrase has motion.";
+        has_features: bool, "", "Whether the phrase has a feature file.";
+        has_audio: bool, "", "Whether the phrase has audio.";
+        has_beats: bool, "", "Whether the phrase has beat times (beat list or feature file).";
+        motion_format: Option<String>, "", "`npy` (25 channels as they were) or `bvh` (converted).";
+        audio_codec: Option<String>, "", "Codec named by the audio header.";
+        sample_rate_hz: Option<i32>, "Hz", "Sample rate named by the audio header.";
+        n_channels: Option<i32>, "channels", "Channels named by the audio header.";
+        duration_s: f64, "s", "Length of the audio; without audio, frames / 30.";
+        n_frames: Option<i64>, "frames", "Motion frames at 30 fps.";
+        n_feature_frames: Option<i64>, "frames", "Frames in the feature file.";
+        split: String, "", "`train` (90 %), `validation` (5 %) or `test` (5 %), by a stable hash of `phrase_id`.";
+        tempo_bpm: Option<f64>, "beats/min", "Tempo.";
+        tempo_source: Option<String>, "", "Where the tempo came from: `beats_file` or `features`.";
+        beats_per_bar: Option<i32>, "beats", "Beats in a bar.";
+        beats_per_bar_source: Option<String>, "", "Where that came from: `beats_file` (numbered beats) or `default`.";
+    }
+}
+
+rows! {
+    "One row per item that a stage could not do; a later success removes it."
+    FailureRow in "failures" version 1 sorted by [phrase_id]
+    {
+        stage: String, "", "The stage that failed.";
+        phrase_id: String, "", "The item, as the stage would have named it.";
+        source: String, "URL", "The file at fault, or the source's folder.";
+        kind: String, "", "Class of the failure, for grouping.";
+        message: String, "", "What is wrong and what to do about it.";
+        time: TimestampUs, "", "When it failed.";
+    }
+}
+
+/// Name of the motion table.
+pub const MOTION: &str = "motion";
+
+/// Returns the schema of `motion`: one row per frame, one column per channel.
+pub fn motion() -> TableSchema {
+    let channels = CHANNEL_NAMES.iter().enumerate().map(|(i, name)| Column {
+        name: Cow::Borrowed(*name),
+        column_type: ColumnType::Float32,
+        nullable: false,
+        unit: channel_unit(i).unwrap_or_default(),
+        description: Cow::Owned(format!("Channel {i} of the frame.")),
+    });
+    frame_table(MOTION, "One row per motion frame at 30 fps.", channels)
+}
+
+/// Builds the schema of a table with one row per frame and one named column per channel.
+fn frame_table(
+    name: &'static str,
+    description: &'static str,
+    channels: impl Iterator<Item = Column>,
+) -> TableSchema {
+    let id = |name: &'static str, column_type, unit, meaning: &'static str| Column {
+        name: name.into(),
+        column_type,
+        nullable: false,
+        unit,
+        description: meaning.into(),
+    };
+    let ids = [
+        id(ITEM_COLUMN, ColumnType::Utf8, "", "The phrase, as in `phrases`."),
+        id(
+            "frame",
+            ColumnType::Int32,
+            "frames",
+            "Index within the phrase, from 0; time is frame / 30 s.",
+        ),
+    ];
+    TableSchema {
+        name,
+        version: 1,
+        description,
+        columns: ids.into_iter().chain(channels).collect(),
+        sorted_by: &["phrase_id", "frame"],
+    }
+}
+
+/// Returns every table of a store.
+pub fn all() -> Vec<TableSchema> {
+    vec![PhraseRow::schema(), motion(), FailureRow::schema()]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rows_survive_the_way_through_a_batch() {
+        let rows = vec![
+            FailureRow {
+                stage: "ingest".into(),
+                phrase_id: "a b/ü".into(),
+                source: "file:///x".into(),
+                kind: "shape".into(),
+                message: "m".into(),
+                time: TimestampUs(1_700_000_000_123_456),
+            },
+            FailureRow {
+                stage: "ingest".into(),
+                phrase_id: "c".into(),
+                source: String::new(),
+                kind: String::new(),
+                message: String::new(),
+                time: TimestampUs(-1),
+            },
+        ];
+        assert_eq!(FailureRow::from_batch(&FailureRow::to_batch(&rows)), Some(rows));
+    }
+
+    #[test]
+    fn a_batch_of_another_table_is_no_row() {
+        let row = FailureRow {
+            stage: "ingest".into(),
+            phrase_id: "a".into(),
+            source: String::new(),
+            kind: String::new(),
+            message: String::new(),
+            time: TimestampUs(0),
+        };
+        assert_eq!(PhraseRow::from_batch(&FailureRow::to_batch(&[row])), None);
+    }
+
+    #[test]
+    fn column_names_are_unique_and_sort_columns_exist() {
+        for table in all() {
+            let mut names: Vec<_> = table.columns.iter().map(|c| c.name.as_ref()).collect();
+            for sort in table.sorted_by {
+                assert!(names.contains(sort), "{}: {sort}", table.name);
+            }
+            assert!(names.contains(&ITEM_COLUMN), "{}", table.name);
+            let n = names.len();
+            names.sort_unstable();
+            names.dedup();
+            assert_eq!(names.len(), n, "{}", table.name);
+        }
+    }
+}
