@@ -36,6 +36,8 @@ fuzz_target!(|bytes: &[u8]| {
     for other in [streamed, again] {
         assert_eq!(other.shape, array.shape);
         // Bits, because a NaN differs from itself.
-        assert!(other.values.iter().map(|v| v.to_bits()).eq(array.values.iter().map(|v| v.to_bits())));
+        assert!(
+            other.values.iter().map(|v| v.to_bits()).eq(array.values.iter().map(|v| v.to_bits()))
+        );
     }
 });

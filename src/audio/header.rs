@@ -7,7 +7,7 @@ mod error;
 #[cfg(test)]
 mod tests;
 
-use std::io::Cursor;
+use std::io::{self, Cursor, Read, Seek, SeekFrom};
 use std::sync::LazyLock;
 
 use symphonia::core::codecs::audio::well_known as codec;
@@ -19,7 +19,7 @@ use symphonia::core::formats::well_known::{
     FORMAT_ID_OGG, FORMAT_ID_WAVE,
 };
 use symphonia::core::formats::{FormatId, FormatOptions, FormatReader, Track, TrackType};
-use symphonia::core::io::MediaSourceStream;
+use symphonia::core::io::{MediaSource, MediaSourceStream};
 use symphonia::core::meta::MetadataOptions;
 
 pub use error::AudioHeaderError;
@@ -27,6 +27,9 @@ pub use error::AudioHeaderError;
 /// Bytes without a known marker after which the search for one ends. Symphonia's own 1 MiB lets
 /// chance pairs of MPEG sync words turn one in twenty random files into audio.
 const MAX_PROBE_BYTES: u32 = 64 * 1024;
+
+/// Bytes at the start of a file that messages and checks look at.
+const HEAD_BYTES: u64 = 4096;
 
 static PROBE: LazyLock<Probe> = LazyLock::new(|| {
     let options = ProbeOptions { max_probe_depth: MAX_PROBE_BYTES, ..ProbeOptions::default() };
@@ -58,23 +61,33 @@ pub struct AudioHeader {
     pub duration_source: DurationSource,
 }
 
-/// Reads the header of a WAV, AIFF, FLAC, MP3, Ogg, MP4 or ADTS file held in memory.
+/// Reads the header of an audio file held in memory; see [`read_header_from`].
+pub fn read_header(bytes: &[u8], extension_hint: &str) -> Result<AudioHeader, AudioHeaderError> {
+    read_header_from(Cursor::new(bytes), extension_hint)
+}
+
+/// Reads the header of a WAV, AIFF, FLAC, MP3, Ogg, MP4 or ADTS file, of any size.
 ///
 /// The content decides; `extension_hint` (no dot, may be empty) only completes messages. In an
 /// MP3 without a LAME tag, an ADTS file and a PCM file shorter than it declares, the duration is
 /// counted from the packets. Errors: [`AudioHeaderError`].
-pub fn read_header(bytes: &[u8], extension_hint: &str) -> Result<AudioHeader, AudioHeaderError> {
-    if bytes.is_empty() {
+pub fn read_header_from(
+    mut input: impl Read + Seek + Send + Sync,
+    extension_hint: &str,
+) -> Result<AudioHeader, AudioHeaderError> {
+    let survey = Survey::of(&mut input).map_err(|e| error::broken_input(&e))?;
+    if survey.n_bytes == 0 {
         return Err(AudioHeaderError::Empty);
     }
-    if let Some(error) = error::other_format(bytes) {
+    if let Some(error) = error::other_format(&survey.head) {
         return Err(error);
     }
-    let mut reader = open(bytes, extension_hint)?;
+    let n_bytes = survey.n_bytes;
+    let mut reader = open(input, &survey, extension_hint)?;
     let info = reader.format_info();
     let (format, container) = (info.format, container_name(info.short_name));
-    if !starts_as(format, bytes) {
-        return Err(error::unknown(bytes, extension_hint));
+    if !starts_as(format, &survey.head) {
+        return Err(error::unknown(&survey.head, extension_hint));
     }
     let track = reader
         .default_track(TrackType::Audio)
@@ -97,7 +110,7 @@ pub fn read_header(bytes: &[u8], extension_hint: &str) -> Result<AudioHeader, Au
 
     let frame_bytes = pcm_frame_bytes(params.codec, n_channels);
     let stated = match format {
-        FORMAT_ID_WAVE | FORMAT_ID_AIFF => whole(&track, frame_bytes, bytes.len()),
+        FORMAT_ID_WAVE | FORMAT_ID_AIFF => whole(&track, frame_bytes, n_bytes),
         FORMAT_ID_FLAC | FORMAT_ID_OGG => stated_duration_s(&track, params),
         FORMAT_ID_ISOMP4 => edited_duration_s(reader.as_ref(), &track, params),
         // Without a LAME tag symphonia extrapolates from the first frames' bit rate.
@@ -110,12 +123,13 @@ pub fn read_header(bytes: &[u8], extension_hint: &str) -> Result<AudioHeader, Au
         Some(duration_s) => (duration_s, DurationSource::Header),
         None => {
             let n_frames = match frame_bytes {
-                Some(size) if format == FORMAT_ID_WAVE => wav_frames_present(bytes, size),
+                // Symphonia's packets would miss up to 1,151 frames at the end.
+                Some(size) if format == FORMAT_ID_WAVE => survey.wav_data_bytes.map(|n| n / size),
                 _ => None,
             };
             let duration_s = match n_frames {
                 Some(n_frames) => n_frames as f64 / f64::from(sample_rate_hz),
-                None => counted_duration_s(reader.as_mut(), &track, bytes.len()),
+                None => counted_duration_s(reader.as_mut(), &track, n_bytes),
             };
             (duration_s, DurationSource::Packets)
         }
@@ -133,11 +147,84 @@ pub fn read_header(bytes: &[u8], extension_hint: &str) -> Result<AudioHeader, Au
     })
 }
 
+/// What can be told of a file without knowing its format.
+struct Survey {
+    /// The first bytes.
+    head: Vec<u8>,
+    n_bytes: u64,
+    /// Bytes from the start of a WAV file's `data` chunk to the end of the file.
+    wav_data_bytes: Option<u64>,
+}
+
+impl Survey {
+    fn of(input: &mut (impl Read + Seek)) -> io::Result<Self> {
+        let n_bytes = input.seek(SeekFrom::End(0))?;
+        input.rewind()?;
+        let mut head = Vec::new();
+        input.take(HEAD_BYTES).read_to_end(&mut head)?;
+        let wav_data_bytes = match head.get(..4) {
+            Some(b"RIFF") => wav_data_bytes(input, n_bytes)?,
+            _ => None,
+        };
+        input.rewind()?;
+        Ok(Self { head, n_bytes, wav_data_bytes })
+    }
+}
+
+/// Finds the `data` chunk of a WAV file and returns the bytes from its content to the end.
+fn wav_data_bytes(input: &mut (impl Read + Seek), n_bytes: u64) -> io::Result<Option<u64>> {
+    let mut chunk_start = 12;
+    // A chunk has a head of 8 bytes, so the walk ends after at most n_bytes / 8 steps.
+    while chunk_start + 8 <= n_bytes {
+        input.seek(SeekFrom::Start(chunk_start))?;
+        let mut head = [0; 8];
+        input.read_exact(&mut head)?;
+        let [id @ .., s0, s1, s2, s3] = head;
+        if id == *b"data" {
+            return Ok(Some(n_bytes - chunk_start - 8));
+        }
+        let size = u64::from(u32::from_le_bytes([s0, s1, s2, s3]));
+        // Chunks start at even offsets.
+        chunk_start += 8 + size + size % 2;
+    }
+    Ok(None)
+}
+
+/// A reader as symphonia takes it.
+struct Media<R> {
+    input: R,
+    n_bytes: u64,
+}
+
+impl<R: Read> Read for Media<R> {
+    fn read(&mut self, bytes: &mut [u8]) -> io::Result<usize> {
+        self.input.read(bytes)
+    }
+}
+
+impl<R: Seek> Seek for Media<R> {
+    fn seek(&mut self, position: SeekFrom) -> io::Result<u64> {
+        self.input.seek(position)
+    }
+}
+
+impl<R: Read + Seek + Send + Sync> MediaSource for Media<R> {
+    fn is_seekable(&self) -> bool {
+        true
+    }
+
+    fn byte_len(&self) -> Option<u64> {
+        Some(self.n_bytes)
+    }
+}
+
 fn open<'a>(
-    bytes: &'a [u8],
+    input: impl Read + Seek + Send + Sync + 'a,
+    survey: &Survey,
     extension_hint: &str,
 ) -> Result<Box<dyn FormatReader + 'a>, AudioHeaderError> {
-    let stream = MediaSourceStream::new(Box::new(Cursor::new(bytes)), Default::default());
+    let media = Media { input, n_bytes: survey.n_bytes };
+    let stream = MediaSourceStream::new(Box::new(media), Default::default());
     let mut hint = Hint::new();
     if !extension_hint.is_empty() {
         hint.with_extension(extension_hint);
@@ -146,7 +233,7 @@ fn open<'a>(
     let metadata = MetadataOptions::default().limit_visual_bytes(Limit::Maximum(0));
     PROBE
         .probe(&hint, stream, FormatOptions::default(), metadata)
-        .map_err(|error| error::unreadable(bytes, extension_hint, &error))
+        .map_err(|error| error::unreadable(&survey.head, survey.n_bytes, extension_hint, &error))
 }
 
 /// Whether the marker that symphonia found is where it belongs, not somewhere inside a file of
@@ -199,33 +286,17 @@ fn edited_duration_s(
 
 /// The stated duration of an uncompressed file, unless its samples would not fit the file, as
 /// when it was cut short or streamed with a placeholder for its length.
-fn whole(track: &Track, frame_bytes: Option<u64>, file_bytes: usize) -> Option<f64> {
+fn whole(track: &Track, frame_bytes: Option<u64>, file_bytes: u64) -> Option<f64> {
     let n_frames = track.num_frames?;
-    if n_frames.saturating_mul(frame_bytes.unwrap_or(0)) > file_bytes as u64 {
+    if n_frames.saturating_mul(frame_bytes.unwrap_or(0)) > file_bytes {
         return None;
     }
     stated_duration_s(track, track.codec_params.as_ref()?.audio()?)
 }
 
-/// Frames between the start of the `data` chunk and the end of the file; symphonia's packets
-/// would miss up to 1,151 of them at the end.
-fn wav_frames_present(bytes: &[u8], frame_bytes: u64) -> Option<u64> {
-    let mut chunk = bytes.get(12..)?;
-    loop {
-        let (head, body) = chunk.split_first_chunk::<8>()?;
-        let [id @ .., s0, s1, s2, s3] = *head;
-        if id == *b"data" {
-            return Some(body.len() as u64 / frame_bytes);
-        }
-        let size = u32::from_le_bytes([s0, s1, s2, s3]) as usize;
-        // Chunks start at even offsets.
-        chunk = body.get(size.checked_add(size % 2)?..)?;
-    }
-}
-
 /// Time from the first packet's start to the last one's end. Timestamps rather than a sum of
 /// durations, because symphonia 0.6.1 does not trim the durations as it documents.
-fn counted_duration_s(reader: &mut dyn FormatReader, track: &Track, file_bytes: usize) -> f64 {
+fn counted_duration_s(reader: &mut dyn FormatReader, track: &Track, file_bytes: u64) -> f64 {
     let Some(time_base) = track.time_base else { return 0.0 };
     let (mut first, mut end) = (None, 0);
     // No codec has packets below one byte, so more of them than bytes means a loop.

@@ -31,6 +31,8 @@ pub fn start(verbosity: u8, quiet: bool, bars: Bars) {
         .with_ansi(io::IsTerminal::is_terminal(&io::stderr()))
         .with_writer(AboveBars(bars));
     subscriber.try_init().ok();
+    // A panic is a defect of ours, even where the stage survives it; it goes to the log like the rest.
+    std::panic::set_hook(Box::new(|panic| tracing::error!("defect: {panic}")));
 }
 
 struct AboveBars(Bars);

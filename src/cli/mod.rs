@@ -101,7 +101,7 @@ fn command<S: Stage>() -> Command {
     // The parameters' own doc comment would become the text about the stage, so that comes after.
     let command = S::Params::augment_args(Command::new(S::NAME))
         .about(S::ABOUT)
-        .long_about(None::<String>)
+        .long_about(S::ABOUT)
         .after_help(contract)
         .arg(
             Arg::new(config::FLAG)

@@ -37,12 +37,16 @@ impl Cache {
     }
 
     /// Returns the cached copy of `url` at `fingerprint`, and marks it as used now.
-    pub fn get(&self, url: &str, fingerprint: &str) -> Option<Content> {
+    ///
+    /// An entry of another size was cut by a crash of the machine, and is as good as missing.
+    pub fn get(&self, url: &str, fingerprint: &str, size_bytes: u64) -> Option<Content> {
         let path = self.path(url, fingerprint);
         let file = std::fs::File::options().read(true).write(true).open(&path).ok()?;
+        if file.metadata().ok()?.len() != size_bytes {
+            return None;
+        }
         // Access times are often switched off, so the modification time serves for both.
         file.set_modified(SystemTime::now()).ok();
-        let size_bytes = file.metadata().ok()?.len();
         read_local(&path, size_bytes).ok()
     }
 
@@ -156,9 +160,10 @@ mod tests {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let cache = Cache::open(folder.path(), 100).expect("a cache");
         cache.put("gs://b/x", "v1", content(7, 1)).expect("room for 7 bytes");
-        assert_eq!(bytes_of(cache.get("gs://b/x", "v1").expect("a hit")), vec![1; 7]);
-        assert!(cache.get("gs://b/x", "v2").is_none());
-        assert!(cache.get("gs://b/y", "v1").is_none());
+        assert_eq!(bytes_of(cache.get("gs://b/x", "v1", 7).expect("a hit")), vec![1; 7]);
+        assert!(cache.get("gs://b/x", "v2", 7).is_none());
+        assert!(cache.get("gs://b/y", "v1", 7).is_none());
+        assert!(cache.get("gs://b/x", "v1", 8).is_none(), "an entry that was cut");
     }
 
     #[test]
@@ -170,12 +175,12 @@ mod tests {
         pause();
         cache.put("b", "1", content(40, 2)).expect("kept");
         pause();
-        cache.get("a", "1").expect("a is used again");
+        cache.get("a", "1", 40).expect("a is used again");
         pause();
         cache.put("c", "1", content(40, 3)).expect("kept");
-        assert!(cache.get("b", "1").is_none(), "b was used longest ago");
-        assert_eq!(bytes_of(cache.get("a", "1").expect("a stays")), vec![1; 40]);
-        assert_eq!(bytes_of(cache.get("c", "1").expect("c stays")), vec![3; 40]);
+        assert!(cache.get("b", "1", 40).is_none(), "b was used longest ago");
+        assert_eq!(bytes_of(cache.get("a", "1", 40).expect("a stays")), vec![1; 40]);
+        assert_eq!(bytes_of(cache.get("c", "1", 40).expect("c stays")), vec![3; 40]);
         let total: u64 = entries(folder.path()).expect("listed").iter().map(|e| e.size_bytes).sum();
         assert_eq!(total, 80);
     }
@@ -186,6 +191,6 @@ mod tests {
         let cache = Cache::open(folder.path(), 10).expect("a cache");
         let read = cache.put("a", "1", content(11, 9)).expect("passed through");
         assert_eq!(bytes_of(read), vec![9; 11]);
-        assert!(cache.get("a", "1").is_none());
+        assert!(cache.get("a", "1", 11).is_none());
     }
 }

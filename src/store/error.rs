@@ -28,7 +28,7 @@ pub enum StoreError {
         place: String,
         hint: &'static str,
         #[source]
-        source: object_store::Error,
+        source: Box<object_store::Error>,
     },
 
     #[error("{place}: commit manifest is damaged ({reason}); move it away and run the stage again")]
@@ -38,14 +38,14 @@ pub enum StoreError {
         "table {table}: {place} has schema version {found}, this program reads version {supported}; \
          {remedy}"
     )]
-    SchemaVersion { table: String, place: String, found: u32, supported: u32, remedy: String },
+    SchemaVersion { table: String, place: String, found: u32, supported: u32, remedy: &'static str },
 
     #[error("table {table}: {place} is not a readable Parquet part")]
     Parquet {
         table: String,
         place: String,
         #[source]
-        source: parquet::errors::ParquetError,
+        source: Box<parquet::errors::ParquetError>,
     },
 
     #[error("table {table}: {place} lacks columns {missing:?}; it has {found:?}")]
@@ -73,7 +73,7 @@ impl StoreError {
             | object_store::Error::Unauthenticated { .. } => credentials_hint(place),
             _ => "",
         };
-        StoreError::Remote { action, place: place.to_owned(), hint, source }
+        StoreError::Remote { action, place: place.to_owned(), hint, source: Box::new(source) }
     }
 
     pub(crate) fn io(action: &'static str, place: &str, source: std::io::Error) -> Self {

@@ -7,6 +7,7 @@ use std::fmt;
 use std::io::Write as _;
 use std::path::{Path as FsPath, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 
 use bytes::Bytes;
 use futures::{StreamExt as _, TryStreamExt as _};
@@ -25,6 +26,10 @@ const MULTIPART_IN_FLIGHT: usize = 4;
 const READS_IN_FLIGHT: usize = 32;
 /// Bytes fetched by one ranged GET when a large object is read.
 const RANGE_BYTES: u64 = 8 << 20;
+/// Times that the creation of an object is repeated when its connection broke, and the pause before
+/// the first repetition; the next pauses are longer by as much each.
+const BROKEN_PUT_RETRIES: u32 = 4;
+const BROKEN_PUT_PAUSE: Duration = Duration::from_millis(100);
 
 /// A folder in local or remote storage.
 #[derive(Clone, Debug)]
@@ -87,6 +92,14 @@ impl Location {
             full.push_str(prefix.as_ref());
         }
         Ok(Self { url: full, kind: Kind::Remote { store, prefix } })
+    }
+
+    /// Returns a location behind a client that the caller holds already, for embedders; `url` is
+    /// what messages and tables call it, `prefix` the key below which its objects are.
+    pub fn with_client(url: &str, store: Arc<dyn ObjectStore>, prefix: &str) -> Self {
+        let prefix = ObjectPath::from(prefix);
+        let url = url.trim_end_matches('/').to_owned();
+        Self { url, kind: Kind::Remote { store, prefix } }
     }
 
     /// Opens a local folder, which need not exist.
@@ -205,18 +218,9 @@ impl Location {
                 persist_new(file, &root.join(path)).map_err(io)
             }
             Kind::Remote { store, prefix } => {
-                let options = PutOptions { mode: PutMode::Create, ..PutOptions::default() };
-                let payload = PutPayload::from_bytes(bytes.clone());
                 let object = join(prefix, path);
-                match block_on(store.put_opts(&object, payload, options)) {
-                    Ok(_) => Ok(Put::Written),
-                    Err(object_store::Error::AlreadyExists { .. }) => Ok(Put::AlreadyThere),
-                    // The store may have acted and its answer been lost; then our bytes are there.
-                    Err(e) => match block_on(read_object(store, &object)) {
-                        Ok(there) if there == bytes => Ok(Put::Written),
-                        _ => Err(StoreError::remote("write", &place(), e)),
-                    },
-                }
+                block_on(create(store, &object, &bytes))
+                    .map_err(|e| StoreError::remote("write", &place(), e))
             }
         }
     }
@@ -263,7 +267,14 @@ impl Location {
                         Err(object_store::Error::NotFound { .. }) => {}
                         Err(e) => return Err(e),
                     }
-                    upload(store, &path, file.path()).await.map(|()| Put::Written)
+                    match upload(store, &path, file.path()).await {
+                        Ok(()) => Ok(Put::Written),
+                        // As in `create`: the last answer may have been lost.
+                        Err(e) => match store.head(&path).await {
+                            Ok(there) if there.size == size => Ok(Put::Written),
+                            _ => Err(e),
+                        },
+                    }
                 };
                 block_on(put).map_err(|e| StoreError::remote("write", &place(), e))
             }
@@ -311,12 +322,55 @@ pub(crate) async fn read_sized(
     if size <= RANGE_BYTES {
         return store.get(path).await?.bytes().await;
     }
-    let ranges: Vec<_> = (0..size)
-        .step_by(RANGE_BYTES as usize)
-        .map(|start| start..(start + RANGE_BYTES).min(size))
-        .collect();
-    let pieces = store.get_ranges(path, &ranges).await?;
-    Ok(Bytes::from(pieces.concat()))
+    // Not `get_ranges`, which would join the ranges into one again.
+    let mut whole = Vec::with_capacity(size as usize);
+    for start in (0..size).step_by(RANGE_BYTES as usize) {
+        let end = (start + RANGE_BYTES).min(size);
+        whole.extend_from_slice(&store.get_range(path, start..end).await?);
+    }
+    Ok(Bytes::from(whole))
+}
+
+/// Creates an object unless it is there, over connections that may break at any moment.
+async fn create(
+    store: &Arc<dyn ObjectStore>,
+    path: &ObjectPath,
+    bytes: &Bytes,
+) -> object_store::Result<Put> {
+    let mut n_broken = 0;
+    loop {
+        let options = PutOptions { mode: PutMode::Create, ..PutOptions::default() };
+        let payload = PutPayload::from_bytes(bytes.clone());
+        let error = match store.put_opts(path, payload, options).await {
+            Ok(_) => return Ok(Put::Written),
+            Err(object_store::Error::AlreadyExists { .. }) => return Ok(Put::AlreadyThere),
+            Err(error) => error,
+        };
+        // The store may have acted and its answer been lost; then our bytes are there. The client
+        // repeats no request that creates, because only its caller can tell.
+        match read_object(store, path).await {
+            Ok(there) if there == *bytes => return Ok(Put::Written),
+            Err(object_store::Error::NotFound { .. })
+                if is_broken_connection(&error) && n_broken < BROKEN_PUT_RETRIES =>
+            {
+                n_broken += 1;
+                tokio::time::sleep(BROKEN_PUT_PAUSE * n_broken).await;
+            }
+            _ => return Err(error),
+        }
+    }
+}
+
+/// Returns whether a request failed because its connection did, without an answer of the store.
+fn is_broken_connection(error: &object_store::Error) -> bool {
+    let mut cause: Option<&(dyn std::error::Error + 'static)> = Some(error);
+    while let Some(error) = cause {
+        if error.is::<object_store::client::HttpError>() {
+            return true;
+        }
+        cause = error.source();
+    }
+    false
 }
 
 async fn upload(
@@ -332,15 +386,21 @@ async fn upload(
     let mut file = std::fs::File::open(file).map_err(generic)?;
     let upload = store.put_multipart(path).await?;
     let mut writer = object_store::WriteMultipart::new_with_chunk_size(upload, SINGLE_PUT_BYTES);
-    loop {
-        let mut chunk = Vec::with_capacity(SINGLE_PUT_BYTES);
-        let n =
-            (&mut file).take(SINGLE_PUT_BYTES as u64).read_to_end(&mut chunk).map_err(generic)?;
-        if n == 0 {
-            break;
+    let sent = async {
+        loop {
+            let mut chunk = Vec::with_capacity(SINGLE_PUT_BYTES);
+            let mut piece = (&mut file).take(SINGLE_PUT_BYTES as u64);
+            if piece.read_to_end(&mut chunk).map_err(generic)? == 0 {
+                return writer.wait_for_capacity(0).await;
+            }
+            writer.wait_for_capacity(MULTIPART_IN_FLIGHT).await?;
+            writer.put(Bytes::from(chunk));
         }
-        writer.wait_for_capacity(MULTIPART_IN_FLIGHT).await?;
-        writer.put(Bytes::from(chunk));
+    };
+    if let Err(e) = sent.await {
+        // Parts of an unfinished upload are invisible but stored, and paid for.
+        writer.abort().await.ok();
+        return Err(e);
     }
     writer.finish().await.map(|_| ())
 }

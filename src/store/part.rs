@@ -173,5 +173,5 @@ impl PartWriter {
 
 fn failed(table: &TableSchema, source: ParquetError) -> StoreError {
     let place = "the part being written".to_owned();
-    StoreError::Parquet { table: table.name.to_owned(), place, source }
+    StoreError::Parquet { table: table.name.to_owned(), place, source: Box::new(source) }
 }

@@ -57,7 +57,7 @@ impl Snapshot {
             let failed = move |source| StoreError::Parquet {
                 table: self.schema.name.to_owned(),
                 place: self.store.url_of(&live.part.path),
-                source,
+                source: Box::new(source),
             };
             let batches: Batches = match open(&self.store, &live.part.path) {
                 Ok(batches) => batches,
@@ -132,9 +132,9 @@ pub(super) fn check_version(
         return Ok(());
     }
     let remedy = if found > schema.version {
-        "install a newer motiongen".to_owned()
+        "install a newer motiongen"
     } else {
-        "run the stage that wrote it again with --force".to_owned()
+        "run the stage that wrote it again with --force"
     };
     let place = store.url_of(&live.part.path);
     let table = schema.name.to_owned();

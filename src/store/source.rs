@@ -94,12 +94,17 @@ impl Source {
         options: &ClientOptions,
         cache: Option<Cache>,
     ) -> Result<Self, StoreError> {
-        Ok(Self {
-            location: Location::open(text, options)?,
+        Ok(Self::at(Location::open(text, options)?, options, cache))
+    }
+
+    /// Returns the source at a location that the caller holds already.
+    pub fn at(location: Location, options: &ClientOptions, cache: Option<Cache>) -> Self {
+        Self {
+            location,
             cache: cache.map(Arc::new),
             read_ahead: options.n_requests.max(1),
             read_ahead_bytes: 64 << 20,
-        })
+        }
     }
 
     pub fn location(&self) -> &Location {
@@ -210,8 +215,9 @@ impl Fetcher {
 
     async fn content(&self, file: &SourceFile) -> Result<Content, StoreError> {
         let place = format!("{}/{}", self.url, file.path);
-        if let Some(cached) = self.cache.as_ref().and_then(|c| c.get(&place, &file.fingerprint)) {
-            return Ok(cached);
+        let cached = |c: &Arc<Cache>| c.get(&place, &file.fingerprint, file.size_bytes);
+        if let Some(content) = self.cache.as_ref().and_then(cached) {
+            return Ok(content);
         }
         let path = join(&self.prefix, &file.path);
         let remote = |e| StoreError::remote("read", &place, e);

@@ -11,6 +11,9 @@ pub enum AudioHeaderError {
         "audio file is empty (0 bytes); the download or copy that made it failed, fetch it again"
     )]
     Empty,
+    /// The file could not be read.
+    #[error("audio file could not be read ({reason}); check the disk and try again")]
+    Input { reason: String },
     /// Bytes of another kind.
     #[error("not audio: it starts with {found}; {way_out}")]
     NotAudio { found: String, way_out: String },
@@ -19,7 +22,7 @@ pub enum AudioHeaderError {
         "audio header cannot be read from {found_bytes} bytes that start with {found}: {reason}; \
          the file may be cut short, copy or download it again"
     )]
-    Unreadable { found_bytes: usize, found: String, reason: String },
+    Unreadable { found_bytes: u64, found: String, reason: String },
     /// A container without audio, such as a silent video.
     #[error("{container} file holds no audio track; is it a video without sound?")]
     NoAudioTrack { container: &'static str },
@@ -77,8 +80,18 @@ pub(super) fn other_format(bytes: &[u8]) -> Option<AudioHeaderError> {
     Some(AudioHeaderError::NotAudio { found: preview(text), way_out: way_out.to_owned() })
 }
 
-/// The error for bytes that symphonia refuses.
-pub(super) fn unreadable(bytes: &[u8], extension: &str, error: &Error) -> AudioHeaderError {
+/// The error for a file whose bytes cannot be had.
+pub(super) fn broken_input(error: &std::io::Error) -> AudioHeaderError {
+    AudioHeaderError::Input { reason: error.to_string() }
+}
+
+/// The error for a file that symphonia refuses: its first bytes, and how many it has.
+pub(super) fn unreadable(
+    bytes: &[u8],
+    n_bytes: u64,
+    extension: &str,
+    error: &Error,
+) -> AudioHeaderError {
     let known = [&b"RIFF"[..], b"FORM", b"fLaC", b"OggS", b"ID3"];
     let mp4 = bytes.get(4..8) == Some(b"ftyp");
     // The bare start of a marker is a header cut short, too.
@@ -94,7 +107,7 @@ pub(super) fn unreadable(bytes: &[u8], extension: &str, error: &Error) -> AudioH
             }
             other => other.to_string(),
         };
-        return AudioHeaderError::Unreadable { found_bytes: bytes.len(), found, reason };
+        return AudioHeaderError::Unreadable { found_bytes: n_bytes, found, reason };
     }
     unknown(bytes, extension)
 }

@@ -117,10 +117,10 @@ fn phrase_layout(listing: Listing, drafts: &mut Drafts) {
         }
     }
     for file in listing.files {
-        if let Some((parent, _)) = file.path.rsplit_once('/') {
-            if let Some((_, expects)) = phrase_folder(parent) {
-                folders.insert(parent.to_owned(), expects);
-            }
+        if let Some((parent, _)) = file.path.rsplit_once('/')
+            && let Some((_, expects)) = phrase_folder(parent)
+        {
+            folders.insert(parent.to_owned(), expects);
         }
         match phrase_slot(&file.path) {
             Some((id, role)) => {

@@ -6,7 +6,7 @@ use ndarray::Array2;
 
 use super::failure::{Failure, FailureKind};
 use super::layout::Role;
-use crate::audio::header::{AudioHeader, AudioHeaderError, read_header};
+use crate::audio::header::{AudioHeader, AudioHeaderError, read_header, read_header_from};
 use crate::motion::npy::{self, NpyError};
 use crate::motion::npz::{Npz, NpzError};
 use crate::motion::{
@@ -211,12 +211,7 @@ fn audio_header(path: &str, content: Content) -> Result<AudioHeader, Failure> {
     let extension = path.rsplit_once('.').map_or("", |(_, extension)| extension);
     let read = match content {
         Content::Bytes(bytes) => read_header(&bytes, extension),
-        Content::File(mut file) => {
-            let mut bytes = Vec::new();
-            file.read_to_end(&mut bytes)
-                .map_err(|e| Failure::new(FailureKind::Unreadable, path, e))?;
-            read_header(&bytes, extension)
-        }
+        Content::File(file) => read_header_from(file, extension),
     };
     read.map_err(|e: AudioHeaderError| failed(path, e.kind(), &e))
 }

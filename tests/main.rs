@@ -1,0 +1,16 @@
+//! The one integration-test crate; every file of `tests/` is a module of it.
+
+mod audio_header;
+mod ingest_bad_input;
+mod ingest_kill;
+mod ingest_local;
+mod ingest_remote;
+mod motion_capture;
+mod npy_files;
+mod object_store_conformance;
+mod query_tables;
+mod rooms;
+mod schemas;
+mod servers;
+mod store_suite;
+mod support;

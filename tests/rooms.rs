@@ -1,0 +1,126 @@
+//! The rooms use each other only as `docs/architecture.md` allows.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Which rooms a room may use.
+const MAY_USE: [(&str, &[&str]); 6] = [
+    ("units", &[]),
+    ("audio", &["units"]),
+    ("motion", &["units"]),
+    ("store", &["motion", "units"]),
+    ("stages", &["audio", "motion", "store", "units"]),
+    ("cli", &["stages"]),
+];
+
+/// Crates that only one place may name: crate, where.
+const KEPT_TO: [(&str, &str); 6] = [
+    ("polars", "store/query.rs"),
+    ("object_store", "store/"),
+    ("parquet", "store/"),
+    ("arrow_array", "store/"),
+    ("symphonia", "audio/"),
+    ("indicatif", "cli/"),
+];
+
+fn sources() -> BTreeMap<PathBuf, String> {
+    fn walk(folder: &Path, found: &mut BTreeMap<PathBuf, String>) {
+        for entry in std::fs::read_dir(folder).expect("a folder of sources") {
+            let path = entry.expect("an entry").path();
+            if path.is_dir() {
+                walk(&path, found);
+            } else if path.extension().is_some_and(|e| e == "rs") {
+                found.insert(path.clone(), std::fs::read_to_string(&path).expect("UTF-8"));
+            }
+        }
+    }
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
+    let mut found = BTreeMap::new();
+    walk(&root, &mut found);
+    found
+        .into_iter()
+        .map(|(path, text)| (path.strip_prefix(&root).expect("in src").into(), text))
+        .collect()
+}
+
+/// Returns the code of a file without comments, in which rooms and crates are only talked about.
+fn code(text: &str) -> impl Iterator<Item = (usize, &str)> {
+    text.lines().enumerate().filter(|(_, line)| !line.trim_start().starts_with("//"))
+}
+
+fn room_of(path: &Path) -> String {
+    let first = path.components().next().expect("a component").as_os_str().to_string_lossy();
+    first.trim_end_matches(".rs").to_owned()
+}
+
+#[test]
+fn rooms_use_only_the_rooms_that_they_may() {
+    let mut n_uses = 0;
+    for (path, text) in sources() {
+        let room = room_of(&path);
+        if room == "lib" || room == "bin" {
+            continue;
+        }
+        let (_, allowed) = MAY_USE
+            .iter()
+            .find(|(name, _)| *name == room)
+            .unwrap_or_else(|| panic!("{}: room {room} is not in MAY_USE", path.display()));
+        for (i, line) in code(&text) {
+            for (at, _) in line.match_indices("crate::") {
+                if line[..at].ends_with('$') {
+                    continue;
+                }
+                let used: String = line[at + 7..]
+                    .chars()
+                    .take_while(|c| c.is_alphanumeric() || *c == '_')
+                    .collect();
+                n_uses += 1;
+                assert!(
+                    used == room || allowed.contains(&used.as_str()),
+                    "src/{}:{}: {room} uses {used}; it may use {allowed:?}",
+                    path.display(),
+                    i + 1
+                );
+            }
+        }
+    }
+    assert!(n_uses > 20, "only {n_uses} uses were seen: the test reads the wrong lines");
+}
+
+#[test]
+fn some_crates_are_named_in_one_place_only() {
+    for (name, place) in KEPT_TO {
+        let uses: Vec<_> = sources()
+            .into_iter()
+            .filter(|(_, text)| {
+                code(text).any(|(_, line)| {
+                    line.contains(&format!("{name}::")) || line.contains(&format!("use {name}"))
+                })
+            })
+            .map(|(path, _)| path.to_string_lossy().into_owned())
+            .collect();
+        assert!(!uses.is_empty(), "{name} is used nowhere: is this list out of date?");
+        for path in uses {
+            assert!(path.starts_with(place), "src/{path} names {name}; only src/{place} may");
+        }
+    }
+}
+
+#[test]
+fn only_the_command_line_prints_and_nothing_is_unsafe() {
+    for (path, text) in sources() {
+        let is_cli = path.starts_with("cli");
+        for (i, line) in code(&text) {
+            let prints = ["println!", "eprintln!", "print!(", "eprint!(", "dbg!("]
+                .iter()
+                .any(|word| line.contains(word));
+            assert!(is_cli || !prints, "src/{}:{}: prints; only cli may", path.display(), i + 1);
+            assert!(
+                !line.contains("unsafe "),
+                "src/{}:{}: unsafe is kept to one measured kernel module",
+                path.display(),
+                i + 1
+            );
+        }
+    }
+}
