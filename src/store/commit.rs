@@ -268,12 +268,16 @@ impl<'a> Commit<'a> {
             ])?;
             let FinishedPart { file, n_rows } = finished;
             let path = format!("{table}/{key}.parquet");
-            let n_bytes = file
+            let mut n_bytes = file
                 .as_file()
                 .metadata()
                 .map_err(|e| StoreError::io("measure", &self.store.url_of(&path), e))?
                 .len();
-            self.store.put_file_new(&path, file)?;
+            if self.store.put_file_new(&path, file)? == Put::AlreadyThere {
+                // Failures carry the time at which they happened, so the one that is there may be
+                // some bytes longer or shorter.
+                n_bytes = self.store.size_bytes(&path)?;
+            }
             committed.n_rows += n_rows;
             committed.n_bytes += n_bytes;
             let (table, schema_version) = (table.to_owned(), open.schema_version);

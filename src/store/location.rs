@@ -7,29 +7,19 @@ use std::fmt;
 use std::io::Write as _;
 use std::path::{Path as FsPath, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
 
 use bytes::Bytes;
 use futures::{StreamExt as _, TryStreamExt as _};
 use object_store::path::Path as ObjectPath;
-use object_store::{ObjectStore, ObjectStoreExt as _, PutMode, PutOptions, PutPayload};
+use object_store::{ObjectStore, ObjectStoreExt as _};
 use url::Url;
 
 use super::StoreError;
 use super::client::{self, ClientOptions, block_on};
+use super::{local, remote};
 
-/// Largest object that is sent with one PUT; larger ones go up in parts of this size.
-const SINGLE_PUT_BYTES: usize = 8 << 20;
-/// Parts of one multipart upload that may be under way at once.
-const MULTIPART_IN_FLIGHT: usize = 4;
 /// Small objects that are read at once.
 const READS_IN_FLIGHT: usize = 32;
-/// Bytes fetched by one ranged GET when a large object is read.
-const RANGE_BYTES: u64 = 8 << 20;
-/// Times that the creation of an object is repeated when its connection broke, and the pause before
-/// the first repetition; the next pauses are longer by as much each.
-const BROKEN_PUT_RETRIES: u32 = 4;
-const BROKEN_PUT_PAUSE: Duration = Duration::from_millis(100);
 
 /// A folder in local or remote storage.
 #[derive(Clone, Debug)]
@@ -147,21 +137,32 @@ impl Location {
         &self.kind
     }
 
+    /// Removes temporary files that killed writers left in a local store more than a day ago.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`] when the store's folders cannot be listed.
+    pub fn sweep(&self) -> Result<(), StoreError> {
+        match &self.kind {
+            Kind::Local(root) => local::sweep(root),
+            Kind::Remote { .. } => Ok(()),
+        }
+    }
+
     /// Lists every object below `folder`, sorted by path; a missing folder is empty.
     ///
     /// # Errors
     /// [`StoreError`] when the storage cannot be listed.
     pub fn list(&self, folder: &str) -> Result<Vec<Listed>, StoreError> {
         let mut found = match &self.kind {
-            Kind::Local(root) => list_local(root, folder)?,
+            Kind::Local(root) => local::list(root, folder)?,
             Kind::Remote { store, prefix } => {
-                let below = join(prefix, folder);
+                let below = remote::join(prefix, folder);
                 let metas: Vec<_> = block_on(store.list(Some(&below)).try_collect())
                     .map_err(|e| StoreError::remote("list", &self.url_of(folder), e))?;
                 metas
                     .into_iter()
                     .filter_map(|meta| {
-                        let path = relative(prefix, &meta.location)?;
+                        let path = remote::relative(prefix, &meta.location)?;
                         Some(Listed { path, size_bytes: meta.size })
                     })
                     .collect()
@@ -169,6 +170,22 @@ impl Location {
         };
         found.sort_by(|a, b| a.path.cmp(&b.path));
         Ok(found)
+    }
+
+    /// Returns the size of an object.
+    ///
+    /// # Errors
+    /// [`StoreError::NotFound`] or what the storage says.
+    pub(crate) fn size_bytes(&self, path: &str) -> Result<u64, StoreError> {
+        let place = || self.url_of(path);
+        match &self.kind {
+            Kind::Local(root) => std::fs::metadata(root.join(path))
+                .map(|meta| meta.len())
+                .map_err(|e| StoreError::io("measure", &place(), e)),
+            Kind::Remote { store, prefix } => block_on(store.head(&remote::join(prefix, path)))
+                .map(|meta| meta.size)
+                .map_err(|e| StoreError::remote("measure", &place(), e)),
+        }
     }
 
     /// Reads a whole object; a large remote one in ranges, so that a stalled request costs one range.
@@ -181,8 +198,10 @@ impl Location {
             Kind::Local(root) => std::fs::read(root.join(path))
                 .map(Bytes::from)
                 .map_err(|e| StoreError::io("read", &place(), e)),
-            Kind::Remote { store, prefix } => block_on(read_object(store, &join(prefix, path)))
-                .map_err(|e| StoreError::remote("read", &place(), e)),
+            Kind::Remote { store, prefix } => {
+                block_on(remote::read_object(store, &remote::join(prefix, path)))
+                    .map_err(|e| StoreError::remote("read", &place(), e))
+            }
         }
     }
 
@@ -195,7 +214,7 @@ impl Location {
             Kind::Local(_) => paths.iter().map(|path| self.read(path)).collect(),
             Kind::Remote { store, prefix } => {
                 let reads = paths.iter().map(|path| async move {
-                    read_object(store, &join(prefix, path))
+                    remote::read_object(store, &remote::join(prefix, path))
                         .await
                         .map_err(|e| StoreError::remote("read", &self.url_of(path), e))
                 });
@@ -213,13 +232,13 @@ impl Location {
         match &self.kind {
             Kind::Local(root) => {
                 let io = |e| StoreError::io("write", &place(), e);
-                let mut file = temporary_beside(&root.join(path)).map_err(io)?;
+                let mut file = local::temporary_beside(&root.join(path)).map_err(io)?;
                 file.write_all(&bytes).map_err(io)?;
-                persist_new(file, &root.join(path)).map_err(io)
+                local::persist_new(file, &root.join(path)).map_err(io)
             }
             Kind::Remote { store, prefix } => {
-                let object = join(prefix, path);
-                block_on(create(store, &object, &bytes))
+                let object = remote::join(prefix, path);
+                block_on(remote::create(store, &object, &bytes))
                     .map_err(|e| StoreError::remote("write", &place(), e))
             }
         }
@@ -232,7 +251,7 @@ impl Location {
     /// [`StoreError::Io`] when no file can be made.
     pub fn temporary(&self, path: &str) -> Result<tempfile::NamedTempFile, StoreError> {
         match &self.kind {
-            Kind::Local(root) => temporary_beside(&root.join(path)),
+            Kind::Local(root) => local::temporary_beside(&root.join(path)),
             Kind::Remote { .. } => tempfile::NamedTempFile::new(),
         }
         .map_err(|e| StoreError::io("make a temporary file for", &self.url_of(path), e))
@@ -253,21 +272,21 @@ impl Location {
         let place = || self.url_of(path);
         let io = |e| StoreError::io("write", &place(), e);
         match &self.kind {
-            Kind::Local(root) => persist_new(file, &root.join(path)).map_err(io),
+            Kind::Local(root) => local::persist_new(file, &root.join(path)).map_err(io),
             Kind::Remote { store, prefix } => {
                 let size = file.as_file().metadata().map_err(io)?.len();
-                if size <= SINGLE_PUT_BYTES as u64 {
+                if size <= remote::SINGLE_PUT_BYTES as u64 {
                     let bytes = std::fs::read(file.path()).map_err(io)?;
                     return self.put_new(path, Bytes::from(bytes));
                 }
-                let path = join(prefix, path);
+                let path = remote::join(prefix, path);
                 let put = async {
                     match store.head(&path).await {
                         Ok(_) => return Ok(Put::AlreadyThere),
                         Err(object_store::Error::NotFound { .. }) => {}
                         Err(e) => return Err(e),
                     }
-                    match upload(store, &path, file.path()).await {
+                    match remote::upload(store, &path, file.path()).await {
                         Ok(()) => Ok(Put::Written),
                         // As in `create`: the last answer may have been lost.
                         Err(e) => match store.head(&path).await {
@@ -289,192 +308,4 @@ impl fmt::Display for Location {
             Kind::Remote { .. } => f.write_str(&self.url),
         }
     }
-}
-
-/// Joins a `/`-separated path to a prefix; segments are percent-encoded where object_store asks.
-pub(crate) fn join(prefix: &ObjectPath, path: &str) -> ObjectPath {
-    // `parse` keeps a key as the store spells it; only a key that could not have come from a store
-    // (an empty segment, `..`) needs encoding.
-    let below = ObjectPath::parse(path).unwrap_or_else(|_| ObjectPath::from(path));
-    prefix.parts().chain(below.parts()).collect()
-}
-
-/// Returns `path` below `prefix`, or `None` when it is not below it.
-pub(crate) fn relative(prefix: &ObjectPath, path: &ObjectPath) -> Option<String> {
-    let rest = path.as_ref().strip_prefix(prefix.as_ref())?;
-    Some(rest.trim_start_matches('/').to_owned())
-}
-
-pub(crate) async fn read_object(
-    store: &Arc<dyn ObjectStore>,
-    path: &ObjectPath,
-) -> object_store::Result<Bytes> {
-    let size = store.head(path).await?.size;
-    read_sized(store, path, size).await
-}
-
-/// Reads an object whose size a listing told, in one GET or in ranges of [`RANGE_BYTES`].
-pub(crate) async fn read_sized(
-    store: &Arc<dyn ObjectStore>,
-    path: &ObjectPath,
-    size: u64,
-) -> object_store::Result<Bytes> {
-    if size <= RANGE_BYTES {
-        return store.get(path).await?.bytes().await;
-    }
-    // Not `get_ranges`, which would join the ranges into one again.
-    let mut whole = Vec::with_capacity(size as usize);
-    for start in (0..size).step_by(RANGE_BYTES as usize) {
-        let end = (start + RANGE_BYTES).min(size);
-        whole.extend_from_slice(&store.get_range(path, start..end).await?);
-    }
-    Ok(Bytes::from(whole))
-}
-
-/// Creates an object unless it is there, over connections that may break at any moment.
-async fn create(
-    store: &Arc<dyn ObjectStore>,
-    path: &ObjectPath,
-    bytes: &Bytes,
-) -> object_store::Result<Put> {
-    let mut n_broken = 0;
-    loop {
-        let options = PutOptions { mode: PutMode::Create, ..PutOptions::default() };
-        let payload = PutPayload::from_bytes(bytes.clone());
-        let error = match store.put_opts(path, payload, options).await {
-            Ok(_) => return Ok(Put::Written),
-            Err(object_store::Error::AlreadyExists { .. }) => return Ok(Put::AlreadyThere),
-            Err(error) => error,
-        };
-        // The store may have acted and its answer been lost; then our bytes are there. The client
-        // repeats no request that creates, because only its caller can tell.
-        match read_object(store, path).await {
-            Ok(there) if there == *bytes => return Ok(Put::Written),
-            Err(object_store::Error::NotFound { .. })
-                if is_broken_connection(&error) && n_broken < BROKEN_PUT_RETRIES =>
-            {
-                n_broken += 1;
-                tokio::time::sleep(BROKEN_PUT_PAUSE * n_broken).await;
-            }
-            _ => return Err(error),
-        }
-    }
-}
-
-/// Returns whether a request failed because its connection did, without an answer of the store.
-fn is_broken_connection(error: &object_store::Error) -> bool {
-    let mut cause: Option<&(dyn std::error::Error + 'static)> = Some(error);
-    while let Some(error) = cause {
-        if error.is::<object_store::client::HttpError>() {
-            return true;
-        }
-        cause = error.source();
-    }
-    false
-}
-
-async fn upload(
-    store: &Arc<dyn ObjectStore>,
-    path: &ObjectPath,
-    file: &FsPath,
-) -> object_store::Result<()> {
-    use std::io::Read as _;
-    let generic = |source: std::io::Error| object_store::Error::Generic {
-        store: "local temporary file",
-        source: Box::new(source),
-    };
-    let mut file = std::fs::File::open(file).map_err(generic)?;
-    let upload = store.put_multipart(path).await?;
-    let mut writer = object_store::WriteMultipart::new_with_chunk_size(upload, SINGLE_PUT_BYTES);
-    let sent = async {
-        loop {
-            let mut chunk = Vec::with_capacity(SINGLE_PUT_BYTES);
-            let mut piece = (&mut file).take(SINGLE_PUT_BYTES as u64);
-            if piece.read_to_end(&mut chunk).map_err(generic)? == 0 {
-                return writer.wait_for_capacity(0).await;
-            }
-            writer.wait_for_capacity(MULTIPART_IN_FLIGHT).await?;
-            writer.put(Bytes::from(chunk));
-        }
-    };
-    if let Err(e) = sent.await {
-        // Parts of an unfinished upload are invisible but stored, and paid for.
-        writer.abort().await.ok();
-        return Err(e);
-    }
-    writer.finish().await.map(|_| ())
-}
-
-fn temporary_beside(path: &FsPath) -> std::io::Result<tempfile::NamedTempFile> {
-    let folder = path.parent().unwrap_or(FsPath::new("."));
-    std::fs::create_dir_all(folder)?;
-    // The leading dot keeps an abandoned temporary out of `*.parquet` globs and of listings.
-    tempfile::Builder::new().prefix(".partial-").tempfile_in(folder)
-}
-
-/// Writes a local file, whole or not at all, replacing what was there.
-///
-/// # Errors
-/// What the file system or `write` says; the old file is untouched then.
-pub fn write_file(
-    path: &FsPath,
-    write: impl FnOnce(&mut dyn std::io::Write) -> std::io::Result<()>,
-) -> std::io::Result<()> {
-    let mut out = std::io::BufWriter::new(temporary_beside(&std::path::absolute(path)?)?);
-    write(&mut out)?;
-    let file = out.into_inner().map_err(std::io::IntoInnerError::into_error)?;
-    readable_by_all(&file)?;
-    file.as_file().sync_all()?;
-    file.persist(path).map(|_| ()).map_err(|e| e.error)
-}
-
-/// Temporary files are private to their owner; what is written is for whoever may read the folder.
-fn readable_by_all(file: &tempfile::NamedTempFile) -> std::io::Result<()> {
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::PermissionsExt as _;
-        file.as_file().set_permissions(std::fs::Permissions::from_mode(0o644))?;
-    }
-    let _ = file;
-    Ok(())
-}
-
-/// Links a temporary file to its final name after fsync of the data, then fsyncs the folder.
-fn persist_new(file: tempfile::NamedTempFile, path: &FsPath) -> std::io::Result<Put> {
-    readable_by_all(&file)?;
-    file.as_file().sync_all()?;
-    match file.persist_noclobber(path) {
-        Ok(_) => {}
-        Err(e) if e.error.kind() == std::io::ErrorKind::AlreadyExists => {
-            return Ok(Put::AlreadyThere);
-        }
-        Err(e) => return Err(e.error),
-    }
-    if let Some(folder) = path.parent() {
-        std::fs::File::open(folder)?.sync_all()?;
-    }
-    Ok(Put::Written)
-}
-
-fn list_local(root: &FsPath, folder: &str) -> Result<Vec<Listed>, StoreError> {
-    let start = root.join(folder);
-    if !start.exists() {
-        return Ok(Vec::new());
-    }
-    let mut found = Vec::new();
-    for entry in walkdir::WalkDir::new(&start) {
-        let entry = entry.map_err(|e| {
-            StoreError::io("list", &start.display().to_string(), std::io::Error::other(e))
-        })?;
-        let hidden = entry.file_name().as_encoded_bytes().starts_with(b".");
-        if hidden || !entry.file_type().is_file() {
-            continue;
-        }
-        let Some(path) = entry.path().strip_prefix(root).ok().and_then(FsPath::to_str) else {
-            continue;
-        };
-        let size_bytes = entry.metadata().map(|m| m.len()).unwrap_or_default();
-        found.push(Listed { path: path.to_owned(), size_bytes });
-    }
-    Ok(found)
 }

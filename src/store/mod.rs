@@ -7,11 +7,13 @@ mod cache;
 mod client;
 mod commit;
 mod error;
+mod local;
 mod location;
 mod part;
 #[cfg(feature = "query")]
 mod query;
 mod reader;
+mod remote;
 pub(crate) mod schema;
 mod shard;
 mod source;
@@ -24,7 +26,8 @@ pub use commit::{
     sha256_of,
 };
 pub use error::StoreError;
-pub use location::{Listed, Location, Put, write_file};
+pub use local::write_file;
+pub use location::{Listed, Location, Put};
 pub use part::{FinishedPart, PartWriter};
 #[cfg(feature = "query")]
 pub use query::{Answer, Format, TableInfo, query, table_infos};

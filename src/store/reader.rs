@@ -18,7 +18,8 @@ use parquet::file::metadata::{ParquetMetaData, ParquetMetaDataReader};
 use super::StoreError;
 use super::client::block_on;
 use super::commit::{LivePart, live_parts};
-use super::location::{Kind, Location, join};
+use super::location::{Kind, Location};
+use super::remote::join;
 use super::schema::{Row, TableSchema};
 use super::tables::ITEM_COLUMN;
 

@@ -14,7 +14,8 @@ use xxhash_rust::xxh3::xxh3_128;
 
 use super::cache::Cache;
 use super::client::{block_on, runtime};
-use super::location::{Kind, Location, join, read_sized, relative};
+use super::location::{Kind, Location};
+use super::remote::{join, read_sized, relative};
 use super::{ClientOptions, StoreError};
 
 /// Files up to this size are read into memory; larger ones are handed over as open files.

@@ -162,8 +162,15 @@ FILES = [
     song("torus-trooper", "tt1", 160),
     song("torus-trooper", "tt3", 160),
     File(f"{CHARTED}.ogg", "music/fof_metal_madness.ogg", "frets-on-fire", CHARTED_CUT_S),
-    File(f"{CHARTED}.beats.txt", "music/fof_metal_madness.beats.txt", "frets-on-fire", CHARTED_CUT_S),
-    File("music/kevin-macleod/vibe_ace.ogg", "music/vibe_ace_kevin_macleod.ogg", "kevin-macleod", 24.0),
+    File(
+        f"{CHARTED}.beats.txt", "music/fof_metal_madness.beats.txt", "frets-on-fire", CHARTED_CUT_S
+    ),
+    File(
+        "music/kevin-macleod/vibe_ace.ogg",
+        "music/vibe_ace_kevin_macleod.ogg",
+        "kevin-macleod",
+        24.0,
+    ),
     File("music/beatnet/kick_120bpm.mp3", "music/808kick120bpm.mp3", "beatnet"),
     *[one_shot(name) for name in ["compus", "mika", "safari", "tabla"]],
 ]
@@ -201,7 +208,9 @@ def make_all(folder: pathlib.Path, new_sources: bool) -> None:
         sys.exit(f"{folder} lacks {', '.join(missing)}; name the folder that holds all sources")
     for name, path in sources.items():
         if known.get(name, digest(path)) != digest(path):
-            sys.exit(f"{path} is not the file that manifest.json names; pass --new-sources to use it")
+            sys.exit(
+                f"{path} is not the file that manifest.json names; pass --new-sources to use it"
+            )
     for name in FOLDERS:
         shutil.rmtree(HERE / name, ignore_errors=True)
     entries = []
@@ -238,7 +247,9 @@ def licenses(entries: list[dict]) -> str:
     ]
     for name, origin in ORIGINS.items():
         own = [entry for entry in entries if entry["origin"] == name]
-        place = f"[text]({origin.text})" if origin.text.startswith("licenses/") else f"<{origin.text}>"
+        place = (
+            f"[text]({origin.text})" if origin.text.startswith("licenses/") else f"<{origin.text}>"
+        )
         text.append(f"\n## {name}\n\n")
         text.append(f"- package: {origin.package}\n- author: {origin.author}\n")
         text.append(f"- licence: {origin.licence}, {place}\n")
@@ -268,7 +279,9 @@ def check() -> None:
         for path in (HERE / name).rglob("*"):
             relative = path.relative_to(HERE).as_posix()
             if path.is_file() and relative not in named:
-                problems.append(f"{relative} is not in manifest.json; add it to make.py or remove it")
+                problems.append(
+                    f"{relative} is not in manifest.json; add it to make.py or remove it"
+                )
     n_bytes = sum(entry["bytes"] for entry in entries)
     if n_bytes > MAX_BYTES:
         problems.append(f"the files have {n_bytes} bytes, more than {MAX_BYTES}; cut shorter")

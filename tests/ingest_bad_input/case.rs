@@ -36,8 +36,7 @@ impl Case {
         Self::file(id, &format!("audio_features/{id}/features.npz"), bytes, kind, sentence)
     }
 
-    /// A phrase of one file, of which the message is `path: sentence`, or just the sentence when
-    /// that names the path.
+    /// A phrase of one file; the message is `path: sentence` unless the sentence has a `{path}`.
     pub fn file(
         id: &str,
         path: &str,
@@ -45,31 +44,20 @@ impl Case {
         kind: &'static str,
         sentence: &str,
     ) -> Self {
-        Self::files(id, [(path, bytes.into())], path, kind, sentence)
+        let start = if sentence.contains("{path}") { "" } else { "{path}: " };
+        Self::files(id, [(path, bytes.into())], path, kind, &format!("{start}{sentence}"))
     }
 
-    /// A phrase of several files, of which one is at fault.
+    /// A phrase of several files; `{path}` in the message is the one at fault.
     pub fn files(
         id: &str,
         files: impl IntoIterator<Item = (impl Into<String>, Vec<u8>)>,
         at_fault: &str,
         kind: &'static str,
-        sentence: &str,
+        message: &str,
     ) -> Self {
         let files = files.into_iter().map(|(path, bytes)| (path.into(), bytes)).collect();
-        let names_path = sentence.contains("{path}") || sentence.contains('/');
-        let message = if names_path {
-            sentence.replace("{path}", at_fault)
-        } else {
-            format!("{at_fault}: {sentence}")
-        };
-        Self {
-            id: id.to_owned(),
-            kind,
-            message,
-            at_fault: at_fault.to_owned(),
-            make: Make::Files(files),
-        }
+        Self::new(id, Make::Files(files), at_fault, kind, message)
     }
 
     /// Something that takes more than writing files, made in the source's folder.
@@ -78,14 +66,21 @@ impl Case {
         at_fault: &str,
         make: fn(&Path),
         kind: &'static str,
-        sentence: &str,
+        message: &str,
     ) -> Self {
-        Self {
-            id: id.to_owned(),
-            kind,
-            message: sentence.replace("{path}", at_fault),
-            at_fault: at_fault.to_owned(),
-            make: Make::With(make),
+        Self::new(id, Make::With(make), at_fault, kind, message)
+    }
+
+    fn new(id: &str, make: Make, at_fault: &str, kind: &'static str, message: &str) -> Self {
+        let message = message.replace("{path}", at_fault);
+        Self { id: id.to_owned(), kind, message, at_fault: at_fault.to_owned(), make }
+    }
+
+    /// Returns the size of the files that are written.
+    pub fn n_bytes(&self) -> usize {
+        match &self.make {
+            Make::Files(files) => files.iter().map(|(_, bytes)| bytes.len()).sum(),
+            Make::With(_) => 0,
         }
     }
 

@@ -6,7 +6,10 @@ use super::case::Case;
 use crate::support::files::{coherent, npy, trajectory};
 
 pub fn cases() -> Vec<Case> {
-    [foreign_bytes(), foreign_types(), shapes(), values(), captures()].into_iter().flatten().collect()
+    [foreign_bytes(), foreign_types(), shapes(), values(), captures()]
+        .into_iter()
+        .flatten()
+        .collect()
 }
 
 fn sound() -> Vec<u8> {

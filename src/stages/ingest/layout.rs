@@ -102,18 +102,20 @@ fn phrase_layout(listing: Listing, drafts: &mut Drafts) {
     let mut folders: BTreeMap<String, &'static str> = BTreeMap::new();
     let mut filled: BTreeSet<String> = BTreeSet::new();
     for folder in &listing.folders {
-        let is_parent = listing.folders.iter().any(|f| is_below(f, folder));
+        let is_parent = any_below(&listing.folders, String::as_str, folder);
         if let (Some((_, expects)), false) = (phrase_folder(folder), is_parent) {
             folders.insert(folder.clone(), expects);
         }
     }
+    // Folders that are called like a phrase's file; what they hold is nobody's.
+    let mut slots: BTreeSet<String> = BTreeSet::new();
     for folder in listing.folders {
         if let Some((id, _)) = phrase_slot(&folder) {
-            folders.retain(|f, _| *f != folder);
             if let Some((parent, _)) = folder.rsplit_once('/') {
                 filled.insert(parent.to_owned());
             }
             drafts.fail(id, not_a_file(&folder));
+            slots.insert(folder);
         }
     }
     for file in listing.files {
@@ -142,7 +144,8 @@ fn phrase_layout(listing: Listing, drafts: &mut Drafts) {
         drafts.problem(id, problem);
     }
     for (folder, expects) in folders {
-        if let (Some((id, _)), false) = (phrase_folder(&folder), filled.contains(&folder)) {
+        let settled = filled.contains(&folder) || at_and_above(&folder).any(|f| slots.contains(f));
+        if let (Some((id, _)), false) = (phrase_folder(&folder), settled) {
             let message =
                 format!("folder {folder} holds no {expects}; add it or remove the folder");
             drafts.fail(id, Failure::new(FailureKind::Layout, &folder, message));
@@ -185,6 +188,14 @@ fn phrase_folder(path: &str) -> Option<(String, &'static str)> {
 
 fn library_layout(listing: Listing, drafts: &mut Drafts) {
     let stem = |path: &str| path.rsplit_once('.').map(|(stem, _)| stem.to_owned());
+    for folder in listing.folders.iter().filter(|f| extension(f).is_some_and(is_audio)) {
+        // A folder may be called `live.wav` for all that we know, as long as it holds something.
+        let holds = any_below(&listing.files, |f| &f.path, folder)
+            || any_below(&listing.folders, String::as_str, folder);
+        if !holds {
+            drafts.fail(folder.clone(), not_a_file(folder));
+        }
+    }
     let mut beats: BTreeMap<String, SourceFile> = BTreeMap::new();
     let mut songs = Vec::new();
     for file in listing.files {
@@ -195,15 +206,6 @@ fn library_layout(listing: Listing, drafts: &mut Drafts) {
             songs.push(file);
         } else {
             drafts.ignored.push(file.path);
-        }
-    }
-    for folder in &listing.folders {
-        // A folder may be called `live.wav` for all that we know, as long as it holds something.
-        let holds = songs.iter().any(|s| is_below(&s.path, folder))
-            || listing.folders.iter().any(|f| is_below(f, folder))
-            || drafts.ignored.iter().any(|f| is_below(f, folder));
-        if extension(folder).is_some_and(is_audio) && !holds {
-            drafts.fail(folder.clone(), not_a_file(folder));
         }
     }
     let with_song: BTreeSet<String> = songs.iter().filter_map(|s| stem(&s.path)).collect();
@@ -299,8 +301,16 @@ fn not_a_file(folder: &str) -> Failure {
     Failure::new(FailureKind::NotAFile, folder, message)
 }
 
-fn is_below(path: &str, folder: &str) -> bool {
-    path.strip_prefix(folder).is_some_and(|rest| rest.starts_with('/'))
+/// Returns whether a listing, sorted by path, has anything below a folder.
+fn any_below<T>(listed: &[T], path: impl Fn(&T) -> &str, folder: &str) -> bool {
+    let start = format!("{folder}/");
+    let first = listed.partition_point(|item| path(item) < start.as_str());
+    listed.get(first).is_some_and(|item| path(item).starts_with(&start))
+}
+
+/// Returns a path and the folders above it, the nearest first.
+fn at_and_above(path: &str) -> impl Iterator<Item = &str> {
+    std::iter::successors(Some(path), |path| path.rsplit_once('/').map(|(above, _)| above))
 }
 
 fn extension(path: &str) -> Option<&str> {

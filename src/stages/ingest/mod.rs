@@ -86,6 +86,17 @@ impl Stage for Ingest {
         let source = Source::open(&params.source, &options, open_cache(&params)?)?;
         let store = Location::open(&params.store, &options)?;
         let plan = plan(source.list()?, params.layout);
+        if plan.phrases.is_empty() {
+            anyhow::bail!(
+                "source {}: no phrases found among {} files; expected motion/ID/trajectory.npy (or \
+                 motion.bvh), audio_features/ID/features.npz, or audio files anywhere",
+                source.location(),
+                plan.ignored.len()
+            );
+        }
+        if !params.dry_run {
+            store.sweep()?;
+        }
         let ledger = Ledger::read(&store, Self::NAME)?;
         let params_hash = params_hash(&params.rules);
 

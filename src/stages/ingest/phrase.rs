@@ -29,6 +29,10 @@ const FEATURE_KEYS: [(&str, Option<usize>); 6] = [
 /// Largest motion, feature or beat file that is read, in bytes.
 const MAX_FILE_BYTES: u64 = 1 << 30;
 
+/// Largest array of a feature file: over four hours of mel bands. A small archive can hold any
+/// amount of zeros, so this and not the file's size bounds the memory that it takes.
+const MAX_FEATURE_ARRAY_BYTES: u64 = 256 << 20;
+
 /// What makes a phrase acceptable; a change of these makes every phrase be read again.
 #[derive(Clone, Copy, Debug, PartialEq, clap::Args, serde::Serialize)]
 pub struct Rules {
@@ -37,8 +41,8 @@ pub struct Rules {
     #[arg(long, value_enum, value_name = "LIMITS", default_value_t = ChannelLimits::Wide)]
     pub limits: ChannelLimits,
     /// Frames by which the lengths of motion, features and audio may differ.
-    #[arg(long, value_name = "FRAMES", default_value_t = 1.0)]
-    pub length_tolerance_frames: f64,
+    #[arg(long, value_name = "FRAMES", default_value_t = 1)]
+    pub length_tolerance_frames: u32,
 }
 
 /// A phrase that passed every check.
@@ -166,13 +170,13 @@ fn check_lengths(phrase: &Phrase, rules: &Rules, motion_path: &str) -> Result<()
     for (i, (a, a_s)) in lengths.iter().enumerate() {
         for (b, b_s) in &lengths[i + 1..] {
             let (Some(a_s), Some(b_s)) = (a_s, b_s) else { continue };
-            // Half a sample's worth of slack, for lengths that are a whole number of frames.
-            if s_to_frames((a_s - b_s).abs()) > tolerance + 1e-3 {
+            // 1e-3: lengths are counted in samples, and a frame is no whole number of them.
+            if s_to_frames((a_s - b_s).abs()) > f64::from(tolerance) + 1e-3 {
                 let message = format!(
                     "{a} is {a_s:.2} s but {b} is {b_s:.2} s; they must agree within {tolerance} \
                      frame{} ({:.3} s)",
-                    if tolerance == 1.0 { "" } else { "s" },
-                    tolerance / FPS
+                    if tolerance == 1 { "" } else { "s" },
+                    f64::from(tolerance) / FPS
                 );
                 return Err(Failure::new(FailureKind::LengthMismatch, motion_path, message));
             }
@@ -272,7 +276,7 @@ struct Features {
 
 fn read_features(path: &str, bytes: &[u8]) -> Result<Features, Failure> {
     let from_npz = |e: NpzError| failed(path, e.kind(), &e);
-    let mut npz = Npz::open(bytes).map_err(from_npz)?;
+    let mut npz = Npz::open_limited(bytes, MAX_FEATURE_ARRAY_BYTES).map_err(from_npz)?;
     let mut n_frames = None;
     for (key, n_channels) in FEATURE_KEYS {
         let array = npz.read_f32(key).map_err(from_npz)?;

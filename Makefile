@@ -1,0 +1,89 @@
+# `make` lists the targets. Needs GNU make 4.3, Rust, Python 3.11 with venv, and Linux.
+
+MAKEFLAGS += --no-builtin-rules --no-print-directory
+SHELL := bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+# One cargo at a time: a second would only wait for the lock of the first.
+.NOTPARALLEL:
+
+CARGO  ?= cargo
+PYTHON ?= python3
+TARGET := $(or $(CARGO_TARGET_DIR),target)
+# Tests and demo share the dev profile, so that the dependencies are built once.
+BIN    := $(TARGET)/debug
+
+.PHONY: help
+help: ## list the targets
+	@echo "make TARGET, where TARGET is one of"
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-12s %s\n", $$1, $$2 }' Makefile
+
+.PHONY: build
+build: ## build the executables (dev profile)
+	$(CARGO) build --locked --bins
+
+.PHONY: demo
+demo: build ## ingest the music and motion of tests/data and query the tables (build/demo)
+	@$(MAKE) --file pipelines/demo.mk BIN=$(BIN)
+
+.PHONY: ingest
+ingest: build ## ingest your own files: make ingest SOURCE=… STORE=… [SHARDS=8 -j4]
+	@$(MAKE) --file pipelines/ingest.mk BIN=$(BIN)
+
+.PHONY: test
+test: check-format check-data lint build check-code doc ## everything that a change must pass
+
+.PHONY: check-format
+check-format:
+	$(CARGO) fmt --check
+
+.PHONY: check-data
+check-data:
+	$(PYTHON) tests/data/make.py --check
+
+# Unit tests of the library and the executables, the integration tests, and the examples' build.
+.PHONY: check-code
+check-code: build/venv/ready
+	MOTIONGEN_TEST_PYTHON='$(CURDIR)/build/venv/bin/python' $(CARGO) test --locked
+
+.PHONY: lint
+lint: check-format ## check formatting and run clippy
+	$(CARGO) clippy --locked --all-targets -- -D warnings
+
+.PHONY: doc
+doc: ## build the library's documentation
+	RUSTDOCFLAGS='-D warnings' $(CARGO) doc --locked --no-deps
+
+# Dev stands for the quick build; its figures say little, because dependencies are not optimised.
+BENCH_PROFILE ?= release
+BENCH_ARGS    ?=
+.PHONY: bench
+bench: build/bench-venv/ready ## measure side by side with peers [BENCH_PROFILE=dev BENCH_ARGS=--quick]
+	$(CARGO) build --locked --profile $(BENCH_PROFILE) --bins --example plain-read
+	build/bench-venv/bin/python benches/bench.py --profile $(BENCH_PROFILE) \
+	  --bin $(TARGET)/$(if $(filter dev,$(BENCH_PROFILE)),debug,$(BENCH_PROFILE)) $(BENCH_ARGS)
+
+FUZZ_SECONDS ?= 60
+.PHONY: fuzz
+fuzz: ## fuzz the readers of untrusted files, each for a minute [FUZZ_SECONDS=600]
+	@command -v cargo-fuzz > /dev/null || \
+	  { echo 'make fuzz needs cargo-fuzz; install it with: cargo install cargo-fuzz' >&2; exit 2; }
+	for target in $(basename $(notdir $(wildcard fuzz/fuzz_targets/*.rs))); do \
+	  mkdir -p fuzz/corpus/$$target; \
+	  RUSTC_BOOTSTRAP=1 $(CARGO) fuzz run $$target fuzz/corpus/$$target fuzz/seeds/$$target -- \
+	    -max_total_time=$(FUZZ_SECONDS) -rss_limit_mb=512; \
+	done
+
+.PHONY: clean-demo
+clean-demo: ## remove what the demo made
+	rm -rf build/demo
+
+# Python environments; made once, and again when their requirements change.
+build/venv/ready: tests/requirements.txt
+build/bench-venv/ready: benches/requirements.txt
+build/venv/ready build/bench-venv/ready:
+	rm -rf $(@D)
+	$(PYTHON) -m venv $(@D)
+	$(@D)/bin/pip install --quiet --disable-pip-version-check --requirement $<
+	touch $@

@@ -1,0 +1,61 @@
+# The demo: real music and real motion capture (tests/data) become tables, and queries answer.
+#
+#   make demo                              builds first
+#   make -f pipelines/demo.mk BIN=…        with executables that are there already
+
+DATA   ?= tests/data
+OUT    ?= build/demo
+STORE  ?= $(OUT)/store
+CONFIG ?= pipelines/demo.toml
+
+.DEFAULT_GOAL := demo
+include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
+
+SOURCES := phrases music
+ANSWERS := $(OUT)/queries.txt
+
+.PHONY: demo
+demo:
+	$(call unless_done,demo,$(ANSWERS))
+	@echo
+	@echo "tables   $(STORE)"
+	@echo "answers  $(ANSWERS)"
+	@echo "ask on   $(MOTIONGEN) query --store $(STORE) \"select …\""
+
+# ingest: both sources into one store.
+$(foreach s,$(SOURCES),$(call watch,$(s),$(DATA)/$(s),$(STORE)))
+INGESTED := $(SOURCES:%=$(STAMPS)/ingest-%.done)
+$(INGESTED): $(STAMPS)/ingest-%.done: $(STAMPS)/%.list $(CONFIG) $(MOTIONGEN)
+	$(call stage,$(MOTIONGEN) ingest --config $(CONFIG) --source $(DATA)/$* --store $(STORE))
+
+# query: what the tables tell.
+define SPLITS
+select split, count(*) as phrases, round(sum(duration_s), 1) as seconds
+from phrases group by split order by split
+endef
+define LONGEST_SONGS
+select phrase_id, round(duration_s, 1) as seconds, round(tempo_bpm, 1) as tempo_bpm, tempo_source
+from phrases where has_audio order by duration_s desc, phrase_id limit 5
+endef
+define SPEEDS
+select phrase_id, count(*) as frames,
+round(avg(sqrt(velocity_x * velocity_x + velocity_y * velocity_y + velocity_z * velocity_z)), 2)
+as mean_speed_m_per_s
+from motion group by phrase_id order by mean_speed_m_per_s desc, phrase_id
+endef
+# Lines become spaces on the way to the shell.
+define newline
+
+
+endef
+comma := ,
+ask = @{ echo; echo '$(1)'; $(MOTIONGEN) query --config $(CONFIG) --store $(STORE) \
+	'$(subst $(newline), ,$($(2)))'; } | tee --append $@.new
+
+$(ANSWERS): $(INGESTED)
+	@rm -f $@.new
+	@{ echo; echo 'What is there?'; $(MOTIONGEN) query --store $(STORE) --tables; } | tee $@.new
+	$(call ask,How much is in each split?,SPLITS)
+	$(call ask,Which songs are the longest$(comma) and what is their tempo?,LONGEST_SONGS)
+	$(call ask,How fast does each capture move?,SPEEDS)
+	@mv $@.new $@

@@ -1,0 +1,165 @@
+//! Names, folders, links and permissions that no phrase can have.
+
+use std::ffi::OsStr;
+use std::fs::{Permissions, create_dir_all, set_permissions};
+use std::os::unix::ffi::OsStrExt as _;
+use std::os::unix::fs::{PermissionsExt as _, symlink};
+use std::os::unix::net::UnixListener;
+use std::path::Path;
+use std::process::Command;
+
+use super::case::Case;
+use crate::support::files::{coherent, trajectory, wav};
+use crate::support::write;
+
+pub fn cases() -> Vec<Case> {
+    [doubles(), folders(), no_files(), links(), permissions(), names()]
+        .into_iter()
+        .flatten()
+        .collect()
+}
+
+#[rustfmt::skip]
+fn doubles() -> Vec<Case> {
+    vec![
+        Case::files("two-songs",
+            [("audio/two-songs.wav", wav(0.5)), ("audio/two-songs.flac", wav(0.5))],
+            "audio/two-songs.wav", "duplicate_id",
+            "audio comes twice, from audio/two-songs.flac and {path}; keep one of them"),
+        Case::files("two-motions",
+            [("motion/two-motions/trajectory.npy", trajectory(&coherent(9, 1))),
+             ("motion/two-motions/motion.bvh", b"HIERARCHY".to_vec())],
+            "motion/two-motions/trajectory.npy", "duplicate_id",
+            "motion comes twice, from motion/two-motions/motion.bvh and {path}; keep one of them"),
+        Case::files("two-beats",
+            [("audio/two-beats.wav", wav(0.5)),
+             ("audio/two-beats.beats.txt", b"0\n1\n".to_vec()),
+             ("beats/two-beats.beats.txt", b"0\n1\n".to_vec())],
+            "beats/two-beats.beats.txt", "duplicate_id",
+            "beats comes twice, from audio/two-beats.beats.txt and {path}; keep one of them"),
+    ]
+}
+
+#[rustfmt::skip]
+fn folders() -> Vec<Case> {
+    vec![
+        Case::tree("folder-for-npy", "motion/folder-for-npy/trajectory.npy",
+            |source| create_dir_all(source.join("motion/folder-for-npy/trajectory.npy")).unwrap(),
+            "not_a_file",
+            "{path} is a folder where a file is expected; rename or remove it"),
+        Case::files("filled-folder-for-npy",
+            [("motion/filled-folder-for-npy/trajectory.npy/part/0.npy", vec![1]),
+             ("motion/filled-folder-for-npy/trajectory.npy/1.npy", vec![2])],
+            "motion/filled-folder-for-npy/trajectory.npy", "not_a_file",
+            "{path} is a folder where a file is expected; rename or remove it"),
+        Case::tree("folder-for-wav", "audio/folder-for-wav.wav",
+            |source| create_dir_all(source.join("audio/folder-for-wav.wav")).unwrap(),
+            "not_a_file",
+            "{path} is a folder where a file is expected; rename or remove it"),
+        Case::tree("folder-empty", "motion/folder-empty",
+            |source| create_dir_all(source.join("motion/folder-empty")).unwrap(),
+            "layout",
+            "folder {path} holds no trajectory.npy or motion.bvh; add it or remove the folder"),
+        Case::tree("features-folder-empty", "audio_features/features-folder-empty",
+            |source| create_dir_all(source.join("audio_features/features-folder-empty")).unwrap(),
+            "layout",
+            "folder {path} holds no features.npz; add it or remove the folder"),
+        Case::files("file-misnamed",
+            [("motion/file-misnamed/Trajectory.npy", trajectory(&coherent(9, 1)))],
+            "motion/file-misnamed", "layout",
+            "folder {path} holds no trajectory.npy or motion.bvh; add it or remove the folder"),
+    ]
+}
+
+#[rustfmt::skip]
+fn no_files() -> Vec<Case> {
+    vec![
+        Case::tree("pipe", "motion/pipe/trajectory.npy",
+            |source| {
+                create_dir_all(source.join("motion/pipe")).unwrap();
+                let path = source.join("motion/pipe/trajectory.npy");
+                assert!(Command::new("mkfifo").arg(path).status().unwrap().success());
+            },
+            "not_a_file", "{path} is a pipe, socket or device, not a file; remove it"),
+        Case::tree("socket", "audio/socket.wav",
+            |source| {
+                create_dir_all(source.join("audio")).unwrap();
+                drop(UnixListener::bind(source.join("audio/socket.wav")).unwrap());
+            },
+            "not_a_file", "{path} is a pipe, socket or device, not a file; remove it"),
+        Case::tree("link-to-a-device", "audio/link-to-a-device.wav",
+            |source| {
+                create_dir_all(source.join("audio")).unwrap();
+                symlink("/dev/zero", source.join("audio/link-to-a-device.wav")).unwrap();
+            },
+            "not_a_file", "{path} is a pipe, socket or device, not a file; remove it"),
+    ]
+}
+
+#[rustfmt::skip]
+fn links() -> Vec<Case> {
+    vec![
+        Case::tree("link-to-nowhere", "motion/link-to-nowhere/trajectory.npy",
+            |source| {
+                create_dir_all(source.join("motion/link-to-nowhere")).unwrap();
+                let path = source.join("motion/link-to-nowhere/trajectory.npy");
+                symlink("gone.npy", path).unwrap();
+            },
+            "symlink",
+            "{path} is a symbolic link to something that does not exist; remove or repair it"),
+        Case::tree("link-to-its-own-folder", "motion/link-to-its-own-folder",
+            |source| {
+                create_dir_all(source.join("motion")).unwrap();
+                symlink("../motion", source.join("motion/link-to-its-own-folder")).unwrap();
+            },
+            "symlink", "{path} is a symbolic link back to its own folder \"motion\"; remove it"),
+        Case::tree("link-to-itself", "audio/link-to-itself.wav",
+            |source| {
+                create_dir_all(source.join("audio")).unwrap();
+                symlink("link-to-itself.wav", source.join("audio/link-to-itself.wav")).unwrap();
+            },
+            "unreadable",
+            "{path} could not be listed (IO error for operation on {source}/{path}: Too many \
+             levels of symbolic links (os error 40))"),
+    ]
+}
+
+fn forbid(path: &Path) {
+    set_permissions(path, Permissions::from_mode(0)).unwrap();
+}
+
+#[rustfmt::skip]
+fn permissions() -> Vec<Case> {
+    vec![
+        Case::tree("file-locked", "motion/file-locked/trajectory.npy",
+            |source| {
+                let bytes = trajectory(&coherent(9, 1));
+                forbid(&write(&source.join("motion/file-locked/trajectory.npy"), bytes));
+            },
+            "unreadable", "{source}/{path}: could not read (Permission denied (os error 13))"),
+        Case::tree("folder-locked", "motion/folder-locked",
+            |source| {
+                let bytes = trajectory(&coherent(9, 1));
+                write(&source.join("motion/folder-locked/trajectory.npy"), bytes);
+                forbid(&source.join("motion/folder-locked"));
+            },
+            "unreadable", "{path} may not be read (permission denied); grant read access"),
+    ]
+}
+
+#[rustfmt::skip]
+fn names() -> Vec<Case> {
+    vec![
+        Case::tree("caf\u{fffd}", "audio/caf\u{fffd}.wav",
+            |source| {
+                write(&source.join("audio").join(OsStr::from_bytes(b"caf\xe9.wav")), wav(0.5));
+            },
+            "name", "{path} has a name that is not UTF-8; rename it"),
+        Case::tree("folder-\u{fffd}", "motion/folder-\u{fffd}",
+            |source| {
+                let folder = source.join("motion").join(OsStr::from_bytes(b"folder-\xff"));
+                write(&folder.join("trajectory.npy"), trajectory(&coherent(9, 1)));
+            },
+            "name", "{path} has a name that is not UTF-8; rename it"),
+    ]
+}
