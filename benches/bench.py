@@ -47,8 +47,8 @@ POLARS = """
 import sys, time
 import polars
 start = time.perf_counter()
-frame = polars.scan_parquet(sys.argv[1] + "/motion/*.parquet").select(polars.col("velocity_x").mean())
-mean = frame.collect().item()
+motion = polars.scan_parquet(sys.argv[1] + "/motion/*.parquet")
+mean = motion.select(polars.col("velocity_x").mean()).collect().item()
 print(mean, time.perf_counter() - start)
 """
 
@@ -56,6 +56,7 @@ print(mean, time.perf_counter() - start)
 @dataclass
 class Run:
     wall_s: float
+    cpu_s: float
     peak_mb: float
     output: str
 
@@ -73,7 +74,7 @@ def run(command: list[str | pathlib.Path]) -> Run:
         text = output.read().decode(errors="replace")
     if child.returncode != 0:
         sys.exit(f"{' '.join(map(str, command))} ended with {child.returncode}:\n{text}")
-    return Run(wall_s, usage.ru_maxrss * 1024 / 1e6, text)
+    return Run(wall_s, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024 / 1e6, text)
 
 
 def interleaved(programs: dict[str, Callable[[], Run]], repeats: int) -> dict[str, list[Run]]:
@@ -87,6 +88,10 @@ def interleaved(programs: dict[str, Callable[[], Run]], repeats: int) -> dict[st
 
 def median_s(runs: list[Run]) -> float:
     return statistics.median(r.wall_s for r in runs)
+
+
+def median_cpu_s(runs: list[Run]) -> float:
+    return statistics.median(r.cpu_s for r in runs)
 
 
 def spread(runs: list[Run]) -> str:
@@ -176,6 +181,7 @@ class Bench:
                         f"{title}, {n_bytes / 1e6:.0f} MB",
                         name,
                         spread(own),
+                        f"{median_cpu_s(own):.2f}",
                         f"{self.count / median_s(own):,.0f}",
                         f"{max(r.peak_mb for r in own):.0f}",
                         f"{ratio:.2f}",
@@ -183,11 +189,19 @@ class Bench:
                 )
             ratio = median_s(runs["ingest"]) / base_s
             notes.append(f"- {title}: ingest / plain-read = {verdict(ratio, INGEST_TARGET)}\n")
-        head = ["phrases", "program", "wall s, median (range)", "phrases/s", "peak MB", "ratio"]
+        head = [
+            "phrases",
+            "program",
+            "wall s, median (range)",
+            "CPU s",
+            "phrases/s",
+            "peak MB",
+            "ratio",
+        ]
         text = (
             "plain-read does not parse, check, digest or sync anything; ingest does all of that. "
-            f"`ingest` alone uses a worker per core ({os.cpu_count()} here). Peaks below about 25 MB are "
-            "those of the measuring process, from which the programs are started.\n\n"
+            f"`ingest` alone uses a worker per core ({os.cpu_count()} here). Peaks under about 25 "
+            "MB are those of the measuring process, from which the programs are started.\n\n"
         )
         return (
             f"### Ingest of {self.count:,} phrases of 120 frames\n\n{text}{table(head, rows)}\n"
@@ -215,10 +229,15 @@ class Bench:
         ours_s, peer_s = median_s(runs["motiongen query"]), median_s(runs["Python polars"])
         alone_s = statistics.median(in_process_s)
         rows = [
-            [name, spread(own_runs), f"{max(r.peak_mb for r in own_runs):.0f}"]
+            [
+                name,
+                spread(own_runs),
+                f"{median_cpu_s(own_runs):.2f}",
+                f"{max(r.peak_mb for r in own_runs):.0f}",
+            ]
             for name, own_runs in runs.items()
         ]
-        rows.append(["Python polars, query alone (after import)", f"{alone_s:.3f}", ""])
+        rows.append(["Python polars, query alone (after import)", f"{alone_s:.3f}", "", ""])
         notes = (
             f"- whole process / whole process = {verdict(ours_s / peer_s, SCAN_TARGET)}\n"
             f"- whole process / polars' query alone = {verdict(ours_s / alone_s, SCAN_TARGET)}\n"
@@ -229,7 +248,7 @@ class Bench:
         return (
             title
             + says
-            + table(["program", "wall s, median (range)", "peak MB"], rows)
+            + table(["program", "wall s, median (range)", "CPU s", "peak MB"], rows)
             + "\n"
             + notes
         )
@@ -260,7 +279,7 @@ class Bench:
             longest_s = start_s + (whole_s - start_s) / 4
             delays_s = sorted(rng.uniform(0, longest_s) for _ in racers)
             began = time.perf_counter()
-            for racer, delay_s in zip(rng.sample(racers, len(racers)), delays_s):
+            for racer, delay_s in zip(rng.sample(racers, len(racers)), delays_s, strict=True):
                 time.sleep(max(0.0, began + delay_s - time.perf_counter()))
                 if n_kills < self.n_kills and racer.poll() is None:
                     racer.kill()
@@ -285,11 +304,11 @@ class Bench:
         n_lost = sum(path.stat().st_size for path in lost)
         return (
             f"### Kills during the ingest of {self.count:,} phrases\n\n"
-            f"{n_kills} × `kill -9` at random moments (seed {self.seed}) in {n_rounds} rounds of two "
-            f"processes; stores driven to the end: {n_stores}. Each has the {len(expected)} committed "
-            "files (parts and manifests) of an ingest that nobody disturbed, byte for byte; after "
-            f"every round, every committed part was there and whole. Left behind in the last store, "
-            f"invisible to readers: {len(lost)} files, {n_lost / 1e6:.2f} MB.\n"
+            f"{n_kills} × `kill -9` at random moments (seed {self.seed}) in {n_rounds} rounds of "
+            f"two processes; stores driven to the end: {n_stores}. Each has the {len(expected)} "
+            "committed files (parts and manifests) of an ingest that nobody disturbed, byte for "
+            "byte; after every round, every committed part was there and whole. Left behind in "
+            f"the last store, invisible to readers: {len(lost)} files, {n_lost / 1e6:.2f} MB.\n"
         )
 
 
@@ -336,7 +355,7 @@ def machine(bench: Bench, profile: str) -> str:
     cpu = re.search(r"model name\s*: (.*)", pathlib.Path("/proc/cpuinfo").read_text())
     memory = re.search(r"MemTotal:\s*(\d+)", pathlib.Path("/proc/meminfo").read_text())
     load = os.getloadavg()[0]
-    now = datetime.datetime.now(datetime.timezone.utc)
+    now = datetime.datetime.now(datetime.UTC)
     facts = [
         f"{now:%Y-%m-%d %H:%M} UTC",
         f"{cpu.group(1) if cpu else platform.machine()}, {os.cpu_count()} cores",
@@ -375,7 +394,8 @@ def main() -> None:
     parser.add_argument("--build-log", type=pathlib.Path, help="cargo's output, for build times")
     arguments = parser.parse_args()
     full, quick = (10_000, 5, 20), (500, 3, 6)
-    for name, value in zip(["count", "repeats", "kills"], quick if arguments.quick else full):
+    sizes = quick if arguments.quick else full
+    for name, value in zip(["count", "repeats", "kills"], sizes, strict=True):
         if getattr(arguments, name) is None:
             setattr(arguments, name, value)
 

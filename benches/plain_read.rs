@@ -8,6 +8,8 @@
 //! bytes through zstd level 1 into OUTPUT. Nothing is parsed, checked, digested or synced to disk.
 //! `benches/bench.py` runs it beside `motiongen ingest`.
 
+#![expect(clippy::print_stdout, clippy::print_stderr, reason = "a program of its own")]
+
 use std::fs::File;
 use std::io::{BufWriter, Write as _};
 use std::path::{Path, PathBuf};

@@ -1,1 +1,470 @@
-//! To come.
+//! `query`: SQL over a local store, every format, and every mistake that a user can make.
+
+use std::path::Path;
+
+use motiongen::store::tables::{FailureRow, PhraseRow, motion};
+use motiongen::store::{
+    ClientOptions, Commit, Format, Item, Ledger, Location, Row as _, StoreError, TableSchema,
+    TimestampUs, query, table_infos,
+};
+use ndarray::Array2;
+use polars::prelude::{ParquetReader, SerReader as _};
+
+use crate::support::files::{Frame, beats, coherent, features_npz, trajectory, wav};
+use crate::support::{Dir, Output, ingest, run};
+
+/// Names, frames and whether there is audio of the phrases in [`sound_store`].
+const PHRASES: [(&str, usize, bool); 5] = [
+    ("mBR0", 31, true),
+    ("a/ü, \"quoted\"", 47, false),
+    ("gLO 2", 17, true),
+    ("z", 59, false),
+    ("gLO_3", 23, false),
+];
+
+fn write_phrase(dir: &Dir, i: usize, n_frames: usize) -> Vec<Frame> {
+    let (id, _, has_audio) = PHRASES[i];
+    let frames = coherent(n_frames, i as u32);
+    dir.write(format!("source/motion/{id}/trajectory.npy"), trajectory(&frames));
+    if has_audio {
+        dir.write(format!("source/audio/{id}.wav"), wav(n_frames as f64 / 30.0));
+        dir.write(format!("source/audio/{id}.beats.txt"), beats(7, 125.0, Some(3)));
+    }
+    frames
+}
+
+/// Ingests five phrases and one that cannot be read.
+fn sound_store() -> (Dir, Vec<Vec<Frame>>) {
+    let dir = Dir::new();
+    let frames = (0..PHRASES.len()).map(|i| write_phrase(&dir, i, PHRASES[i].1)).collect();
+    dir.write("source/audio_features/z/features.npz", features_npz(59));
+    dir.write("source/motion/broken/trajectory.npy", "no array");
+    let output = ingest(&dir.at("source"), &dir.at("store"), &["--batch-phrases", "2"]);
+    assert_eq!(output.code, 1, "{output:?}");
+    (dir, frames)
+}
+
+fn ask(store: &Path, more: &[&str]) -> Output {
+    let store = store.display().to_string();
+    run(["query", "--store", &store].into_iter().chain(more.iter().copied()))
+}
+
+/// Asks for CSV and returns it.
+#[track_caller]
+fn csv(store: &Path, sql: &str) -> String {
+    let output = ask(store, &["--format", "csv", sql]);
+    assert_eq!((output.code, output.stderr.as_str()), (0, ""), "{sql}");
+    output.stdout
+}
+
+/// Asks something wrong and returns the one sentence that comes back.
+#[track_caller]
+fn refusal(store: &Path, sql: &str) -> String {
+    let output = ask(store, &[sql]);
+    assert_eq!((output.code, output.stdout.as_str()), (2, ""), "{sql}: {}", output.stderr);
+    assert_eq!(output.stderr.lines().count(), 1, "{sql}: {}", output.stderr);
+    let sentence = output.stderr.strip_prefix("error: ").expect("an error");
+    sentence.trim_end().to_owned()
+}
+
+/// Returns a store with two failures at known times, and their commit.
+fn failures_at(store: &Location, rows: &[(&str, &str, i64)]) {
+    let mut commit = Commit::new(store, "ingest", "rules", "file:///source");
+    let rows: Vec<_> = rows
+        .iter()
+        .map(|(id, message, time_us)| FailureRow {
+            stage: "ingest".to_owned(),
+            phrase_id: (*id).to_owned(),
+            source: format!("file:///source/{id}"),
+            kind: "shape".to_owned(),
+            message: (*message).to_owned(),
+            time: TimestampUs(*time_us),
+        })
+        .collect();
+    let part = commit.part("failures", FailureRow::schema).expect("a temporary file");
+    part.write_rows(&rows).expect("rows");
+    let ledger = Ledger::read(store, "ingest").expect("commits");
+    for row in &rows {
+        let (id, input_hash) = (row.phrase_id.clone(), row.message.clone());
+        let item = Item { id, fingerprint: String::new(), input_hash, failure: Some("x".into()) };
+        commit.settle(item, &ledger);
+    }
+    commit.publish().expect("published");
+}
+
+const SOME: &str =
+    "select phrase_id, n_frames, tempo_bpm, has_audio from phrases order by phrase_id";
+
+#[test]
+fn csv_quotes_what_needs_it_and_leaves_nulls_empty() {
+    let (dir, _) = sound_store();
+    let expected = "phrase_id,n_frames,tempo_bpm,has_audio\n\
+                    \"a/ü, \"\"quoted\"\"\",47,,false\n\
+                    gLO 2,17,125.0,true\n\
+                    gLO_3,23,,false\n\
+                    mBR0,31,125.0,true\n\
+                    z,59,97.5,false\n";
+    assert_eq!(csv(&dir.at("store"), SOME), expected);
+}
+
+#[test]
+fn json_is_an_array_of_rows_with_nulls() {
+    let (dir, _) = sound_store();
+    let output = ask(&dir.at("store"), &["--format", "json", SOME]);
+    assert_eq!((output.code, output.stderr.as_str()), (0, ""));
+    let expected = serde_json::json!([
+        {"phrase_id": "a/ü, \"quoted\"", "n_frames": 47, "tempo_bpm": null, "has_audio": false},
+        {"phrase_id": "gLO 2", "n_frames": 17, "tempo_bpm": 125.0, "has_audio": true},
+        {"phrase_id": "gLO_3", "n_frames": 23, "tempo_bpm": null, "has_audio": false},
+        {"phrase_id": "mBR0", "n_frames": 31, "tempo_bpm": 125.0, "has_audio": true},
+        {"phrase_id": "z", "n_frames": 59, "tempo_bpm": 97.5, "has_audio": false},
+    ]);
+    let found: serde_json::Value = serde_json::from_str(&output.stdout).expect("JSON");
+    assert_eq!(found, expected);
+    assert!(output.stdout.ends_with("]\n"), "{}", output.stdout);
+}
+
+#[test]
+fn a_table_aligns_numbers_right_and_shows_every_digit() {
+    let (dir, _) = sound_store();
+    let sql = "select phrase_id, n_frames, duration_s, tempo_bpm, has_audio from phrases \
+               order by phrase_id";
+    let output = ask(&dir.at("store"), &[sql]);
+    let expected = "\
+┌───────────────┬──────────┬────────────────────┬───────────┬───────────┐
+│ phrase_id     ┆ n_frames ┆         duration_s ┆ tempo_bpm ┆ has_audio │
+╞═══════════════╪══════════╪════════════════════╪═══════════╪═══════════╡
+│ a/ü, \"quoted\" ┆       47 ┆ 1.5666666666666667 ┆           ┆ false     │
+│ gLO 2         ┆       17 ┆           0.566625 ┆       125 ┆ true      │
+│ gLO_3         ┆       23 ┆ 0.7666666666666667 ┆           ┆ false     │
+│ mBR0          ┆       31 ┆           1.033375 ┆       125 ┆ true      │
+│ z             ┆       59 ┆ 1.9666666666666666 ┆      97.5 ┆ false     │
+└───────────────┴──────────┴────────────────────┴───────────┴───────────┘
+";
+    assert_eq!((output.code, output.stdout.as_str()), (0, expected), "{}", output.stderr);
+}
+
+#[test]
+fn parquet_keeps_types_and_replaces_the_output_file_whole() {
+    let (dir, _) = sound_store();
+    let (store, output_file) = (dir.at("store"), dir.write("answers/a.parquet", "an older answer"));
+    let flags = ["--format", "parquet", "--output", output_file.to_str().expect("UTF-8"), SOME];
+    let output = ask(&store, &flags);
+    let expected = format!("5 rows → {}\n", output_file.display());
+    assert_eq!((output.code, output.stdout), (0, expected), "{}", output.stderr);
+    let file = std::fs::File::open(&output_file).expect("the answer");
+    let frame = ParquetReader::new(file).finish().expect("a Parquet file");
+    let types: Vec<_> = frame.dtypes().iter().map(ToString::to_string).collect();
+    assert_eq!(types, ["str", "i64", "f64", "bool"]);
+    let n_frames: Vec<_> = frame.column("n_frames").expect("a column").i64().expect("i64").into();
+    assert_eq!(n_frames, [47, 17, 23, 31, 59].map(Some));
+    // Nothing else is left in the folder, and others may read the answer.
+    assert_eq!(std::fs::read_dir(dir.at("answers")).expect("the folder").count(), 1);
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt as _;
+        let mode = std::fs::metadata(&output_file).expect("the answer").permissions().mode();
+        assert_eq!(mode & 0o777, 0o644);
+    }
+}
+
+#[test]
+fn a_refused_query_leaves_the_output_file_as_it_was() {
+    let (dir, _) = sound_store();
+    let kept = dir.write("a.csv", "an older answer");
+    let path = kept.to_str().expect("UTF-8");
+    let output = ask(&dir.at("store"), &["--format", "csv", "--output", path, "select x from y"]);
+    assert_eq!(output.code, 2, "{output:?}");
+    assert_eq!(std::fs::read_to_string(&kept).expect("still there"), "an older answer");
+    let nowhere = dir.write("a file", "x").join("a.csv");
+    let path = nowhere.to_str().expect("UTF-8");
+    let output = ask(&dir.at("store"), &["--format", "csv", "--output", path, SOME]);
+    assert_eq!((output.code, output.stdout.as_str()), (2, ""), "{output:?}");
+    let start = format!("error: while writing {path}: ");
+    assert!(output.stderr.starts_with(&start), "{}", output.stderr);
+}
+
+#[test]
+fn tables_counts_rows_bytes_and_parts_of_what_is_live() {
+    let (dir, _) = sound_store();
+    let store = dir.at("store");
+    let expected = |tables: [(&str, usize); 3]| {
+        let mut text =
+            String::from("table                    rows          bytes   parts  version\n");
+        for (name, n_rows) in tables {
+            let live = live_files(&store, name);
+            let n_bytes: u64 = live.iter().sum();
+            text += &format!("{name:<16} {n_rows:>12} {n_bytes:>14} {:>7}        1\n", live.len());
+        }
+        text
+    };
+    let output = ask(&store, &["--tables"]);
+    let first = expected([("phrases", 5), ("motion", 177), ("failures", 1)]);
+    assert_eq!((output.code, output.stdout), (0, first), "{}", output.stderr);
+
+    // One phrase is replaced by a longer one, the broken one is repaired.
+    write_phrase(&dir, 2, 19);
+    dir.write("source/motion/broken/trajectory.npy", trajectory(&coherent(7, 7)));
+    let output = ingest(&dir.at("source"), &store, &["--batch-phrases", "2"]);
+    assert_eq!(output.code, 0, "{output:?}");
+    let output = ask(&store, &["--tables"]);
+    let then = expected([("phrases", 6), ("motion", 186), ("failures", 0)]);
+    assert_eq!((output.code, output.stdout), (0, then), "{}", output.stderr);
+}
+
+/// Returns the sizes of a table's live parts.
+fn live_files(store: &Path, table: &str) -> Vec<u64> {
+    let location = Location::local(store).expect("a location");
+    let live = motiongen::store::live_parts(&location).expect("commits").remove(table);
+    let size = |path: &str| std::fs::metadata(store.join(path)).expect("a part").len();
+    live.unwrap_or_default().iter().map(|l| size(&l.part.path)).collect()
+}
+
+#[test]
+fn rows_of_replaced_phrases_do_not_appear() {
+    let (dir, _) = sound_store();
+    let store = dir.at("store");
+    write_phrase(&dir, 2, 19);
+    dir.write("source/motion/broken/trajectory.npy", trajectory(&coherent(7, 7)));
+    assert_eq!(ingest(&dir.at("source"), &store, &["--batch-phrases", "2"]).code, 0);
+    let sql = "select phrase_id, n_frames from phrases order by phrase_id";
+    let expected = "phrase_id,n_frames\n\"a/ü, \"\"quoted\"\"\",47\nbroken,7\ngLO 2,19\ngLO_3,23\n\
+                    mBR0,31\nz,59\n";
+    assert_eq!(csv(&store, sql), expected);
+    let sql = "select phrase_id, count(*) n, max(frame) last from motion group by phrase_id \
+               order by phrase_id";
+    let expected = "phrase_id,n,last\n\"a/ü, \"\"quoted\"\"\",47,46\nbroken,7,6\ngLO 2,19,18\n\
+                    gLO_3,23,22\nmBR0,31,30\nz,59,58\n";
+    assert_eq!(csv(&store, sql), expected);
+    assert_eq!(csv(&store, "select count(*) n from failures"), "n\n0\n");
+}
+
+#[test]
+fn aggregates_over_many_parts_are_those_of_the_frames() {
+    let (dir, frames) = sound_store();
+    let sql = "select phrase_id, count(*) n, min(position_x) low, max(position_x) high, \
+               avg(cast(style_3 as double)) mean from motion where frame >= 5 and frame < 20 \
+               group by phrase_id order by phrase_id desc";
+    let text = csv(&dir.at("store"), sql);
+    let mut rows = text.lines().skip(1);
+    for i in [3, 0, 4, 2, 1] {
+        let (id, n_frames, _) = PHRASES[i];
+        let part = &frames[i][5..20.min(n_frames)];
+        let x: Vec<f32> = part.iter().map(|f| f[0]).collect();
+        let mean = part.iter().map(|f| f64::from(f[20])).sum::<f64>() / part.len() as f64;
+        let row = rows.next().expect("five rows");
+        // The quoted name holds commas, the numbers do not.
+        let mut cells = row.rsplit(',');
+        let mut number = || cells.next().and_then(|c| c.parse::<f64>().ok()).expect("a number");
+        let found_mean = number();
+        assert!((found_mean - mean).abs() < 1e-12, "{row}: mean {mean}");
+        let high = x.iter().copied().fold(f32::MIN, f32::max);
+        let low = x.iter().copied().fold(f32::MAX, f32::min);
+        assert_eq!(number() as f32, high, "{row}");
+        assert_eq!(number() as f32, low, "{row}");
+        assert_eq!(number(), part.len() as f64, "{row}");
+        assert!(row.contains(id.split('"').next().expect("a start")), "{row}: not {id}");
+    }
+    assert_eq!(rows.next(), None);
+}
+
+#[test]
+fn joins_relate_the_tables_of_a_store() {
+    let (dir, _) = sound_store();
+    let sql = "select p.phrase_id, p.n_frames, count(*) n, p.audio_codec c from phrases p \
+               join motion m on m.phrase_id = p.phrase_id where p.has_audio \
+               group by p.phrase_id, p.n_frames, p.audio_codec order by p.phrase_id";
+    let expected = "phrase_id,n_frames,n,c\ngLO 2,17,17,pcm_s16le\nmBR0,31,31,pcm_s16le\n";
+    assert_eq!(csv(&dir.at("store"), sql), expected);
+    // Case of keywords and tables does not matter, and two spellings are one table.
+    let sql = "SELECT COUNT(*) AS n FROM Phrases LEFT JOIN PHRASES q USING (phrase_id)";
+    assert_eq!(csv(&dir.at("store"), sql), "n\n5\n");
+}
+
+#[test]
+fn timestamps_are_shown_in_utc_with_microseconds() {
+    let dir = Dir::new();
+    let store = Location::local(&dir.at("store")).expect("a location");
+    failures_at(&store, &[("a", "first", 1_700_000_000_123_456), ("b", "second", -1)]);
+    let sql = "select phrase_id, time from failures order by time";
+    let expected = "phrase_id,time\nb,1969-12-31T23:59:59.999999+0000\n\
+                    a,2023-11-14T22:13:20.123456+0000\n";
+    assert_eq!(csv(&dir.at("store"), sql), expected);
+    let output = ask(&dir.at("store"), &["select time from failures where phrase_id = 'a'"]);
+    assert!(output.stdout.contains("│ 2023-11-14 22:13:20.123456 UTC │"), "{}", output.stdout);
+}
+
+#[test]
+fn an_empty_store_has_every_table_without_rows() {
+    let dir = Dir::new();
+    let store = dir.at("nobody was here");
+    let sql = "select phrase_id, duration_s, has_audio, n_frames from phrases";
+    assert_eq!(csv(&store, sql), "phrase_id,duration_s,has_audio,n_frames\n");
+    let sql = "select split, count(*) n, sum(duration_s) s from phrases group by split";
+    assert_eq!(csv(&store, sql), "split,n,s\n");
+    assert_eq!(csv(&store, "select count(*) n from motion"), "n\n0\n");
+    assert_eq!(csv(&store, "select phrase_id, time from failures"), "phrase_id,time\n");
+    let output = ask(&store, &["--format", "json", "select phrase_id from phrases"]);
+    assert_eq!((output.code, output.stdout.as_str()), (0, "[]\n"), "{}", output.stderr);
+    let expected = "\
+table                    rows          bytes   parts  version
+phrases                     0              0       0        1
+motion                      0              0       0        1
+failures                    0              0       0        1
+";
+    let output = ask(&store, &["--tables"]);
+    assert_eq!((output.code, output.stdout.as_str()), (0, expected), "{}", output.stderr);
+    assert!(!store.exists(), "asking created the store");
+}
+
+/// Returns "table NAME has COLUMN, …" of a table.
+fn columns_of(schema: &TableSchema) -> String {
+    let names: Vec<_> = schema.columns.iter().map(|c| c.name.as_ref()).collect();
+    format!("table {} has {}", schema.name, names.join(", "))
+}
+
+#[test]
+fn an_unknown_column_comes_with_the_nearest_ones() {
+    let (dir, _) = sound_store();
+    let store = dir.at("store");
+    let of_phrases = columns_of(&PhraseRow::schema());
+    let tempo = format!(
+        "column \"tempo_bmp\" not found; nearest: tempo_bpm, tempo_source, motion_bytes; {of_phrases}"
+    );
+    let wherever = [
+        "select tempo_bmp from phrases",
+        "select phrase_id from phrases where tempo_bmp > 100",
+        "select p.tempo_bmp from phrases p",
+        "select phrases.tempo_bmp from phrases",
+        "select split, avg(tempo_bmp) from phrases group by split",
+        "select phrase_id from phrases order by tempo_bmp",
+    ];
+    for sql in wherever {
+        assert_eq!(refusal(&store, sql), tempo, "{sql}");
+    }
+    let sql = "select m.phrase from motion m join phrases p on m.phrase_id = p.phrase_id";
+    let sentence = refusal(&store, sql);
+    let start = "column \"phrase\" not found; nearest: phase, phrase_id, source; ";
+    assert!(sentence.starts_with(start), "{sentence}");
+    let end = format!("{of_phrases}; {}", columns_of(&motion()));
+    assert!(sentence.ends_with(&end), "{sentence}");
+}
+
+#[test]
+fn an_unknown_table_comes_with_the_nearest_and_all_others() {
+    let dir = Dir::new();
+    for (sql, table, nearest) in [
+        ("select * from phrase", "phrase", "phrases, failures, motion"),
+        ("select * from phrases join motions using (phrase_id)", "motions", "motion"),
+        ("select count(*) from failure", "failure", "failures"),
+    ] {
+        let sentence = refusal(&dir.at("store"), sql);
+        let start = format!("table \"{table}\" not found; nearest: {nearest}");
+        assert!(sentence.starts_with(&start), "{sentence}");
+        assert!(sentence.ends_with("; a store has phrases, motion, failures"), "{sentence}");
+    }
+}
+
+#[test]
+fn broken_sql_is_refused_in_one_useful_line() {
+    let dir = Dir::new();
+    for (sql, part) in [
+        ("selct phrase_id from phrases", "selct"),
+        ("select phrase_id from phrases where", "Expected"),
+        ("select (1 from phrases", "Expected"),
+        ("select nosuchfunction(phrase_id) from phrases", "nosuchfunction"),
+        ("", "one (and only one) statement"),
+        ("select 1; select 2", "one (and only one) statement"),
+        ("select avg(split) from phrases", "`mean` operation not supported for dtype `str`"),
+    ] {
+        let sentence = refusal(&dir.at("store"), sql);
+        assert!(sentence.contains(part), "{sql}: {sentence}");
+    }
+}
+
+#[test]
+fn a_statement_that_would_change_a_table_is_refused() {
+    let (dir, _) = sound_store();
+    for (sql, verb) in [
+        ("delete from phrases", "delete"),
+        (" DROP table phrases", "drop"),
+        ("create table x as select * from phrases", "create"),
+    ] {
+        let expected = format!(
+            "\"{verb}\" would change the tables, which only stages do; begin with \"select\""
+        );
+        assert_eq!(refusal(&dir.at("store"), sql), expected);
+    }
+    assert_eq!(csv(&dir.at("store"), "select count(*) n from phrases"), "n\n5\n");
+}
+
+#[test]
+fn folders_above_the_store_never_become_columns() {
+    let dir = Dir::new();
+    let path = dir.at("split=3/run=x[1]*/store ü");
+    let store = Location::local(&path).expect("a location");
+    failures_at(&store, &[("a", "1", 1)]);
+    let sql = "select * from failures";
+    let expected = "stage,phrase_id,source,kind,message,time\n\
+                    ingest,a,file:///source/a,shape,1,1970-01-01T00:00:00.000001+0000\n";
+    assert_eq!(csv(&path, sql), expected);
+}
+
+#[test]
+fn a_query_without_sql_or_with_an_unknown_format_is_refused() {
+    let dir = Dir::new();
+    let output = ask(&dir.at("store"), &[]);
+    assert_eq!((output.code, output.stdout.as_str()), (2, ""), "{output:?}");
+    assert!(output.stderr.contains("<SQL>"), "{}", output.stderr);
+    let output = ask(&dir.at("store"), &["--format", "xml", SOME]);
+    assert_eq!((output.code, output.stdout.as_str()), (2, ""), "{output:?}");
+    assert!(output.stderr.contains("use table, csv, json or parquet"), "{}", output.stderr);
+    let output = ask(&dir.at("store"), &["--tables", SOME]);
+    assert_eq!(output.code, 2, "{output:?}");
+}
+
+#[test]
+fn a_part_of_another_schema_version_is_refused_with_what_to_do() {
+    for (version, remedy) in
+        [(2, "install a newer motiongen"), (0, "run the stage that wrote it again with --force")]
+    {
+        let dir = Dir::new();
+        let store = Location::local(&dir.at("store")).expect("a location");
+        let mut commit = Commit::new(&store, "ingest", "rules", "file:///source");
+        let part = commit.part("motion", || TableSchema { version, ..motion() }).expect("a file");
+        part.write_frames("a", Array2::zeros((3, 25)).view()).expect("frames");
+        let (fingerprint, input_hash) = (String::new(), String::new());
+        let item = Item { id: "a".to_owned(), fingerprint, input_hash, failure: None };
+        commit.settle(item, &Ledger::default());
+        commit.publish().expect("published");
+        let part = store.list("motion").expect("a listing").remove(0).path;
+        let expected = format!(
+            "table motion: {} has schema version {version}, this program reads version 1; {remedy}",
+            store.url_of(&part)
+        );
+        assert_eq!(refusal(&dir.at("store"), "select count(*) from motion"), expected);
+        assert_eq!(csv(&dir.at("store"), "select count(*) n from phrases"), "n\n0\n");
+    }
+}
+
+#[test]
+fn a_store_in_memory_is_asked_inside_the_process() {
+    let options = ClientOptions::default();
+    let store = Location::open("memory://query-tables/ü", &options).expect("a store in memory");
+    failures_at(&store, &[("a", "1", 1), ("b", "1", 2), ("c", "1", 3)]);
+    failures_at(&store, &[("b", "2", 4)]);
+    let ask = |sql| {
+        let mut answer = query(&store, sql, &options).unwrap_or_else(|e| panic!("{e}"));
+        let mut text = Vec::new();
+        answer.write(Format::Csv, &mut text).expect("written to memory");
+        (answer.n_rows(), String::from_utf8(text).expect("UTF-8"))
+    };
+    let sql = "select phrase_id, message from failures order by phrase_id";
+    assert_eq!(ask(sql), (3, "phrase_id,message\na,1\nb,2\nc,1\n".to_owned()));
+    assert_eq!(ask("select count(*) n from phrases"), (1, "n\n0\n".to_owned()));
+    let error = query(&store, "select id from failures", &options).expect_err("no such column");
+    assert!(matches!(error, StoreError::Query(_)), "{error:?}");
+    let infos = table_infos(&store, &options).expect("a store");
+    let counts: Vec<_> = infos.iter().map(|i| (i.name, i.n_rows, i.n_parts)).collect();
+    assert_eq!(counts, [("phrases", 0, 0), ("motion", 0, 0), ("failures", 3, 2)]);
+}

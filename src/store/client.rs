@@ -48,7 +48,7 @@ impl ClientOptions {
     }
 
     fn timeout(&self) -> String {
-        format!("{} milliseconds", (self.request_timeout_s * 1000.0).round().max(1.0))
+        format!("{} ms", (self.request_timeout_s * 1000.0).round().max(1.0))
     }
 }
 

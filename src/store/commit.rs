@@ -10,9 +10,9 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use bytes::Bytes;
 use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
 
 use super::StoreError;
+use super::digest::{digest, digest_texts};
 use super::location::{Location, Put};
 use super::part::{FinishedPart, PartWriter};
 use super::schema::TableSchema;
@@ -20,6 +20,8 @@ use super::schema::TableSchema;
 /// Layout of manifests; raised when a field changes its meaning.
 const MANIFEST_FORMAT: u32 = 1;
 const FOLDER: &str = "commits";
+/// Hexadecimal digits of a key: 128 bits.
+const KEY_DIGITS: usize = 32;
 
 /// One commit: the parts that it adds and the items that it settles.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -303,56 +305,21 @@ impl<'a> Commit<'a> {
     }
 
     fn key(&self) -> String {
-        let mut hash = Sha256::new();
-        let mut line = |text: &str| {
-            // Length before content: no two sequences of lines run together.
-            hash.update((text.len() as u64).to_le_bytes());
-            hash.update(text);
-        };
-        line(self.stage);
-        line(&program());
-        line(&self.params_hash);
-        line(&self.origin);
-        for (name, open) in &self.parts {
-            line(name);
-            line(&open.schema_version.to_string());
-        }
-        line("replaces");
-        for (_, key) in &self.replaces {
-            line(key);
-        }
-        line("items");
+        let program = program();
+        let mut texts = vec![self.stage, &program, &self.params_hash, &self.origin];
+        let versions: Vec<_> =
+            self.parts.iter().map(|(name, p)| format!("{name} {}", p.schema_version)).collect();
+        texts.extend(versions.iter().map(String::as_str));
+        texts.push("replaces");
+        texts.extend(self.replaces.iter().map(|(_, key)| key.as_str()));
+        texts.push("items");
         for item in &self.items {
-            line(&item.id);
-            line(&item.input_hash);
-            line(item.failure.as_deref().unwrap_or_default());
+            texts.push(&item.id);
+            texts.push(&item.input_hash);
+            texts.push(item.failure.as_deref().unwrap_or_default());
         }
-        hex(&hash.finalize()[..16])
+        digest_texts(texts)[..KEY_DIGITS].to_owned()
     }
-}
-
-/// Returns the digest of bytes that a manifest or table stores: SHA-256, in hexadecimal.
-pub fn sha256(bytes: &[u8]) -> String {
-    hex(&Sha256::digest(bytes))
-}
-
-/// Returns the SHA-256 of everything left in a reader, in hexadecimal.
-///
-/// # Errors
-/// What the reader says.
-pub fn sha256_of(reader: &mut impl std::io::Read) -> std::io::Result<String> {
-    let mut hash = Sha256::new();
-    let mut buffer = vec![0; 1 << 20];
-    loop {
-        match reader.read(&mut buffer)? {
-            0 => return Ok(hex(&hash.finalize())),
-            n => hash.update(&buffer[..n]),
-        }
-    }
-}
-
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|b| format!("{b:02x}")).collect()
 }
 
 /// Returns the name and version that parts and manifests carry.
@@ -362,5 +329,5 @@ fn program() -> String {
 
 fn input_hash(items: &[Item]) -> String {
     let lines: String = items.iter().map(|i| format!("{}\n", i.input_hash)).collect();
-    sha256(lines.as_bytes())
+    digest(lines.as_bytes())
 }

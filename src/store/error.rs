@@ -69,8 +69,7 @@ impl StoreError {
             object_store::Error::NotFound { .. } => {
                 return StoreError::NotFound { place: place.to_owned(), hint: "" };
             }
-            object_store::Error::PermissionDenied { .. }
-            | object_store::Error::Unauthenticated { .. } => credentials_hint(place),
+            source if is_refusal(source) => credentials_hint(place),
             _ => "",
         };
         StoreError::Remote { action, place: place.to_owned(), hint, source: Box::new(source) }
@@ -82,6 +81,15 @@ impl StoreError {
         }
         StoreError::Io { action, place: place.to_owned(), source }
     }
+}
+
+/// Returns whether the storage knew who asked and said no, or asked for credentials.
+fn is_refusal(error: &object_store::Error) -> bool {
+    use object_store::Error::{PermissionDenied, Unauthenticated};
+    // A refused listing is a generic error of the client's, whose status can only be read.
+    let text = || error.to_string();
+    matches!(error, PermissionDenied { .. } | Unauthenticated { .. })
+        || ["status code: 401", "status code: 403"].iter().any(|code| text().contains(code))
 }
 
 fn credentials_hint(place: &str) -> &'static str {

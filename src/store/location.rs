@@ -87,7 +87,7 @@ impl Location {
     /// Returns a location behind a client that the caller holds already, for embedders; `url` is
     /// what messages and tables call it, `prefix` the key below which its objects are.
     pub fn with_client(url: &str, store: Arc<dyn ObjectStore>, prefix: &str) -> Self {
-        let prefix = ObjectPath::from(prefix);
+        let prefix = remote::join(&ObjectPath::default(), prefix);
         let url = url.trim_end_matches('/').to_owned();
         Self { url, kind: Kind::Remote { store, prefix } }
     }

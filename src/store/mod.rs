@@ -6,6 +6,7 @@
 mod cache;
 mod client;
 mod commit;
+mod digest;
 mod error;
 mod local;
 mod location;
@@ -21,10 +22,8 @@ pub mod tables;
 
 pub use cache::Cache;
 pub use client::ClientOptions;
-pub use commit::{
-    Commit, Committed, Item, Ledger, LivePart, Manifest, Part, Settled, live_parts, sha256,
-    sha256_of,
-};
+pub use commit::{Commit, Committed, Item, Ledger, LivePart, Manifest, Part, Settled, live_parts};
+pub use digest::{digest, digest_of};
 pub use error::StoreError;
 pub use local::write_file;
 pub use location::{Listed, Location, Put};

@@ -1,5 +1,6 @@
 //! SQL over the tables of a store: the one file that knows polars.
 
+use std::collections::BTreeSet;
 use std::io::Write;
 use std::str::FromStr;
 
@@ -17,6 +18,8 @@ use super::{ClientOptions, StoreError};
 
 /// Names offered when a name is not found.
 const N_SUGGESTIONS: usize = 3;
+/// Statements that polars would act out on the answer's own copy of a table.
+const CHANGING: [&str; 7] = ["alter", "create", "delete", "drop", "insert", "truncate", "update"];
 
 /// How an answer is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -68,15 +71,22 @@ pub struct TableInfo {
 /// [`StoreError::Query`] in the user's terms: an unknown column or table comes with the nearest
 /// names; [`StoreError::SchemaVersion`] when a part is of another version.
 pub fn query(store: &Location, sql: &str, options: &ClientOptions) -> Result<Answer, StoreError> {
+    let verb = sql.split_whitespace().next().unwrap_or_default().to_lowercase();
+    if CHANGING.contains(&verb.as_str()) {
+        let reason = "would change the tables, which only stages do; begin with \"select\"";
+        return Err(StoreError::Query(format!("\"{verb}\" {reason}")));
+    }
     let schemas = tables::all();
     let mut parts = live_parts(store)?;
     let mut context = SQLContext::new();
     let named = extract_table_identifiers(sql, false, true).unwrap_or_default();
     for schema in &schemas {
         // Only tables that the statement names are opened: a scan reads footers.
-        if named.iter().any(|n| n.eq_ignore_ascii_case(schema.name)) {
+        let mut spellings = named.iter().filter(|n| n.eq_ignore_ascii_case(schema.name)).peekable();
+        if spellings.peek().is_some() {
             let live = parts.remove(schema.name).unwrap_or_default();
-            context.register(schema.name, scan(store, schema, &live, options)?);
+            let frame = scan(store, schema, &live, options)?;
+            spellings.for_each(|name| context.register(name, frame.clone()));
         }
     }
     let explain = |e: PolarsError| StoreError::Query(explain(&e, &schemas, &named));
@@ -230,7 +240,10 @@ fn scan_parts(
     cloud_options.retry_config =
         CloudRetryConfig { max_retries: Some(options.max_retries), ..Default::default() };
     let cloud_options = Some(cloud_options);
-    let args = ScanArgsParquet { glob: false, cloud_options, ..ScanArgsParquet::default() };
+    // A folder called `split=test` above the store is no column of its tables.
+    let hive_options = HiveOptions::new_disabled();
+    let args =
+        ScanArgsParquet { glob: false, cloud_options, hive_options, ..ScanArgsParquet::default() };
     LazyFrame::scan_parquet_sources(sources, args).map_err(|e| StoreError::Query(first_line(&e)))
 }
 
@@ -289,8 +302,10 @@ fn explain(error: &PolarsError, schemas: &[TableSchema], named: &[String]) -> St
 
 /// Returns the names most like `name`, best first.
 fn nearest<'a>(name: &str, known: &[&'a str]) -> Vec<&'a str> {
+    // Tables that are joined share columns; each is offered once.
+    let known: BTreeSet<_> = known.iter().collect();
     let mut scored: Vec<_> =
-        known.iter().map(|k| (strsim::jaro_winkler(&name.to_lowercase(), k), *k)).collect();
+        known.iter().map(|k| (strsim::jaro_winkler(&name.to_lowercase(), k), **k)).collect();
     scored.sort_by(|a, b| b.0.total_cmp(&a.0));
     scored.into_iter().take(N_SUGGESTIONS).map(|(_, k)| k).collect()
 }

@@ -127,7 +127,7 @@ impl Source {
                 for meta in metas {
                     let Some(path) = relative(prefix, &meta.location) else { continue };
                     let tag = meta.e_tag.unwrap_or_else(|| meta.last_modified.to_rfc3339());
-                    let fingerprint = digest(&format!("{} {tag}", meta.size));
+                    let fingerprint = fingerprint_of(&format!("{} {tag}", meta.size));
                     listing.files.push(SourceFile { path, size_bytes: meta.size, fingerprint });
                 }
                 listing.files.sort_by(|a, b| a.path.cmp(&b.path));
@@ -267,7 +267,7 @@ fn units(bytes: u64) -> u32 {
     u32::try_from(bytes.div_ceil(BUDGET_UNIT_BYTES)).unwrap_or(u32::MAX).max(1)
 }
 
-fn digest(text: &str) -> String {
+fn fingerprint_of(text: &str) -> String {
     format!("{:032x}", xxh3_128(text.as_bytes()))
 }
 
@@ -324,7 +324,7 @@ fn local_file(path: String, meta: &std::fs::Metadata) -> SourceFile {
         .ok()
         .and_then(|t| t.duration_since(std::time::UNIX_EPOCH).ok())
         .map_or(0, |d| d.as_nanos());
-    let fingerprint = digest(&format!("{} {modified_ns}", meta.len()));
+    let fingerprint = fingerprint_of(&format!("{} {modified_ns}", meta.len()));
     SourceFile { path, size_bytes: meta.len(), fingerprint }
 }
 

@@ -22,7 +22,7 @@ rows! {
         features_bytes: Option<i64>, "bytes", "Size of the feature file.";
         audio_bytes: Option<i64>, "bytes", "Size of the audio file.";
         beats_bytes: Option<i64>, "bytes", "Size of the beat list.";
-        content_hash: String, "SHA-256", "Digest of the phrase's files: SHA-256 over one line `role sha256` per file, roles sorted.";
+        content_hash: String, "BLAKE3", "Digest of the phrase's files: BLAKE3 over one line `role digest` per file, roles sorted.";
         has_motion: bool, "", "Whether the phrase has motion.";
         has_features: bool, "", "Whether the phrase has a feature file.";
         has_audio: bool, "", "Whether the phrase has audio.";

@@ -87,8 +87,8 @@ ORIGINS = {
         "Carlos Viola Iborra",
         "MIT",
         "licenses/MIT-Carlos-Viola-Iborra.txt",
-        "song and guitar tracks mixed and encoded as Vorbis; beats from the tempo map of the chart, "
-        "beat numbers assume 4/4 from the first beat",
+        "song and guitar tracks mixed and encoded as Vorbis; beats from the tempo map of the "
+        "chart, beat numbers assume 4/4 from the first beat",
     ),
     "kevin-macleod": Origin(
         "librosa 0.7.2 (PyPI), example data",
@@ -228,7 +228,7 @@ def make_all(folder: pathlib.Path, new_sources: bool) -> None:
                 "cut": cut,
             }
         )
-    entries.sort(key=lambda entry: entry["path"])
+    entries.sort(key=lambda entry: str(entry["path"]))
     MANIFEST.write_text(json.dumps({"files": entries}, indent=1) + "\n")
     LICENSES.write_text(licenses(entries))
 
@@ -240,10 +240,10 @@ def licenses(entries: list[dict]) -> str:
         "other: no motion belongs to any of the songs.\n\n"
         "> The data used in this project was obtained from mocap.cs.cmu.edu. The database was\n"
         "> created with funding from NSF EIA-0196217.\n\n"
-        "The same captures serve as golden files: `../golden/motion/cmu_01_01.bvh` is the beginning\n"
-        "of CMU subject 1 trial 1, `mocapbank.bvh` and `mocapbank_15fps.bvh` are the beginning of\n"
-        "the test file of bvh_anim (MIT, © 2019 George Burton). The other BVH files there were drawn\n"
-        "by the script beside them.\n"
+        "The same captures serve as golden files: `../golden/motion/cmu_01_01.bvh` is the\n"
+        "beginning of CMU subject 1 trial 1, `mocapbank.bvh` and `mocapbank_15fps.bvh` are the\n"
+        "beginning of the test file of bvh_anim (MIT, © 2019 George Burton). The other BVH files\n"
+        "there were drawn by the script beside them.\n"
     ]
     for name, origin in ORIGINS.items():
         own = [entry for entry in entries if entry["origin"] == name]
@@ -271,8 +271,8 @@ def check() -> None:
             problems.append(f"{entry['path']} is missing; restore it with git checkout")
         elif digest(path) != entry["sha256"]:
             problems.append(
-                f"{entry['path']} differs from manifest.json; restore it, and look for a line-ending "
-                "conversion if nobody edited it (see .gitattributes)"
+                f"{entry['path']} differs from manifest.json; restore it, and look for a "
+                "line-ending conversion if nobody edited it (see .gitattributes)"
             )
     named = {entry["path"] for entry in entries}
     for name in FOLDERS:

@@ -22,13 +22,13 @@ fn songs() -> Vec<Case> {
             "not audio: it starts with \"{\\\"error\\\": 403}\"; was an error message saved as \
              audio?"),
         song("wav-header-cut-short", "wav", &wav(0.5)[..30], "audio_header",
-            "audio header cannot be read from 30 bytes that start with {start}: {reason}; the file \
-             may be cut short, copy or download it again"),
+            "audio header cannot be read from 30 bytes that start with \"RIFFd\": it ends before a \
+             known codec's header does; the file may be cut short, copy or download it again"),
         song("wav-of-0-hz", "wav", &wav_of(0, 1, &[0; 64]), "audio_header",
             "wav header gives its pcm_s16le track a sample rate of 0 Hz; encode the file again"),
         song("wav-of-0-channels", "wav", &wav_of(8_000, 0, &[0; 64]), "audio_header",
-            "audio header cannot be read from 108 bytes that start with \"RIFFd\": {reason}; the \
-             file may be cut short, copy or download it again"),
+            "audio header cannot be read from 108 bytes that start with \"RIFFd\": riff: invalid \
+             channel count; the file may be cut short, copy or download it again"),
         song("wav-without-samples", "wav", &wav_of(44_100, 2, &[]), "audio_header",
             "wav file has 0 samples of pcm_s16le at 44100 Hz; the recording or conversion that \
              made it failed, make it again"),

@@ -1,7 +1,7 @@
 //! Names, folders, links and permissions that no phrase can have.
 
 use std::ffi::OsStr;
-use std::fs::{Permissions, create_dir_all, set_permissions};
+use std::fs::{File, Permissions, create_dir_all, set_permissions};
 use std::os::unix::ffi::OsStrExt as _;
 use std::os::unix::fs::{PermissionsExt as _, symlink};
 use std::os::unix::net::UnixListener;
@@ -10,10 +10,10 @@ use std::process::Command;
 
 use super::case::Case;
 use crate::support::files::{coherent, trajectory, wav};
-use crate::support::write;
+use crate::support::{MEMORY_BYTES, write};
 
 pub fn cases() -> Vec<Case> {
-    [doubles(), folders(), no_files(), links(), permissions(), names()]
+    [doubles(), folders(), no_files(), links(), large_files(), permissions(), names()]
         .into_iter()
         .flatten()
         .collect()
@@ -121,6 +121,28 @@ fn links() -> Vec<Case> {
             "unreadable",
             "{path} could not be listed (IO error for operation on {source}/{path}: Too many \
              levels of symbolic links (os error 40))"),
+    ]
+}
+
+/// Makes a file of zeros that takes no room on the disk.
+fn zeros(path: &Path, n_bytes: u64) {
+    create_dir_all(path.parent().unwrap()).unwrap();
+    File::create(path).unwrap().set_len(n_bytes).unwrap();
+}
+
+#[rustfmt::skip]
+fn large_files() -> Vec<Case> {
+    vec![
+        Case::tree("npy-of-1-gb", "motion/npy-of-1-gb/trajectory.npy",
+            |source| zeros(&source.join("motion/npy-of-1-gb/trajectory.npy"), (1 << 30) + 1),
+            "too_large",
+            "{path} has 1073741825 bytes, more than the 1073741824 that are read; split the phrase"),
+        // Larger than the memory that the program may have.
+        Case::tree("wav-of-zeros", "audio/wav-of-zeros.wav",
+            |source| zeros(&source.join("audio/wav-of-zeros.wav"), MEMORY_BYTES + (100 << 20)),
+            "audio_header",
+            "{path}: not audio: it starts with bytes 00 00 00 00 00 00 00 00; WAV, AIFF, FLAC, MP3, \
+             Ogg and MP4 are read, was another format saved under the name .wav?"),
     ]
 }
 

@@ -192,7 +192,7 @@ fn a_damaged_manifest_is_refused_with_its_place_and_the_damage() {
         "params_hash": "h", "origin": "o", "parts": [], "items": []}"#;
     for (text, reason) in [
         ("", "EOF while parsing a value at line 1 column 0"),
-        ("{\"format\": 1, \"sta", "EOF while parsing a string at line 1 column 17"),
+        ("{\"format\": 1, \"sta", "EOF while parsing a string at line 1 column 18"),
         ("{\"format\": 1}", "missing field `stage` at line 1 column 13"),
         (empty, "it has format 2, this program reads format 1"),
     ] {

@@ -15,7 +15,7 @@ use crate::stages::{Progress, Stage as _};
 use crate::store::tables::{self, FailureRow, PhraseRow};
 use crate::store::{
     Commit, Content, Item, Ledger, Location, Row as _, Source, SourceFile, StoreError, TimestampUs,
-    batch_of, sha256, split_of,
+    batch_of, digest, split_of,
 };
 
 /// Bytes of source files that one batch holds at most, so that a kill costs little of a slow source.
@@ -121,6 +121,8 @@ impl Job<'_> {
             commit.part(PhraseRow::schema().name, PhraseRow::schema)?.write_rows(&rows)?;
         }
         if !failures.is_empty() {
+            // A contested name sorts elsewhere than the name that it is made from.
+            failures.sort_by(|a, b| a.phrase_id.cmp(&b.phrase_id));
             commit.part(FailureRow::schema().name, FailureRow::schema)?.write_rows(&failures)?;
         }
         if !commit.is_empty() {
@@ -135,7 +137,7 @@ impl Job<'_> {
         planned: &Planned,
         files: Vec<(Role, SourceFile, Result<Content, StoreError>)>,
     ) -> (String, Result<Phrase, Failure>) {
-        let without_content = |failure: &Failure| sha256(failure.message.as_bytes());
+        let without_content = |failure: &Failure| digest(failure.message.as_bytes());
         if let Some(problem) = &planned.problem {
             return (without_content(problem), Err(problem.clone()));
         }
@@ -194,19 +196,20 @@ impl Job<'_> {
                 tally.failed.push(Refused { id: id.clone(), failure: failure.clone() });
             }
         }
+        let fingerprint = fingerprint(planned);
+        let refused = |id| self.ledger.get(id).is_some_and(|known| known.item.failure.is_some());
+        if id != contested && refused(&contested) {
+            // The claim of the other source is gone, and with it the failure.
+            let (fingerprint, input_hash) = (fingerprint.clone(), input_hash.clone());
+            let item = Item { id: contested, fingerprint, input_hash, failure: None };
+            commit.settle(item, self.ledger);
+        }
         if unchanged {
             return Ok(());
         }
         if let Ok(Phrase { motion: Some(motion), .. }) = &outcome {
             let part = commit.part(tables::MOTION, tables::motion)?;
             part.write_frames(&id, motion.view())?;
-        }
-        let fingerprint = fingerprint(planned);
-        if id != contested && self.ledger.get(&contested).is_some() {
-            // The claim of the other source is gone, and with it the failure.
-            let (fingerprint, input_hash) = (fingerprint.clone(), input_hash.clone());
-            let item = Item { id: contested, fingerprint, input_hash, failure: None };
-            commit.settle(item, self.ledger);
         }
         add(match outcome {
             Ok(phrase) => Ok(self.phrase_row(planned, phrase)),
@@ -300,11 +303,11 @@ pub fn fingerprint(planned: &Planned) -> String {
         .map(|(role, file)| format!("{} {} {}\n", role.name(), file.path, file.fingerprint))
         .collect();
     let problem = planned.problem.as_ref().map_or("", |p| p.message.as_str());
-    sha256(format!("{lines}{problem}").as_bytes())[..32].to_owned()
+    digest(format!("{lines}{problem}").as_bytes())[..32].to_owned()
 }
 
 fn failure_digest(failure: &Failure) -> String {
-    sha256(format!("{}\n{}", failure.kind.name(), failure.message).as_bytes())[..32].to_owned()
+    digest(format!("{}\n{}", failure.kind.name(), failure.message).as_bytes())[..32].to_owned()
 }
 
 fn gone(file: &SourceFile) -> Result<Content, StoreError> {

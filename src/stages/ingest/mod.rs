@@ -11,7 +11,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use super::{ClientParams, Contract, Progress, Stage, Summary};
-use crate::store::{Cache, Ledger, Location, Shard, Source, StoreError, sha256};
+use crate::store::{Cache, Ledger, Location, Shard, Source, StoreError, digest};
 
 pub use failure::{Failure, FailureKind};
 pub use layout::{Layout, Plan, Planned, Role, plan};
@@ -101,8 +101,10 @@ impl Stage for Ingest {
         let params_hash = params_hash(&params.rules);
 
         let mine: Vec<_> = plan.phrases.iter().filter(|p| shard.takes(&p.id)).collect();
-        let is_done =
-            |p: &Planned| !params.force && !params.verify && is_settled(p, &ledger, &params_hash);
+        let origin = source.location().url();
+        let is_done = |p: &Planned| {
+            !params.force && !params.verify && is_settled(p, &ledger, &params_hash, origin)
+        };
         let (done, todo): (Vec<_>, Vec<_>) = mine.into_iter().partition(|p| is_done(p));
         tracing::info!(
             source = source.location().url(),
@@ -158,13 +160,16 @@ fn open_cache(params: &Params) -> Result<Option<Cache>, StoreError> {
 /// Returns the digest of everything but the input that determines ingest's output.
 fn params_hash(rules: &Rules) -> String {
     let text = serde_json::json!({ "output_version": OUTPUT_VERSION, "rules": rules }).to_string();
-    sha256(text.as_bytes())
+    digest(text.as_bytes())
 }
 
 /// Returns whether the store has a phrase's rows for these files and rules.
-fn is_settled(planned: &Planned, ledger: &Ledger, params_hash: &str) -> bool {
+///
+/// Size and time tell a file's versions apart, not the files of two sources.
+fn is_settled(planned: &Planned, ledger: &Ledger, params_hash: &str, origin: &str) -> bool {
     ledger.get(&planned.id).is_some_and(|known| {
         known.params_hash == params_hash
+            && known.origin == origin
             && known.item.failure.is_none()
             && known.item.fingerprint == batch::fingerprint(planned)
     })

@@ -13,7 +13,7 @@ use crate::motion::{
     Beats, BeatsPerBarSource, Bvh, BvhError, CaptureError, ChannelLimits, Trajectory,
     TrajectoryError, convert_bvh,
 };
-use crate::store::{Content, SourceFile, StoreError, sha256, sha256_of};
+use crate::store::{Content, SourceFile, StoreError, digest, digest_of};
 use crate::units::{FPS, frames_to_s, s_to_frames};
 
 /// Arrays of a feature file: key and channels (`None`: one value per frame).
@@ -92,15 +92,15 @@ impl Files {
         for (role, file, content) in files {
             let mut content = content.map_err(|e| unreadable(&file, &e))?;
             let hash = match &mut content {
-                Content::Bytes(bytes) => sha256(bytes),
-                Content::File(file_content) => sha256_of(file_content)
+                Content::Bytes(bytes) => digest(bytes),
+                Content::File(file_content) => digest_of(file_content)
                     .and_then(|hash| file_content.rewind().map(|()| hash))
                     .map_err(|e| Failure::new(FailureKind::Unreadable, &file.path, e))?,
             };
             lines += &format!("{} {hash}\n", role.name());
             taken.push((role, file, content));
         }
-        Ok(Self { content_hash: sha256(lines.as_bytes()), files: taken })
+        Ok(Self { content_hash: digest(lines.as_bytes()), files: taken })
     }
 
     pub fn content_hash(&self) -> &str {
