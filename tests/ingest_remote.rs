@@ -99,7 +99,7 @@ impl Job {
                 has_features: false,
                 tempo_bpm: None,
             };
-            if i % 5 == 0 {
+            if i.is_multiple_of(5) {
                 put(format!("audio/{id}.wav"), wav(duration_s));
                 put(format!("audio/{id}.beats.txt"), beats(5, 120.0, Some(4)).into_bytes());
                 (expected.has_audio, expected.tempo_bpm) = (true, Some(120.0));

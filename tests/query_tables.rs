@@ -344,7 +344,7 @@ fn an_unknown_column_comes_with_the_nearest_ones() {
     }
     let sql = "select m.phrase from motion m join phrases p on m.phrase_id = p.phrase_id";
     let sentence = refusal(&store, sql);
-    let start = "column \"phrase\" not found; nearest: phase, phrase_id, source; ";
+    let start = "column \"phrase\" not found; nearest: phase, phrase_id, has_beats; ";
     assert!(sentence.starts_with(start), "{sentence}");
     let end = format!("{of_phrases}; {}", columns_of(&motion()));
     assert!(sentence.ends_with(&end), "{sentence}");

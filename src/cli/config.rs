@@ -70,7 +70,7 @@ pub fn apply(
 }
 
 /// Returns the file that the flag or the environment names.
-fn file_named(arguments: &[OsString]) -> Option<OsString> {
+pub fn file_named(arguments: &[OsString]) -> Option<OsString> {
     let flag = format!("--{FLAG}");
     let mut rest = arguments.iter().skip(1);
     while let Some(argument) = rest.next() {
@@ -120,6 +120,7 @@ fn with_defaults(
 fn unknown_key(command: &Command, stage: &str, key: &str) -> String {
     let known: Vec<_> = command
         .get_arguments()
+        .filter(|a| !matches!(a.get_action(), ArgAction::Count))
         .filter_map(|a| a.get_long())
         .filter(|flag| !["help", "version", FLAG].contains(flag))
         .collect();

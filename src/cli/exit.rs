@@ -1,5 +1,6 @@
 //! The one place that prints errors and chooses the exit code.
 
+use std::ffi::OsStr;
 use std::process::ExitCode;
 
 use crate::stages::Summary;
@@ -27,10 +28,17 @@ pub fn report(outcome: anyhow::Result<Box<dyn Summary>>) -> ExitCode {
 }
 
 /// Prints clap's own words: help and version end well, a wrong flag could not run.
-pub fn usage(error: &clap::Error) -> ExitCode {
+#[expect(clippy::print_stderr, reason = "this is where errors are printed")]
+pub fn usage(error: &clap::Error, configuration: Option<&OsStr>) -> ExitCode {
     // The reader of a help text may be gone; there is nobody left to tell.
     error.print().ok();
-    if error.use_stderr() { ExitCode::from(COULD_NOT_RUN) } else { ExitCode::SUCCESS }
+    if !error.use_stderr() {
+        return ExitCode::SUCCESS;
+    }
+    if let Some(file) = configuration {
+        eprintln!("hint: values that were not typed may come from {}", file.to_string_lossy());
+    }
+    ExitCode::from(COULD_NOT_RUN)
 }
 
 /// Joins an error and its causes, leaving out a cause that its parent has quoted already.

@@ -47,13 +47,9 @@ fn entries() -> Vec<Entry> {
 pub fn stage<S: Stage>() -> ExitCode {
     let command = command::<S>().name(format!("motiongen-{}", S::NAME)).version(VERSION);
     let arguments: Vec<OsString> = std::env::args_os().collect();
-    let command = match config::apply(command, &[], &arguments) {
-        Ok(command) => command,
-        Err(e) => return exit::report(Err(e)),
-    };
-    let matches = match command.try_get_matches_from(&arguments) {
+    let matches = match matches(command, &[], &arguments) {
         Ok(matches) => matches,
-        Err(e) => return exit::usage(&e),
+        Err(code) => return code,
     };
     exit::report(run_stage::<S>(&matches))
 }
@@ -74,13 +70,9 @@ pub fn front_door() -> ExitCode {
         return exit::report(list_stages(&entries));
     }
     let names: Vec<_> = entries.iter().map(|e| e.name).collect();
-    let command = match config::apply(command, &names, &arguments) {
-        Ok(command) => command,
-        Err(e) => return exit::report(Err(e)),
-    };
-    let matches = match command.try_get_matches_from(&arguments) {
+    let matches = match matches(command, &names, &arguments) {
         Ok(matches) => matches,
-        Err(e) => return exit::usage(&e),
+        Err(code) => return code,
     };
     let chosen = matches.subcommand().and_then(|(name, matches)| {
         entries.iter().find(|entry| entry.name == name).map(|entry| (entry, matches))
@@ -89,6 +81,18 @@ pub fn front_door() -> ExitCode {
         Some((entry, matches)) => exit::report((entry.run)(matches)),
         None => exit::report(list_stages(&entries)),
     }
+}
+
+/// Parses the command line over the configuration file; what is wrong is printed.
+fn matches(
+    command: Command,
+    stages: &[&str],
+    arguments: &[OsString],
+) -> Result<ArgMatches, ExitCode> {
+    let command = config::apply(command, stages, arguments).map_err(|e| exit::report(Err(e)))?;
+    command
+        .try_get_matches_from(arguments)
+        .map_err(|e| exit::usage(&e, config::file_named(arguments).as_deref()))
 }
 
 const VERSION: &str = env!("CARGO_PKG_VERSION");

@@ -111,6 +111,15 @@ impl Ledger {
         Self { items }
     }
 
+    /// Returns the items from `origin` that failed last time, in order of id.
+    pub fn failed(&self, origin: &str) -> Vec<&str> {
+        let failed = |s: &&Settled| s.item.failure.is_some() && s.origin == origin;
+        let mut ids: Vec<_> =
+            self.items.values().filter(failed).map(|s| s.item.id.as_str()).collect();
+        ids.sort_unstable();
+        ids
+    }
+
     pub fn get(&self, id: &str) -> Option<&Settled> {
         self.items.get(id)
     }
@@ -166,10 +175,9 @@ fn manifests(store: &Location, stage: Option<&str>) -> Result<Vec<Manifest>, Sto
         let manifest: Manifest =
             serde_json::from_slice(&bytes).map_err(|e| damaged(e.to_string()))?;
         if manifest.format != MANIFEST_FORMAT {
-            return Err(damaged(format!(
-                "it has format {}, this program reads format {MANIFEST_FORMAT}",
-                manifest.format
-            )));
+            let place = store.url_of(path);
+            let (found, supported) = (manifest.format, MANIFEST_FORMAT);
+            return Err(StoreError::ManifestFormat { place, found, supported });
         }
         found.push(manifest);
     }

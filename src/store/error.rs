@@ -31,6 +31,12 @@ pub enum StoreError {
         source: Box<object_store::Error>,
     },
 
+    #[error(
+        "{place}: commit manifest has format {found}, this program reads format {supported}; install \
+         a newer motiongen"
+    )]
+    ManifestFormat { place: String, found: u32, supported: u32 },
+
     #[error("{place}: commit manifest is damaged ({reason}); move it away and run the stage again")]
     Manifest { place: String, reason: String },
 

@@ -254,7 +254,7 @@ impl Location {
             Kind::Local(root) => local::temporary_beside(&root.join(path)),
             Kind::Remote { .. } => tempfile::NamedTempFile::new(),
         }
-        .map_err(|e| StoreError::io("make a temporary file for", &self.url_of(path), e))
+        .map_err(|e| StoreError::io("make a temporary file beside it", &self.url_of(path), e))
     }
 
     /// Publishes a finished temporary file at `path`: whole or absent, and durable on return.

@@ -333,8 +333,11 @@ fn walk_problem(root: &FsPath, error: &walkdir::Error) -> SourceProblem {
     let path = path.strip_prefix(root).unwrap_or(path).to_string_lossy().into_owned();
     if let Some(ancestor) = error.loop_ancestor() {
         let ancestor = ancestor.strip_prefix(root).unwrap_or(ancestor).display();
-        let message =
-            format!("is a symbolic link back to its own folder \"{ancestor}\"; remove it");
+        let ancestor = match ancestor.to_string().as_str() {
+            "" => "the source itself".to_owned(),
+            folder => format!("its own folder \"{folder}\""),
+        };
+        let message = format!("is a symbolic link back to {ancestor}; remove it");
         return SourceProblem { path, kind: SourceProblemKind::Symlink, message };
     }
     let kind = error.io_error().map(std::io::Error::kind);

@@ -44,7 +44,8 @@ fn archives() -> Vec<Case> {
     }
     vec![
         Case::npz("npz-empty", vec![], "empty_file",
-            "npz file is empty (0 bytes); the download or copy that made it failed, fetch it again"),
+            "npz file is empty (0 bytes); the download or copy that made it failed, fetch it \
+             again"),
         Case::npz("npz-truncated", sound[..500].to_vec(), "truncated",
             "npz file is truncated: it starts as a zip archive, but no table of members ends its \
              500 bytes; the file was cut short, copy or download it again"),
@@ -55,8 +56,8 @@ fn archives() -> Vec<Case> {
             "not an npz file: it starts with bytes 93 4e 55 4d 50 59 01 00; it is a single array, \
              name it .npy"),
         Case::npz("npz-damaged-table", table, "npz_format",
-            "npz table of members is damaged: invalid Zip archive: Invalid Central Directory header; \
-             copy or download the file again"),
+            "npz table of members is damaged: invalid Zip archive: Invalid Central Directory \
+             header; copy or download the file again"),
         Case::npz("npz-doubled-member", doubled, "npz_format",
             "npz key \"mel\" names two members; write the file again with each key once"),
         Case::npz("npz-no-members", npz(&[], Stored), "missing_key",
@@ -98,7 +99,8 @@ fn members() -> Vec<Case> {
             "npz member \"mel\" is damaged: its bytes do not match its CRC-32; copy or download \
              the file again"),
         Case::npz("npz-damaged-deflate", deflate, "npz_format",
-            "npz member \"mel\" is damaged: corrupt deflate stream; copy or download the file again"),
+            "npz member \"mel\" is damaged: corrupt deflate stream; copy or download the file \
+             again"),
         Case::npz("npz-pickled-member", with("chroma", npy("'|O'", "(2,)", b"\x80\x04\x95")),
             "pickle",
             "npz member \"chroma\": npy holds Python objects (pickle), which are never executed; \

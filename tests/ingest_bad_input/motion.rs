@@ -37,7 +37,8 @@ fn foreign_bytes() -> Vec<Case> {
     magic[..6].copy_from_slice(b"NUMPY!");
     vec![
         Case::npy("npy-empty", vec![], "empty_file",
-            "npy file is empty (0 bytes); the download or copy that made it failed, fetch it again"),
+            "npy file is empty (0 bytes); the download or copy that made it failed, fetch it \
+             again"),
         Case::npy("npy-cut-in-the-data", sound()[..1001].to_vec(), "truncated",
             "npy data is truncated: 1700 bytes are declared and 873 found; the file was cut short, \
              copy or download it again"),
@@ -87,13 +88,14 @@ fn foreign_types() -> Vec<Case> {
         Case::npy("npy-bare-pickle", b"\x80\x04\x95\x1a\x00\x00\x00cos\nsystem".to_vec(), "pickle",
             "npy holds Python objects (pickle), which are never executed; save it with \
              numpy.save(..., allow_pickle=False) from a numeric array"),
-        Case::npy("npy-object-array", npy("'|O'", "(2,)", b"\x80\x04\x95\x1a\x00\x00\x00"), "pickle",
+        Case::npy("npy-object-array", npy("'|O'", "(2,)", b"\x80\x04\x95\x1a\x00\x00\x00"),
+            "pickle",
             "npy holds Python objects (pickle), which are never executed; save it with \
              numpy.save(..., allow_pickle=False) from a numeric array"),
         Case::npy("npy-structured", npy("[('x', '<f4'), ('y', '<f4')]", "(3,)", &[0; 24]),
             "npy_format",
-            "npy dtype is structured with 2 fields, which are not read; save each field as an array \
-             of its own, for example numpy.savez(path, **{n: a[n] for n in a.dtype.names})"),
+            "npy dtype is structured with 2 fields, which are not read; save each field as an \
+             array of its own, for example numpy.savez(path, **{n: a[n] for n in a.dtype.names})"),
         Case::npy("npy-strings", npy("'<U5'", "(3, 25)", &[0; 1500]), "npy_format",
             "npy dtype \"<U5\" holds strings, which are not read; save a numeric array, and names \
              in a text file"),

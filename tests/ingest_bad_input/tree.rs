@@ -136,18 +136,19 @@ fn large_files() -> Vec<Case> {
         Case::tree("npy-of-1-gb", "motion/npy-of-1-gb/trajectory.npy",
             |source| zeros(&source.join("motion/npy-of-1-gb/trajectory.npy"), (1 << 30) + 1),
             "too_large",
-            "{path} has 1073741825 bytes, more than the 1073741824 that are read; split the phrase"),
+            "{path} has 1073741825 bytes, more than the 1073741824 that are read; split the \
+             phrase"),
         // Larger than the memory that the program may have.
         Case::tree("wav-of-zeros", "audio/wav-of-zeros.wav",
             |source| zeros(&source.join("audio/wav-of-zeros.wav"), MEMORY_BYTES + (100 << 20)),
             "audio_header",
-            "{path}: not audio: it starts with bytes 00 00 00 00 00 00 00 00; WAV, AIFF, FLAC, MP3, \
-             Ogg and MP4 are read, was another format saved under the name .wav?"),
+            "{path}: not audio: it starts with bytes 00 00 00 00 00 00 00 00; WAV, AIFF, FLAC, \
+             MP3, Ogg and MP4 are read, was another format saved under the name .wav?"),
     ]
 }
 
 fn forbid(path: &Path) {
-    set_permissions(path, Permissions::from_mode(0)).unwrap();
+    set_permissions(path, Permissions::from_mode(0o0)).unwrap();
 }
 
 #[rustfmt::skip]

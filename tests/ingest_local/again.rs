@@ -5,7 +5,7 @@ use std::time::{Duration, SystemTime};
 
 use super::write_motion;
 use crate::support::files::{coherent, trajectory, wav};
-use crate::support::{Dir, Output, ingest, motion, phrases, tree};
+use crate::support::{Dir, Output, failures, ingest, motion, phrases, tree};
 
 const IDS: [(&str, usize); 5] = [("a", 31), ("b", 3), ("c/d", 17), ("e", 1), ("f g", 60)];
 
@@ -172,4 +172,45 @@ fn a_dry_run_says_what_would_be_done_and_writes_nothing() {
     let output = ingest(&source, &store, &["--dry-run"]);
     says(&output, "would read 2 phrases (1 of them cannot be read), leave 1 as they are\n");
     assert_eq!(tree(&store), before);
+}
+
+#[test]
+fn a_failure_goes_with_its_phrase_and_a_success_stays() {
+    let (dir, source, store) = ingested();
+    dir.write("source/motion/bad/trajectory.npy", b"");
+    dir.write("source/motion/worse/trajectory.npy", b"");
+    assert_eq!(ingest(&source, &store, &[]).code, 1);
+    assert_eq!(failures(&store).into_keys().collect::<Vec<_>>(), ["bad", "worse"]);
+
+    std::fs::remove_dir_all(source.join("motion/bad")).unwrap();
+    std::fs::remove_dir_all(source.join("motion/a")).unwrap();
+    assert_eq!(ingest(&source, &store, &[]).code, 1);
+    assert_eq!(failures(&store).into_keys().collect::<Vec<_>>(), ["worse"]);
+    assert!(phrases(&store).contains_key("a"), "a record was lost because its file went away");
+    let settled = tree(&store);
+    assert_eq!(ingest(&source, &store, &[]).code, 1);
+    assert_eq!(tree(&store), settled, "the failure was forgotten twice");
+
+    // What comes back is read again, broken or not.
+    dir.write("source/motion/bad/trajectory.npy", b"");
+    assert_eq!(ingest(&source, &store, &[]).code, 1);
+    assert_eq!(failures(&store).into_keys().collect::<Vec<_>>(), ["bad", "worse"]);
+    write_motion(&source, "bad", 5, 9);
+    write_motion(&source, "worse", 7, 9);
+    assert_eq!(ingest(&source, &store, &[]).code, 0);
+    assert_eq!(phrases(&store)["bad"].n_frames, Some(5));
+}
+
+#[test]
+fn extras_inside_a_phrase_folder_and_hidden_files_are_left_alone() {
+    let (dir, source, store) = ingested();
+    dir.write("source/motion/a/extras/thumb.png", b"png");
+    dir.write("source/audio/._song.wav", b"resource fork");
+    let output = ingest(&source, &store, &[]);
+    assert_eq!(output.code, 0, "{output:?}");
+    assert!(
+        output.stdout.contains("2 files belong to no phrase and were left alone"),
+        "{}",
+        output.stdout
+    );
 }

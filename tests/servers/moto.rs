@@ -25,6 +25,7 @@ pub struct Moto {
 /// # Panics
 /// If moto is missing and `CI` is set. Elsewhere the caller gets `None`, and should return from
 /// its test: a missing Python package must not stop anybody from working on the rest.
+#[expect(clippy::print_stderr, reason = "a skipped test must say so")]
 pub fn moto() -> Option<&'static Moto> {
     static MOTO: OnceLock<Result<Moto, String>> = OnceLock::new();
     let start = || match std::env::var("MOTIONGEN_TEST_S3_ENDPOINT") {

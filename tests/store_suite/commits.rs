@@ -188,13 +188,10 @@ fn an_item_settled_without_rows_loses_the_rows_that_it_had() {
 
 #[test]
 fn a_damaged_manifest_is_refused_with_its_place_and_the_damage() {
-    let empty = r#"{"format": 2, "stage": "ingest", "key": "k", "sequence": 0, "program": "p",
-        "params_hash": "h", "origin": "o", "parts": [], "items": []}"#;
     for (text, reason) in [
         ("", "EOF while parsing a value at line 1 column 0"),
         ("{\"format\": 1, \"sta", "EOF while parsing a string at line 1 column 18"),
         ("{\"format\": 1}", "missing field `stage` at line 1 column 13"),
-        (empty, "it has format 2, this program reads format 1"),
     ] {
         for backend in backends("damaged") {
             let location = &backend.location;
@@ -210,6 +207,21 @@ fn a_damaged_manifest_is_refused_with_its_place_and_the_damage() {
             assert_eq!(error.to_string(), expected, "{backend}");
             assert!(Ledger::read(location, "train").is_ok(), "{backend}: another stage suffers");
         }
+    }
+}
+
+#[test]
+fn a_manifest_of_another_format_asks_for_a_newer_program() {
+    let newer = r#"{"format": 2, "stage": "ingest", "key": "k", "sequence": 0, "program": "p",
+        "params_hash": "h", "origin": "o", "parts": [], "items": []}"#;
+    for backend in backends("newer") {
+        put(&backend.location, "commits/ingest/0123.json", newer.as_bytes());
+        let error = Ledger::read(&backend.location, STAGE).expect_err("another format");
+        let expected = format!(
+            "{}: commit manifest has format 2, this program reads format 1; install a newer motiongen",
+            backend.location.url_of("commits/ingest/0123.json")
+        );
+        assert_eq!(error.to_string(), expected, "{backend}");
     }
 }
 

@@ -3,6 +3,7 @@
 //! A batch is a range of the phrases' stable hash, so what is in it depends on the source alone:
 //! whoever does it, whenever, after however many kills, writes the same bytes under the same name.
 
+use std::collections::BTreeSet;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
@@ -14,8 +15,8 @@ use super::{Ingest, Refused, Tally};
 use crate::stages::{Progress, Stage as _};
 use crate::store::tables::{self, FailureRow, PhraseRow};
 use crate::store::{
-    Commit, Content, Item, Ledger, Location, Row as _, Source, SourceFile, StoreError, TimestampUs,
-    batch_of, digest, split_of,
+    Commit, Content, Item, Ledger, Location, Row as _, Shard, Source, SourceFile, StoreError,
+    TimestampUs, batch_of, digest, split_of,
 };
 
 /// Bytes of source files that one batch holds at most, so that a kill costs little of a slow source.
@@ -85,6 +86,29 @@ impl Job<'_> {
             }
         });
         total.into_inner().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Removes the failures of phrases that the source no longer has.
+    ///
+    /// Rows of phrases that succeeded stay: a store loses no record because a file went away.
+    ///
+    /// # Errors
+    /// [`StoreError`] of the store.
+    pub fn forget_failures(&self, all: &[Planned], shard: Shard) -> Result<(), StoreError> {
+        let origin = self.source.location().url();
+        let there: BTreeSet<&str> = all.iter().map(|p| p.id.as_str()).collect();
+        let suffix = self.contested("");
+        let mut commit = Commit::new(self.store, Ingest::NAME, self.params_hash, origin);
+        for id in self.ledger.failed(origin) {
+            let phrase = id.strip_suffix(&suffix).unwrap_or(id);
+            if !there.contains(phrase) && shard.takes(phrase) {
+                // Neither digest can be that of a file, so the phrase is read if it comes back.
+                let (fingerprint, input_hash) = (String::new(), String::new());
+                let item = Item { id: id.to_owned(), fingerprint, input_hash, failure: None };
+                commit.settle(item, self.ledger);
+            }
+        }
+        if commit.is_empty() { Ok(()) } else { commit.publish().map(|_| ()) }
     }
 
     fn batch(&self, batch: &[&Planned]) -> Result<Tally, StoreError> {

@@ -106,8 +106,7 @@ impl FailureKind {
     /// Returns the kind that a reader names.
     ///
     /// # Panics
-    /// When a reader names a kind that does not exist, which a test of every reader's kinds rules
-    /// out.
+    /// When a reader names a kind that does not exist.
     pub fn of_reader(name: &str) -> Self {
         Self::ALL
             .into_iter()

@@ -144,7 +144,8 @@ fn phrase_layout(listing: Listing, drafts: &mut Drafts) {
         drafts.problem(id, problem);
     }
     for (folder, expects) in folders {
-        let settled = filled.contains(&folder) || at_and_above(&folder).any(|f| slots.contains(f));
+        // A folder inside a phrase's own holds extras, which are left alone.
+        let settled = at_and_above(&folder).any(|f| filled.contains(f) || slots.contains(f));
         if let (Some((id, _)), false) = (phrase_folder(&folder), settled) {
             let message =
                 format!("folder {folder} holds no {expects}; add it or remove the folder");
@@ -172,7 +173,12 @@ fn phrase_slot(path: &str) -> Option<(String, Role)> {
         },
         _ => None,
     };
-    slot.filter(|(id, _)| !id.is_empty() && !id.ends_with('/'))
+    // `._song.wav` and its like are what some systems leave beside a file, not a file of their own.
+    let hidden = |id: &str| id.rsplit('/').next().is_some_and(|name| name.starts_with('.'));
+    slot.filter(|(id, role)| {
+        let beside = matches!(role, Role::Audio | Role::Beats);
+        !(id.is_empty() || id.ends_with('/') || beside && hidden(id))
+    })
 }
 
 /// Returns the phrase whose folder this is, and what the folder must hold.

@@ -144,6 +144,7 @@ impl Stage for Ingest {
                 force: params.force,
             };
             report.tally.add(job.run(&batches, params.workers.get())?);
+            job.forget_failures(&plan.phrases, shard)?;
             progress.finish();
         }
         report.tally.failed.sort_by(|a, b| a.id.cmp(&b.id));
