@@ -227,11 +227,11 @@ fn broken_phrases_are_one_failure_each_and_sound_ones_beside_them_are_kept() {
     assert_eq!(output.code, 1, "{output:?}");
     let counted = format!("  {} ingested (", sound.len()).into_boxed_str();
     assert!(output.stdout.contains(&*counted), "{}", output.stdout);
+    assert_failures_are(&store, &source, &broken);
     let failed = format!(" up to date, {} failed; ", broken.len());
     assert!(output.stdout.contains(&failed), "{}", output.stdout);
     let more = format!("\n  … and {} more\n", broken.len() - 10);
     assert!(output.stdout.contains(&more), "{}", output.stdout);
-    assert_failures_are(&store, &source, &broken);
     assert_phrases_are(&store, &source, &sound);
 
     // Every failure is tried again, and says nothing new.

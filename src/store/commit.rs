@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use super::StoreError;
 use super::digest::{digest, digest_texts};
-use super::location::{Location, Put};
+use super::location::{Listed, Location, Put};
 use super::part::{FinishedPart, PartWriter};
 use super::schema::TableSchema;
 
@@ -166,11 +166,10 @@ pub fn live_parts(store: &Location) -> Result<BTreeMap<String, Vec<LivePart>>, S
 
 fn manifests(store: &Location, stage: Option<&str>) -> Result<Vec<Manifest>, StoreError> {
     let folder = stage.map_or(FOLDER.to_owned(), |stage| format!("{FOLDER}/{stage}"));
-    let listed = store.list(&folder)?;
-    let paths: Vec<_> =
-        listed.into_iter().map(|l| l.path).filter(|path| path.ends_with(".json")).collect();
-    let mut found = Vec::with_capacity(paths.len());
-    for (path, bytes) in paths.iter().zip(store.read_many(&paths)?) {
+    let mut listed = store.list(&folder)?;
+    listed.retain(|l| l.path.ends_with(".json"));
+    let mut found = Vec::with_capacity(listed.len());
+    for (Listed { path, .. }, bytes) in listed.iter().zip(store.read_many(&listed)?) {
         let damaged = |reason: String| StoreError::Manifest { place: store.url_of(path), reason };
         let manifest: Manifest =
             serde_json::from_slice(&bytes).map_err(|e| damaged(e.to_string()))?;

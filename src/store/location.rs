@@ -205,16 +205,16 @@ impl Location {
         }
     }
 
-    /// Reads many small objects, remote ones concurrently, in the order given.
+    /// Reads many listed objects, remote ones concurrently, in the order given; for small ones.
     ///
     /// # Errors
     /// The first failure.
-    pub fn read_many(&self, paths: &[String]) -> Result<Vec<Bytes>, StoreError> {
+    pub fn read_many(&self, listed: &[Listed]) -> Result<Vec<Bytes>, StoreError> {
         match &self.kind {
-            Kind::Local(_) => paths.iter().map(|path| self.read(path)).collect(),
+            Kind::Local(_) => listed.iter().map(|l| self.read(&l.path)).collect(),
             Kind::Remote { store, prefix } => {
-                let reads = paths.iter().map(|path| async move {
-                    remote::read_object(store, &remote::join(prefix, path))
+                let reads = listed.iter().map(|Listed { path, size_bytes }| async move {
+                    remote::read_sized(store, &remote::join(prefix, path), *size_bytes)
                         .await
                         .map_err(|e| StoreError::remote("read", &self.url_of(path), e))
                 });

@@ -39,10 +39,8 @@ pub async fn read_object(
     store: &Arc<dyn ObjectStore>,
     path: &ObjectPath,
 ) -> object_store::Result<Bytes> {
-    // Most objects are small: the GET that tells the size has brought the whole of it.
-    let found = store.get(path).await?;
-    let size = found.meta.size;
-    if size <= RANGE_BYTES { found.bytes().await } else { read_sized(store, path, size).await }
+    let size = store.head(path).await?.size;
+    read_sized(store, path, size).await
 }
 
 /// Reads an object whose size a listing told, in one GET or in ranges of [`RANGE_BYTES`].

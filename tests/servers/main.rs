@@ -14,6 +14,7 @@ mod servers;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
+#[expect(clippy::print_stdout, clippy::print_stderr, reason = "a program of its own")]
 fn main() -> ExitCode {
     let mut arguments = std::env::args().skip(1);
     let Some(directory) = arguments.next().map(PathBuf::from) else {

@@ -82,8 +82,9 @@ fn many_objects_are_read_in_the_order_asked_for_repetitions_included() {
             put(&backend.location, &path(i), &noise(3 * i, i as u64));
         }
         let order: Vec<usize> = (0..59).map(|k| k * 17 % 41).collect();
-        let paths: Vec<String> = order.iter().map(|&i| path(i)).collect();
-        let contents = backend.location.read_many(&paths).expect("all are there");
+        let listed: Vec<_> =
+            order.iter().map(|&i| Listed { path: path(i), size_bytes: 3 * i as u64 }).collect();
+        let contents = backend.location.read_many(&listed).expect("all are there");
         assert_eq!(contents.len(), 59, "{backend}");
         for (i, content) in order.into_iter().zip(contents) {
             assert!(content == noise(3 * i, i as u64), "{backend}: object {i}");
@@ -99,7 +100,8 @@ fn a_missing_object_is_named_in_the_error() {
         let expected = format!("{place}: not found");
         let error = backend.location.read("not/here.json").expect_err("nothing to read");
         assert_eq!(error.to_string(), expected, "{backend}");
-        let both = ["there".to_owned(), "not/here.json".to_owned()];
+        let both =
+            ["there", "not/here.json"].map(|path| Listed { path: path.to_owned(), size_bytes: 1 });
         let error = backend.location.read_many(&both).expect_err("one is missing");
         assert_eq!(error.to_string(), expected, "{backend}");
         if let Some(remote) = &backend.remote {

@@ -100,7 +100,9 @@ fn looks_like_phrases(listing: &Listing) -> bool {
 fn phrase_layout(listing: Listing, drafts: &mut Drafts) {
     // Folders of `motion/` and `audio_features/` that must hold a phrase's file.
     let mut folders: BTreeMap<String, &'static str> = BTreeMap::new();
+    // Folders that need nothing more, and those among them that are a phrase's own.
     let mut filled: BTreeSet<String> = BTreeSet::new();
+    let mut phrases: BTreeSet<String> = BTreeSet::new();
     for folder in &listing.folders {
         let is_parent = any_below(&listing.folders, String::as_str, folder);
         if let (Some((_, expects)), false) = (phrase_folder(folder), is_parent) {
@@ -126,8 +128,11 @@ fn phrase_layout(listing: Listing, drafts: &mut Drafts) {
         }
         match phrase_slot(&file.path) {
             Some((id, role)) => {
-                if let Some((parent, _)) = file.path.rsplit_once('/') {
+                if let Some((parent, _)) = file.path.rsplit_once('/')
+                    && phrase_folder(parent).is_some()
+                {
                     filled.insert(parent.to_owned());
+                    phrases.insert(parent.to_owned());
                 }
                 drafts.add(id, role, file);
             }
@@ -145,7 +150,8 @@ fn phrase_layout(listing: Listing, drafts: &mut Drafts) {
     }
     for (folder, expects) in folders {
         // A folder inside a phrase's own holds extras, which are left alone.
-        let settled = at_and_above(&folder).any(|f| filled.contains(f) || slots.contains(f));
+        let settled = filled.contains(&folder)
+            || at_and_above(&folder).any(|f| phrases.contains(f) || slots.contains(f));
         if let (Some((id, _)), false) = (phrase_folder(&folder), settled) {
             let message =
                 format!("folder {folder} holds no {expects}; add it or remove the folder");
