@@ -1,6 +1,6 @@
 //! The command line: flags, configuration, logging, progress and exit codes.
 //!
-//! This is the only room that prints, and [`exit::report`] is the only place that prints an error
+//! This is the only room that prints, and `exit::report` is the only place that prints an error
 //! and chooses the exit code.
 
 mod config;

@@ -199,7 +199,7 @@ impl Cell for TimestampUs {
     }
 }
 
-/// A row type of a table; made by [`rows!`].
+/// A row type of a table; made by `rows!`.
 pub trait Row: Sized {
     fn schema() -> TableSchema;
 
