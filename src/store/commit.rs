@@ -63,6 +63,20 @@ pub struct Item {
     pub failure: Option<String>,
 }
 
+impl Item {
+    /// Returns an item that the store has no rows of any more, and whose next sight is news.
+    pub fn forgotten(id: &str) -> Self {
+        // Neither text can be a digest of anything.
+        let (fingerprint, input_hash) = (String::new(), String::new());
+        Self { id: id.to_owned(), fingerprint, input_hash, failure: None }
+    }
+
+    /// Returns whether the item has rows in its stage's tables.
+    pub fn succeeded(&self) -> bool {
+        self.failure.is_none() && !self.input_hash.is_empty()
+    }
+}
+
 /// What a store knows of one stage's items.
 #[derive(Debug, Default)]
 pub struct Ledger {

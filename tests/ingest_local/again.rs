@@ -1,11 +1,15 @@
 //! Running ingest again: what is done stays untouched, what changed is done anew.
 
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use super::write_motion;
 use crate::support::files::{coherent, trajectory, wav};
-use crate::support::{Dir, Output, failures, ingest, motion, phrases, tree};
+use crate::support::{
+    Dir, MEMORY_BYTES, Output, confined, failures, finish, ingest, ingest_command, motion, phrases,
+    tree,
+};
 
 const IDS: [(&str, usize); 5] = [("a", 31), ("b", 3), ("c/d", 17), ("e", 1), ("f g", 60)];
 
@@ -199,6 +203,31 @@ fn a_failure_goes_with_its_phrase_and_a_success_stays() {
     write_motion(&source, "worse", 7, 9);
     assert_eq!(ingest(&source, &store, &[]).code, 0);
     assert_eq!(phrases(&store)["bad"].n_frames, Some(5));
+}
+
+#[test]
+fn a_phrase_that_cannot_be_read_just_now_keeps_its_rows() {
+    let (_dir, source, store) = ingested();
+    let lock = |mode| {
+        let path = source.join("motion/a/trajectory.npy");
+        std::fs::set_permissions(path, std::fs::Permissions::from_mode(mode)).unwrap();
+    };
+    lock(0o0);
+    let arguments = ["--verify"];
+    let command = ingest_command(&source, &store, &arguments);
+    let output = finish(&mut confined(&command, MEMORY_BYTES));
+    assert_eq!(output.code, 1, "{output:?}");
+    assert_eq!(phrases(&store)["a"].n_frames, Some(31), "rows went with the permission");
+    assert_eq!(motion(&store)["a"].len(), 31);
+    let failures_then = failures(&store);
+    let name = format!("a @ file://{}", source.canonicalize().unwrap().display());
+    assert_eq!(failures_then.keys().collect::<Vec<_>>(), [&name]);
+    assert_eq!(failures_then[&name].kind, "unreadable");
+
+    lock(0o644);
+    assert_eq!(ingest(&source, &store, &[]).code, 0);
+    assert_eq!(failures(&store).len(), 0, "the failure outlived its cause");
+    assert_eq!(phrases(&store).len(), 6);
 }
 
 #[test]

@@ -102,10 +102,7 @@ impl Job<'_> {
         for id in self.ledger.failed(origin) {
             let phrase = id.strip_suffix(&suffix).unwrap_or(id);
             if !there.contains(phrase) && shard.takes(phrase) {
-                // Neither digest can be that of a file, so the phrase is read if it comes back.
-                let (fingerprint, input_hash) = (String::new(), String::new());
-                let item = Item { id: id.to_owned(), fingerprint, input_hash, failure: None };
-                commit.settle(item, self.ledger);
+                commit.settle(Item::forgotten(id), self.ledger);
             }
         }
         if commit.is_empty() { Ok(()) } else { commit.publish().map(|_| ()) }
@@ -201,6 +198,8 @@ impl Job<'_> {
         if let Some(failure) = self.claimed_by_another_source(planned, &input_hash) {
             id.clone_from(&contested);
             outcome = Err(failure);
+        } else if self.is_out_of_reach(&id, &outcome) {
+            id.clone_from(&contested);
         }
         let failure = outcome.as_ref().err().map(failure_digest);
         let unchanged = !self.force
@@ -223,10 +222,8 @@ impl Job<'_> {
         let fingerprint = fingerprint(planned);
         let refused = |id| self.ledger.get(id).is_some_and(|known| known.item.failure.is_some());
         if id != contested && refused(&contested) {
-            // The claim of the other source is gone, and with it the failure.
-            let (fingerprint, input_hash) = (fingerprint.clone(), input_hash.clone());
-            let item = Item { id: contested, fingerprint, input_hash, failure: None };
-            commit.settle(item, self.ledger);
+            // What kept the phrase from its own name is gone, and with it the failure.
+            commit.settle(Item::forgotten(&contested), self.ledger);
         }
         if unchanged {
             return Ok(());
@@ -243,9 +240,19 @@ impl Job<'_> {
         Ok(())
     }
 
-    /// Returns the name under which a phrase fails whose own name belongs to another source.
+    /// Returns whether a phrase that the store has could not be read just now.
+    ///
+    /// Its rows were true when they were written, and a disk or a network that fails for an hour says
+    /// nothing about them: they stay, and the failure is listed beside them.
+    fn is_out_of_reach(&self, id: &str, outcome: &Result<Phrase, Failure>) -> bool {
+        matches!(outcome, Err(failure) if failure.kind == FailureKind::Unreadable)
+            && self.ledger.get(id).is_some_and(|known| known.item.succeeded())
+    }
+
+    /// Returns the name under which a phrase fails whose own name stands for rows that stay: those of
+    /// another source, or those of a phrase that cannot be read just now.
     fn contested(&self, id: &str) -> String {
-        format!("{id} @ {}", self.source.location().url())
+        contested(id, self.source.location().url())
     }
 
     /// Refuses a phrase whose name the store has from elsewhere with other content.
@@ -254,7 +261,7 @@ impl Job<'_> {
         let here = self.source.location().url();
         if self.force
             || known.origin == here
-            || known.item.failure.is_some()
+            || !known.item.succeeded()
             || known.item.input_hash == input_hash
         {
             return None;
@@ -317,6 +324,11 @@ impl Job<'_> {
             time: TimestampUs::now(),
         }
     }
+}
+
+/// Returns the name under which a phrase from `origin` fails while rows of its own name stay.
+pub fn contested(id: &str, origin: &str) -> String {
+    format!("{id} @ {origin}")
 }
 
 /// Returns what the storage says of a phrase's files, without reading them.

@@ -168,12 +168,15 @@ fn params_hash(rules: &Rules) -> String {
 ///
 /// Size and time tell a file's versions apart, not the files of two sources.
 fn is_settled(planned: &Planned, ledger: &Ledger, params_hash: &str, origin: &str) -> bool {
-    ledger.get(&planned.id).is_some_and(|known| {
-        known.params_hash == params_hash
-            && known.origin == origin
-            && known.item.failure.is_none()
-            && known.item.fingerprint == batch::fingerprint(planned)
-    })
+    let refused = ledger.get(&batch::contested(&planned.id, origin));
+    let is_refused = refused.is_some_and(|known| known.item.failure.is_some());
+    !is_refused
+        && ledger.get(&planned.id).is_some_and(|known| {
+            known.params_hash == params_hash
+                && known.origin == origin
+                && known.item.succeeded()
+                && known.item.fingerprint == batch::fingerprint(planned)
+        })
 }
 
 /// What became of the phrases.
