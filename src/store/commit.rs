@@ -99,30 +99,18 @@ impl Ledger {
     /// # Errors
     /// [`StoreError`] when commits cannot be read.
     pub fn read(store: &Location, stage: &str) -> Result<Self, StoreError> {
-        Ok(Self::of(manifests(store, Some(stage))?.iter()))
-    }
-
-    fn of<'a>(manifests: impl Iterator<Item = &'a Manifest>) -> Self {
-        let mut items: HashMap<String, Settled> = HashMap::new();
-        for manifest in manifests {
-            for item in &manifest.items {
-                let newer = items.get(&item.id).is_none_or(|known| {
-                    (known.sequence, known.key.as_str())
-                        < (manifest.sequence, manifest.key.as_str())
-                });
-                if newer {
-                    let settled = Settled {
-                        item: item.clone(),
-                        params_hash: manifest.params_hash.clone(),
-                        origin: manifest.origin.clone(),
-                        key: manifest.key.clone(),
-                        sequence: manifest.sequence,
-                    };
-                    items.insert(item.id.clone(), settled);
-                }
-            }
-        }
-        Self { items }
+        let manifests = manifests(store, Some(stage))?;
+        let settled = |(id, (manifest, item)): (&str, (&Manifest, &Item))| {
+            let settled = Settled {
+                item: item.clone(),
+                params_hash: manifest.params_hash.clone(),
+                origin: manifest.origin.clone(),
+                key: manifest.key.clone(),
+                sequence: manifest.sequence,
+            };
+            (id.to_owned(), settled)
+        };
+        Ok(Self { items: latest(&manifests).into_iter().map(settled).collect() })
     }
 
     /// Returns the items from `origin` that failed last time, in order of id.
@@ -137,6 +125,15 @@ impl Ledger {
     pub fn get(&self, id: &str) -> Option<&Settled> {
         self.items.get(id)
     }
+}
+
+/// Returns the latest word on every item of one stage: by sequence, ties by key.
+fn latest(manifests: &[Manifest]) -> HashMap<&str, (&Manifest, &Item)> {
+    let mut ordered: Vec<_> = manifests.iter().collect();
+    ordered.sort_by(|a, b| (a.sequence, &a.key).cmp(&(b.sequence, &b.key)));
+    let items = ordered.into_iter().flat_map(|m| m.items.iter().map(move |item| (m, item)));
+    // Later entries replace earlier ones of the same name.
+    items.map(|(manifest, item)| (item.id.as_str(), (manifest, item))).collect()
 }
 
 /// A part that a table's readers see.
@@ -158,11 +155,11 @@ pub fn live_parts(store: &Location) -> Result<BTreeMap<String, Vec<LivePart>>, S
     }
     let mut tables: BTreeMap<String, Vec<LivePart>> = BTreeMap::new();
     for manifests in by_stage.values() {
-        let ledger = Ledger::of(manifests.iter());
+        let latest = latest(manifests);
         for manifest in manifests {
-            let is_live = |id: &str| ledger.get(id).is_some_and(|s| s.key == manifest.key);
-            let superseded: Vec<_> =
-                manifest.items.iter().map(|i| i.id.clone()).filter(|id| !is_live(id)).collect();
+            let is_live = |id: &str| latest.get(id).is_some_and(|(m, _)| m.key == manifest.key);
+            let dead = manifest.items.iter().filter(|item| !is_live(&item.id));
+            let superseded: Vec<_> = dead.map(|item| item.id.clone()).collect();
             if superseded.len() == manifest.items.len() {
                 continue;
             }
@@ -318,7 +315,7 @@ impl<'a> Commit<'a> {
             items: self.items,
         };
         let path = format!("{FOLDER}/{}/{}.json", manifest.stage, manifest.key);
-        let text = serde_json::to_vec_pretty(&manifest)
+        let text = serde_json::to_vec(&manifest)
             .expect("invariant: a manifest holds only strings and numbers");
         committed.already_there =
             self.store.put_new(&path, Bytes::from(text))? == Put::AlreadyThere;
