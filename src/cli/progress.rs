@@ -4,7 +4,7 @@ use std::io::IsTerminal as _;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{ProgressBar, ProgressState, ProgressStyle};
 
 use crate::stages::Progress;
 
@@ -71,10 +71,14 @@ impl Progress for Bars {
             Mode::Silent => {}
             Mode::Bar => {
                 let template = format!(
-                    "{what} {{wide_bar}} {{human_pos}}/{{human_len}} {unit} {{per_sec}} ETA {{eta}}"
+                    "{what} {{wide_bar}} {{human_pos}}/{{human_len}} {unit} {{rate}} ETA {{eta}}"
                 );
                 let style = ProgressStyle::with_template(&template)
-                    .unwrap_or_else(|_| ProgressStyle::default_bar());
+                    .unwrap_or_else(|_| ProgressStyle::default_bar())
+                    .with_key("rate", |state: &ProgressState, out: &mut dyn std::fmt::Write| {
+                        // A bar that cannot be drawn must not stop the work.
+                        write!(out, "{:.1}/s", state.per_sec()).ok();
+                    });
                 state.bar = Some(ProgressBar::new(total).with_style(style));
             }
             Mode::Lines => {
