@@ -5,6 +5,7 @@
 pub mod audio;
 pub mod cli;
 pub mod motion;
+pub mod plot;
 pub mod stages;
 pub mod store;
 pub mod units;

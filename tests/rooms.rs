@@ -4,22 +4,26 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Which rooms a room may use.
-const MAY_USE: [(&str, &[&str]); 6] = [
+const MAY_USE: [(&str, &[&str]); 7] = [
     ("units", &[]),
     ("audio", &["units"]),
     ("motion", &["units"]),
-    ("store", &["motion", "units"]),
-    ("stages", &["audio", "motion", "store", "units"]),
+    ("plot", &["units"]),
+    ("store", &["audio", "motion", "units"]),
+    ("stages", &["audio", "motion", "plot", "store", "units"]),
     ("cli", &["stages"]),
 ];
 
 /// Crates that only one place may name: crate, where.
-const KEPT_TO: [(&str, &str); 6] = [
+const KEPT_TO: [(&str, &str); 9] = [
     ("polars", "store/query.rs"),
     ("object_store", "store/"),
     ("parquet", "store/"),
     ("arrow_array", "store/"),
     ("symphonia", "audio/"),
+    ("realfft", "audio/"),
+    ("tiny_skia", "plot/"),
+    ("ab_glyph", "plot/"),
     ("indicatif", "cli/"),
 ];
 

@@ -1,3 +1,36 @@
-//! Audio files: what their headers say.
+//! Audio: bytes become samples, and samples the 163 features of every frame.
+//!
+//! Data flow: `decode` → `resample` → `features`, whose first pass collects spectra
+//! (`spectral`: mel, RMS, centroid) and the tuning, and whose second pass adds chroma. Onsets, MFCC
+//! and beats follow from the mel bands of the whole file.
 
+pub mod beat;
+pub mod chroma;
+pub mod cqt;
+pub mod decimate;
+pub mod decode;
+pub mod features;
+pub mod framing;
 pub mod header;
+pub mod mel;
+pub mod mfcc;
+pub mod onset;
+pub mod recording;
+pub mod resample;
+pub mod sliding_dft;
+pub mod spectral;
+pub mod stft;
+pub mod tuning;
+
+pub use beat::Rhythm;
+pub use features::{
+    BLOCKS, Block, FEATURE_DIM, FeatureError, Features, RawFeatures, extract, feature_names,
+};
+pub use tuning::Tuning;
+
+/// Rate at which everything is computed, in Hz.
+pub const SAMPLE_RATE_HZ: u32 = 44_100;
+/// Samples between frames: 44,100 / 30.
+pub const HOP: usize = 1_470;
+/// Samples of a frame's transform.
+pub const N_FFT: usize = 2_048;

@@ -1,0 +1,207 @@
+//! A whole recording: from a reader of bytes to features, in bounded memory.
+
+use std::io::{self, Read, Seek};
+
+use super::SAMPLE_RATE_HZ;
+use super::decode::{DecodeError, Decoder};
+use super::features::{FeatureError, FirstPass, RawFeatures};
+use super::resample::Resampler;
+use super::tuning::Tuning;
+
+/// Samples at 44.1 kHz that are kept for the second pass: 6 min. Longer recordings are decoded twice.
+pub const MAX_HELD_SAMPLES: usize = 6 * 60 * SAMPLE_RATE_HZ as usize;
+
+/// Sample rates that are converted, in Hz; the filter's length grows with the rate.
+const MIN_RATE_HZ: u32 = 1_000;
+const MAX_RATE_HZ: u32 = 768_000;
+
+/// What an encoded recording is read from.
+pub trait Input: Read + Seek + Send + Sync {}
+impl<T: Read + Seek + Send + Sync> Input for T {}
+
+/// How a recording is analysed.
+pub struct Options<'a> {
+    /// Fixes the tuning that would be estimated.
+    pub tuning: Option<Tuning>,
+    /// Longest recording, in seconds.
+    pub max_duration_s: f64,
+    /// Whether the time for this recording is over; asked once per packet.
+    pub is_late: &'a dyn Fn() -> bool,
+    /// Samples kept for the second pass, usually [`MAX_HELD_SAMPLES`].
+    pub max_held_samples: usize,
+}
+
+/// A recording's features and what it was.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Recording {
+    pub raw: RawFeatures,
+    pub encoding: Encoding,
+}
+
+/// How a recording was stored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Encoding {
+    pub codec: &'static str,
+    pub sample_rate_hz: u32,
+    pub n_channels: u16,
+}
+
+/// Why a recording has no features.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordingError {
+    #[error("cannot be opened ({0}); check that it is still there")]
+    Open(io::Error),
+    #[error(transparent)]
+    Decode(#[from] DecodeError),
+    #[error(transparent)]
+    Features(#[from] FeatureError),
+    /// A rate that no recording has.
+    #[error(
+        "has a sample rate of {found_hz} Hz, outside the {MIN_RATE_HZ} to {MAX_RATE_HZ} Hz that are \
+         converted; its header is probably damaged, encode it again"
+    )]
+    Rate { found_hz: u32 },
+    /// The limit on length.
+    #[error(
+        "is longer than {limit_s:.0} s, the longest recording that is taken; split it or raise \
+         --max-duration"
+    )]
+    TooLong { limit_s: f64 },
+    /// The limit on time.
+    #[error(
+        "was not done in time, after {done_s:.1} s of its audio; raise --timeout or look at the \
+         file"
+    )]
+    Late { done_s: f64 },
+    /// The two passes saw different samples.
+    #[error("changed while it was read; run extract again when nobody writes it")]
+    Changed,
+}
+
+impl RecordingError {
+    /// The error's class in reports.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Open(_) => "unreadable",
+            Self::Decode(e) => e.kind(),
+            Self::Features(FeatureError::Empty) => "no_samples",
+            Self::Rate { .. } => "audio_sample_rate",
+            Self::TooLong { .. } => "too_long",
+            Self::Late { .. } => "timeout",
+            Self::Changed => "changed",
+        }
+    }
+}
+
+impl Recording {
+    /// Decodes a recording and extracts its raw features.
+    ///
+    /// `open` is called once, and once more for recordings that are longer than what is held.
+    ///
+    /// # Errors
+    /// [`RecordingError`].
+    pub fn analyse<I: Input>(
+        mut open: impl FnMut() -> io::Result<I>,
+        extension_hint: &str,
+        options: &Options<'_>,
+    ) -> Result<Self, RecordingError> {
+        let mut held = Some(Vec::new());
+        let mut first = FirstPass::new(options.tuning);
+        let mut digest = Digest::default();
+        let input = open().map_err(RecordingError::Open)?;
+        let encoding = decode(input, extension_hint, options, |samples| {
+            first.push(samples);
+            digest.add(samples);
+            let fits = |kept: &Vec<f32>| kept.len() + samples.len() <= options.max_held_samples;
+            held = held.take().filter(fits);
+            if let Some(kept) = &mut held {
+                kept.extend_from_slice(samples);
+            }
+        })?;
+        let mut second = first.finish()?;
+        match held {
+            Some(samples) => {
+                for block in samples.chunks(BLOCK_SAMPLES) {
+                    second.push(block);
+                }
+            }
+            None => {
+                let mut again = Digest::default();
+                let input = open().map_err(RecordingError::Open)?;
+                decode(input, extension_hint, options, |samples| {
+                    second.push(samples);
+                    again.add(samples);
+                })?;
+                if again != digest {
+                    return Err(RecordingError::Changed);
+                }
+            }
+        }
+        Ok(Self { raw: second.finish(), encoding })
+    }
+}
+
+/// Samples that are passed on together.
+const BLOCK_SAMPLES: usize = 8192;
+
+/// Decodes and resamples, in blocks.
+fn decode(
+    input: impl Input,
+    extension_hint: &str,
+    options: &Options<'_>,
+    mut visit: impl FnMut(&[f32]),
+) -> Result<Encoding, RecordingError> {
+    let mut decoder = Decoder::open(input, extension_hint)?;
+    let rate_hz = decoder.sample_rate_hz();
+    if !(MIN_RATE_HZ..=MAX_RATE_HZ).contains(&rate_hz) {
+        return Err(RecordingError::Rate { found_hz: rate_hz });
+    }
+    let mut resampler = Resampler::new(rate_hz);
+    let (mut packet, mut block) = (Vec::new(), Vec::new());
+    let mut n_samples = 0u64;
+    loop {
+        packet.clear();
+        let goes_on = decoder.next_block(&mut packet)?;
+        n_samples += packet.len() as u64;
+        resampler.push(&packet, &mut block);
+        if block.len() >= BLOCK_SAMPLES {
+            visit(&block);
+            block.clear();
+        }
+        if !goes_on {
+            break;
+        }
+        let done_s = n_samples as f64 / f64::from(rate_hz);
+        if done_s > options.max_duration_s {
+            return Err(RecordingError::TooLong { limit_s: options.max_duration_s });
+        }
+        if (options.is_late)() {
+            return Err(RecordingError::Late { done_s });
+        }
+    }
+    resampler.finish(&mut block);
+    visit(&block);
+    Ok(Encoding {
+        codec: decoder.codec(),
+        sample_rate_hz: rate_hz,
+        n_channels: decoder.n_channels(),
+    })
+}
+
+/// Tells two streams of samples apart (FNV-1a over their bits, in words).
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Digest(u64);
+
+impl Default for Digest {
+    fn default() -> Self {
+        Self(0xcbf2_9ce4_8422_2325)
+    }
+}
+
+impl Digest {
+    fn add(&mut self, samples: &[f32]) {
+        for sample in samples {
+            self.0 = (self.0 ^ u64::from(sample.to_bits())).wrapping_mul(0x0000_0100_0000_01b3);
+        }
+    }
+}

@@ -1,0 +1,273 @@
+//! How far a recording's pitch lies from A440, in bins of 1/36 octave.
+//!
+//! librosa's `estimate_tuning` with 36 bins per octave, to the letter: on real music the histogram
+//! is nearly flat, so that one vote can move the chroma of the whole file.
+
+use std::fmt;
+use std::ops::Range;
+
+use super::framing::Framer;
+use super::stft::{Dft, hann_power};
+use super::{N_FFT, SAMPLE_RATE_HZ};
+
+/// Bins of the constant-Q transform per octave.
+pub const BINS_PER_OCTAVE: usize = 36;
+/// Candidates: −0.50, −0.49 … 0.49.
+const N_CANDIDATES: usize = 100;
+/// Frames of the estimate are closer than those of the features.
+const HOP: usize = 512;
+/// Spectral bins with 150 Hz ≤ f < 4000 Hz.
+const PITCH_BINS: Range<usize> = 7..186;
+/// A peak counts if it reaches this share of its frame's highest magnitude.
+const THRESHOLD: f32 = 0.1;
+/// Lowest A of the piano, to which residuals refer.
+const A0_HZ: f32 = 27.5;
+
+/// Deviation from A440 in fractions of 1/36 octave, from −0.5 to below 0.5.
+#[derive(Clone, Copy, Debug, PartialEq, PartialOrd)]
+pub struct Tuning(f64);
+
+impl Tuning {
+    /// A440.
+    pub const STANDARD: Tuning = Tuning(0.0);
+
+    /// Takes a deviation in bins.
+    ///
+    /// # Errors
+    /// [`TuningRangeError`] outside −0.5 … 0.5, where it would be another bin's.
+    pub fn new(bins: f64) -> Result<Self, TuningRangeError> {
+        if (-0.5..0.5).contains(&bins) { Ok(Self(bins)) } else { Err(TuningRangeError(bins)) }
+    }
+
+    /// Returns the left edge of a histogram bin, as `numpy.linspace(-0.5, 0.5, 101)[i]`.
+    fn of_candidate(i: usize) -> Self {
+        Self(i as f64 * (1.0 / N_CANDIDATES as f64) - 0.5)
+    }
+
+    /// Returns the deviation in bins of 1/36 octave.
+    pub fn bins(self) -> f64 {
+        self.0
+    }
+}
+
+impl fmt::Display for Tuning {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", self.0)
+    }
+}
+
+/// A tuning outside its range.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+#[error(
+    "tuning {0} is outside -0.5 <= tuning < 0.5 (in bins of 1/36 octave); give the nearest bin's"
+)]
+pub struct TuningRangeError(f64);
+
+impl std::str::FromStr for Tuning {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let bins = text.parse::<f64>().map_err(|_| format!("tuning {text:?} is not a number"))?;
+        Self::new(bins).map_err(|e| e.to_string())
+    }
+}
+
+/// Collects spectral peaks from a stream at 44.1 kHz.
+pub struct TuningPass {
+    framer: Framer,
+    dft: Dft,
+    power: Vec<f64>,
+    peaks: Peaks,
+}
+
+/// Peaks of a file: the candidate that each votes for, and its magnitude.
+#[derive(Default)]
+struct Peaks {
+    candidates: Vec<u8>,
+    magnitudes: Vec<f32>,
+}
+
+impl TuningPass {
+    pub fn new() -> Self {
+        Self {
+            framer: Framer::new(N_FFT, HOP),
+            dft: Dft::new(N_FFT),
+            power: vec![0.0; N_FFT / 2 + 1],
+            peaks: Peaks::default(),
+        }
+    }
+
+    /// Takes the next samples.
+    pub fn push(&mut self, samples: &[f32]) {
+        let Self { framer, dft, power, peaks } = self;
+        framer.push(samples, |frame| peaks.add(frame, dft, power));
+    }
+
+    /// Ends the signal and returns the most frequent tuning, [`Tuning::STANDARD`] without peaks.
+    ///
+    /// Peaks below the median magnitude have no vote; ties go to the lowest tuning.
+    pub fn finish(mut self) -> Tuning {
+        let Self { framer, dft, power, peaks } = &mut self;
+        framer.finish(|frame| peaks.add(frame, dft, power));
+        self.peaks.tuning()
+    }
+}
+
+impl Default for TuningPass {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Peaks {
+    /// Adds the peaks of one frame, interpolated by a parabola through three bins.
+    fn add(&mut self, frame: &[f32], dft: &mut Dft, power: &mut [f64]) {
+        hann_power(dft.of(frame), power);
+        let highest = highest(power).sqrt() as f32;
+        let threshold = THRESHOLD * highest;
+        let mut s = [0f32; PITCH_BINS.end + 1];
+        for (s, p) in s.iter_mut().zip(&*power).skip(PITCH_BINS.start - 1) {
+            *s = p.sqrt() as f32;
+        }
+        // Magnitudes at or below the threshold count as 0 when maxima are sought.
+        let z = |k: usize| if s[k] > threshold { s[k] } else { 0.0 };
+        for k in PITCH_BINS {
+            if !(z(k) > z(k - 1) && z(k) >= z(k + 1)) {
+                continue;
+            }
+            let slope = (s[k + 1] - s[k - 1]) / 2.0;
+            // librosa's stencil goes over to f64 here.
+            let a = f64::from(s[k + 1] + s[k - 1]) - 2.0 * f64::from(s[k]);
+            let b = f64::from(s[k + 1] - s[k - 1]) / 2.0;
+            let shift = if b.abs() >= a.abs() { 0.0 } else { (-b / a) as f32 };
+            let rate_hz = f64::from(SAMPLE_RATE_HZ);
+            let pitch_hz = ((k as f64 + f64::from(shift)) * rate_hz / N_FFT as f64) as f32;
+            self.candidates.push(candidate(pitch_hz));
+            self.magnitudes.push(s[k] + 0.5 * slope * shift);
+        }
+    }
+
+    fn tuning(mut self) -> Tuning {
+        if self.magnitudes.is_empty() {
+            return Tuning::STANDARD;
+        }
+        // The votes keep their order, so the median works on a copy.
+        let mut sorted = self.magnitudes.clone();
+        let threshold = median(&mut sorted);
+        let mut votes = [0u64; N_CANDIDATES];
+        for (candidate, magnitude) in self.candidates.drain(..).zip(self.magnitudes) {
+            if magnitude >= threshold {
+                votes[usize::from(candidate)] += 1;
+            }
+        }
+        // The first of equals: `max_by_key` alone would return the last.
+        let best = (0..N_CANDIDATES).rev().max_by_key(|&i| votes[i]).unwrap_or(0);
+        Tuning::of_candidate(best)
+    }
+}
+
+/// Returns the largest of some values that are not NaN, by partial maxima that vectorise.
+fn highest(values: &[f64]) -> f64 {
+    let mut lanes = [0f64; 8];
+    let chunks = values.chunks_exact(lanes.len());
+    let rest = chunks.remainder().iter().copied().fold(0.0, f64::max);
+    for chunk in chunks {
+        for (lane, &value) in lanes.iter_mut().zip(chunk) {
+            *lane = if value > *lane { value } else { *lane };
+        }
+    }
+    lanes.into_iter().fold(rest, f64::max)
+}
+
+/// Returns the histogram bin of a pitch: r = 36·log₂(f/27.5) mod 1, from −½ to ½, in f32.
+fn candidate(pitch_hz: f32) -> u8 {
+    // Rounded from f64: within one unit of the last place of any f32 logarithm.
+    let octaves = f64::from(pitch_hz / A0_HZ).log2() as f32;
+    let mut r = (BINS_PER_OCTAVE as f32 * octaves).rem_euclid(1.0);
+    if r >= 0.5 {
+        r -= 1.0;
+    }
+    let r = f64::from(r);
+    // Bins are closed on the left. The product may round across an edge, so the edges decide.
+    let guess = ((r + 0.5) * N_CANDIDATES as f64) as usize;
+    let below = guess.min(N_CANDIDATES - 1);
+    let bin = if r < Tuning::of_candidate(below).0 {
+        below.saturating_sub(1)
+    } else if below + 1 < N_CANDIDATES && r >= Tuning::of_candidate(below + 1).0 {
+        below + 1
+    } else {
+        below
+    };
+    bin as u8
+}
+
+/// Returns the median: the mean of the two middle values when there are two.
+fn median(values: &mut [f32]) -> f32 {
+    let half = values.len() / 2;
+    let is_even = values.len().is_multiple_of(2);
+    let (below, &mut upper, _) = values.select_nth_unstable_by(half, f32::total_cmp);
+    if !is_even {
+        return upper;
+    }
+    let lower = below.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    (lower + upper) / 2.0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::f64::consts::TAU;
+
+    fn tuning_of(y: &[f32]) -> Tuning {
+        let mut pass = TuningPass::new();
+        pass.push(y);
+        pass.finish()
+    }
+
+    #[test]
+    fn a_detuned_tone_shows_its_deviation() {
+        // 35 cents are 1.05 bins of 33.3 cents, that is 0.05 bins above the next bin.
+        let hz = 440.0 * 2f64.powf(35.0 / 1200.0);
+        let y: Vec<f32> = (0..44_100)
+            .map(|i| (0.5 * (TAU * hz * f64::from(i) / 44_100.0).sin()) as f32)
+            .collect();
+        let bins = tuning_of(&y).bins();
+        // Parabolic interpolation under a Hann window is biased by up to 0.05 DFT bins of 21.5 Hz,
+        // which are 4 cents here: 0.12 bins of 33.3 cents.
+        assert!((bins - 0.05).abs() <= 0.12, "{bins}");
+    }
+
+    #[test]
+    fn silence_has_the_standard_tuning() {
+        assert_eq!(tuning_of(&[0.0; 5000]), Tuning::STANDARD);
+        assert_eq!(tuning_of(&[]), Tuning::STANDARD);
+    }
+
+    #[test]
+    fn candidates_are_closed_on_the_left() {
+        assert_eq!(candidate(27.5), 50);
+        assert_eq!(candidate(440.0), 50);
+        // Just below and above half a bin over A440.
+        let hz = |bins: f64| (440.0 * 2f64.powf(bins / 36.0)) as f32;
+        assert_eq!((candidate(hz(0.4951)), candidate(hz(0.5049))), (99, 0));
+        assert_eq!((candidate(hz(0.0149)), candidate(hz(-0.0149))), (51, 48));
+    }
+
+    #[test]
+    fn medians_of_odd_and_even_counts() {
+        assert_eq!(median(&mut [3.0, 1.0, 2.0]), 2.0);
+        assert_eq!(median(&mut [4.0, 1.0, 3.0, 2.0]), 2.5);
+    }
+
+    #[test]
+    fn tunings_of_other_bins_are_refused() {
+        let error = "0.5".parse::<Tuning>().expect_err("half a bin is the next bin's");
+        assert_eq!(
+            error,
+            "tuning 0.5 is outside -0.5 <= tuning < 0.5 (in bins of 1/36 octave); give the \
+             nearest bin's"
+        );
+        assert_eq!("-0.5".parse::<Tuning>().map(Tuning::bins), Ok(-0.5));
+        assert!("x".parse::<Tuning>().is_err());
+    }
+}
