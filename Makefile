@@ -59,11 +59,21 @@ doc: ## build the library's documentation
 # CPU to build polars.
 BENCH_PROFILE ?= dev
 BENCH_ARGS    ?=
+BENCH_BIN     := $(TARGET)/$(if $(filter dev,$(BENCH_PROFILE)),debug,$(BENCH_PROFILE))
 .PHONY: bench
 bench: build/bench-venv/ready ## measure side by side with peers [BENCH_PROFILE=release BENCH_ARGS=--quick]
 	$(CARGO) build --locked --profile $(BENCH_PROFILE) --bins --example plain-read
-	build/bench-venv/bin/python benches/bench.py --profile $(BENCH_PROFILE) \
-	  --bin $(TARGET)/$(if $(filter dev,$(BENCH_PROFILE)),debug,$(BENCH_PROFILE)) $(BENCH_ARGS)
+	build/bench-venv/bin/python benches/bench.py --profile $(BENCH_PROFILE) --bin $(BENCH_BIN) $(BENCH_ARGS)
+
+.PHONY: bench-audio
+bench-audio: build/bench-venv/ready ## measure the audio features beside librosa [BENCH_PROFILE, BENCH_ARGS]
+	$(CARGO) build --locked --profile $(BENCH_PROFILE) --bin motiongen
+	build/bench-venv/bin/python benches/audio.py --profile $(BENCH_PROFILE) --bin $(BENCH_BIN) $(BENCH_ARGS)
+
+.PHONY: bench-parity
+bench-parity: build/bench-venv/ready ## compare the audio features with those of librosa [BENCH_ARGS=--per-clip]
+	$(CARGO) build --locked --profile $(BENCH_PROFILE) --bin motiongen
+	build/bench-venv/bin/python benches/parity.py --bin $(BENCH_BIN) $(BENCH_ARGS)
 
 FUZZ_SECONDS ?= 60
 .PHONY: fuzz

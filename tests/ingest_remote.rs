@@ -6,7 +6,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use motiongen::motion::MOTION_DIM;
-use motiongen::motion::npy::write_f32;
+use motiongen::motion::npy::write;
 use motiongen::store::tables::{FailureRow, PhraseRow};
 use motiongen::store::{Location, Row as _, Snapshot, split_of};
 
@@ -79,7 +79,7 @@ impl Job {
                 }
                 (true, 1) => {
                     kind = "shape";
-                    bytes = write_f32(&[MOTION_DIM, n_frames], frames.as_flattened());
+                    bytes = write(&[MOTION_DIM, n_frames], frames.as_flattened());
                 }
                 (true, 2) => {
                     kind = "truncated";

@@ -31,7 +31,7 @@ fuzz_target!(|bytes: &[u8]| {
         assert_eq!(doubles.shape, array.shape);
     }
     let streamed = npy::read_f32_from(bytes, u64::MAX).expect("the slice reader took it");
-    let written = npy::write_f32(&array.shape, &array.values);
+    let written = npy::write(&array.shape, &array.values);
     let again = npy::read_f32(&written).expect("written by us");
     for other in [streamed, again] {
         assert_eq!(other.shape, array.shape);

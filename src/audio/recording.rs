@@ -84,7 +84,7 @@ impl RecordingError {
         match self {
             Self::Open(_) => "unreadable",
             Self::Decode(e) => e.kind(),
-            Self::Features(FeatureError::Empty) => "no_samples",
+            Self::Features(FeatureError::Empty) => "audio_no_samples",
             Self::Rate { .. } => "audio_sample_rate",
             Self::TooLong { .. } => "too_long",
             Self::Late { .. } => "timeout",

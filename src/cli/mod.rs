@@ -14,6 +14,7 @@ use std::process::ExitCode;
 
 use clap::{Arg, ArgAction, ArgMatches, Command, FromArgMatches as _};
 
+use crate::stages::extract::Extract;
 use crate::stages::ingest::Ingest;
 #[cfg(feature = "query")]
 use crate::stages::query::Query;
@@ -38,6 +39,7 @@ impl Entry {
 fn entries() -> Vec<Entry> {
     vec![
         Entry::of::<Ingest>(),
+        Entry::of::<Extract>(),
         #[cfg(feature = "query")]
         Entry::of::<Query>(),
     ]

@@ -34,6 +34,8 @@ struct State {
 struct Count {
     what: String,
     unit: String,
+    /// What follows the rate.
+    rate_unit: &'static str,
     done: u64,
     total: u64,
     started: Instant,
@@ -59,13 +61,7 @@ impl Bars {
         }
     }
 
-    fn lock(&self) -> std::sync::MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-impl Progress for Bars {
-    fn start(&self, what: &str, unit: &str, total: u64) {
+    fn begin(&self, what: &str, unit: &str, total: u64, rate_unit: &'static str) {
         let mut state = self.lock();
         match self.mode {
             Mode::Silent => {}
@@ -75,10 +71,13 @@ impl Progress for Bars {
                 );
                 let style = ProgressStyle::with_template(&template)
                     .unwrap_or_else(|_| ProgressStyle::default_bar())
-                    .with_key("rate", |state: &ProgressState, out: &mut dyn std::fmt::Write| {
-                        // A bar that cannot be drawn must not stop the work.
-                        write!(out, "{:.1}/s", state.per_sec()).ok();
-                    });
+                    .with_key(
+                        "rate",
+                        move |state: &ProgressState, out: &mut dyn std::fmt::Write| {
+                            // A bar that cannot be drawn must not stop the work.
+                            write!(out, "{:.1}{rate_unit}", state.per_sec()).ok();
+                        },
+                    );
                 state.bar = Some(ProgressBar::new(total).with_style(style));
             }
             Mode::Lines => {
@@ -86,6 +85,7 @@ impl Progress for Bars {
                 state.count = Some(Count {
                     what: what.to_owned(),
                     unit: unit.to_owned(),
+                    rate_unit,
                     done: 0,
                     total,
                     started: now,
@@ -93,6 +93,20 @@ impl Progress for Bars {
                 });
             }
         }
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Progress for Bars {
+    fn start(&self, what: &str, unit: &str, total: u64) {
+        self.begin(what, unit, total, "/s");
+    }
+
+    fn start_audio(&self, what: &str, total_s: u64) {
+        self.begin(what, "s of audio", total_s, "× real time");
     }
 
     #[expect(clippy::print_stderr, reason = "progress is for people, data for standard output")]
@@ -121,10 +135,10 @@ impl Progress for Bars {
 
 impl Count {
     fn line(&self, elapsed: Duration) -> String {
-        let Count { what, unit, done, total, .. } = self;
+        let Count { what, unit, rate_unit, done, total, .. } = self;
         let rate = *done as f64 / elapsed.as_secs_f64().max(1e-9);
         let eta_s = total.saturating_sub(*done) as f64 / rate.max(1e-9);
-        format!("{what}: {done} of {total} {unit}, {rate:.1}/s, ETA {}", duration(eta_s))
+        format!("{what}: {done} of {total} {unit}, {rate:.1}{rate_unit}, ETA {}", duration(eta_s))
     }
 }
 
@@ -147,6 +161,7 @@ mod tests {
         let count = Count {
             what: "ingest".into(),
             unit: "phrases".into(),
+            rate_unit: "/s",
             done: 300,
             total: 1200,
             started: now,

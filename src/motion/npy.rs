@@ -60,12 +60,34 @@ pub fn read_f64_from(reader: impl Read, byte_limit: u64) -> Result<NpyArray<f64>
     read_array(reader, byte_limit, 0)
 }
 
+/// A number that [`write`] can store.
+pub trait Writable: Copy {
+    /// NumPy's name of the type.
+    const DESCR: &'static str;
+    /// Appends the little-endian bytes.
+    fn append_to(self, bytes: &mut Vec<u8>);
+}
+
+macro_rules! writable {
+    ($type:ty, $descr:literal) => {
+        impl Writable for $type {
+            const DESCR: &'static str = $descr;
+            fn append_to(self, bytes: &mut Vec<u8>) {
+                bytes.extend_from_slice(&self.to_le_bytes());
+            }
+        }
+    };
+}
+writable!(f32, "<f4");
+writable!(f64, "<f8");
+writable!(i64, "<i8");
+
 /// Writes `values`, in C order, as a version 1.0 file equal byte for byte to `numpy.save`'s for
-/// a C-order `<f4` array of `shape`.
+/// a C-order array of `shape`, of `<f4`, `<f8` or `<i8` as the values are.
 ///
 /// # Panics
 /// If the lengths in `shape` do not multiply to the number of values, or there are over 64.
-pub fn write_f32(shape: &[usize], values: &[f32]) -> Vec<u8> {
+pub fn write<T: Writable>(shape: &[usize], values: &[T]) -> Vec<u8> {
     assert!(shape.len() <= 64, "shape has {} axes and NumPy allows 64", shape.len());
     let count = shape.iter().try_fold(1_usize, |count, &length| count.checked_mul(length));
     assert_eq!(count, Some(values.len()), "shape {shape:?} against {} values", values.len());
@@ -73,7 +95,8 @@ pub fn write_f32(shape: &[usize], values: &[f32]) -> Vec<u8> {
     let lengths: Vec<String> = shape.iter().map(usize::to_string).collect();
     let comma = if shape.len() == 1 { "," } else { "" };
     let mut header = format!(
-        "{{'descr': '<f4', 'fortran_order': False, 'shape': ({}{comma}), }}",
+        "{{'descr': '{}', 'fortran_order': False, 'shape': ({}{comma}), }}",
+        T::DESCR,
         lengths.join(", ")
     );
     // `numpy.lib.format` leaves room for the first axis to grow to 21 digits in place, then pads
@@ -90,7 +113,7 @@ pub fn write_f32(shape: &[usize], values: &[f32]) -> Vec<u8> {
     file.extend_from_slice(&(header.len() as u16).to_le_bytes());
     file.extend_from_slice(header.as_bytes());
     for value in values {
-        file.extend_from_slice(&value.to_le_bytes());
+        value.append_to(&mut file);
     }
     file
 }

@@ -99,6 +99,31 @@ fn list(keys: &[String]) -> String {
     format!("{}{more}", named.join(", "))
 }
 
+/// Writes an archive of `.npy` members, stored as they are (`numpy.savez`).
+///
+/// The same members give the same bytes: no member carries a time.
+///
+/// # Errors
+/// What the output says.
+pub fn write(
+    out: impl std::io::Write + std::io::Seek,
+    members: &[(&str, Vec<u8>)],
+) -> std::io::Result<()> {
+    use std::io::Write as _;
+    let options = zip::write::SimpleFileOptions::default()
+        .compression_method(CompressionMethod::Stored)
+        .last_modified_time(zip::DateTime::default());
+    let mut archive = zip::ZipWriter::new(out);
+    for (key, bytes) in members {
+        // NumPy, too, asks for the room of large files up front.
+        let options = options.large_file(bytes.len() as u64 > u64::from(u32::MAX / 2));
+        archive.start_file(format!("{key}.npy"), options)?;
+        archive.write_all(bytes)?;
+    }
+    archive.finish()?;
+    Ok(())
+}
+
 /// An opened archive over bytes in memory.
 #[derive(Debug)]
 pub struct Npz<'a> {

@@ -1,5 +1,8 @@
 //! Stages: what the user runs. Each has a contract, parameters, a run and a summary.
 
+pub mod extract;
+pub mod failure;
+pub mod feature_file;
 pub mod ingest;
 #[cfg(feature = "query")]
 pub mod query;
@@ -37,6 +40,8 @@ pub struct Contract {
 pub trait Progress: Sync {
     /// Starts counting `total` things called `unit` (in the plural).
     fn start(&self, what: &str, unit: &str, total: u64);
+    /// Starts counting `total` seconds of audio; the rate is a multiple of real time.
+    fn start_audio(&self, what: &str, total_s: u64);
     /// Counts `n` more.
     fn advance(&self, n: u64);
     /// Ends the counting.
@@ -49,6 +54,7 @@ pub struct Silent;
 
 impl Progress for Silent {
     fn start(&self, _what: &str, _unit: &str, _total: u64) {}
+    fn start_audio(&self, _what: &str, _total_s: u64) {}
     fn advance(&self, _n: u64) {}
     fn finish(&self) {}
 }

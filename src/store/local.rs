@@ -29,6 +29,14 @@ pub fn write_file(
     let mut out = std::io::BufWriter::new(temporary_beside(&std::path::absolute(path)?)?);
     write(&mut out)?;
     let file = out.into_inner().map_err(std::io::IntoInnerError::into_error)?;
+    replace_file(path, file)
+}
+
+/// Publishes a finished temporary file at `path`, replacing what was there.
+///
+/// # Errors
+/// What the file system says; the old file is untouched then.
+pub fn replace_file(path: &FsPath, file: tempfile::NamedTempFile) -> std::io::Result<()> {
     readable_by_all(&file)?;
     file.as_file().sync_all()?;
     file.persist(path).map(|_| ()).map_err(|e| e.error)

@@ -25,7 +25,7 @@ pub use client::ClientOptions;
 pub use commit::{Commit, Committed, Item, Ledger, LivePart, Manifest, Part, Settled, live_parts};
 pub use digest::{digest, digest_of};
 pub use error::StoreError;
-pub use local::write_file;
+pub use local::{replace_file, temporary_beside, write_file};
 pub use location::{Listed, Location, Put};
 pub use part::{FinishedPart, PartWriter};
 #[cfg(feature = "query")]

@@ -136,6 +136,20 @@ impl Source {
         }
     }
 
+    /// Returns the file that a table recorded by its URL, or `None` when it lies elsewhere.
+    pub fn recorded(&self, url: &str, size_bytes: u64, fingerprint: &str) -> Option<SourceFile> {
+        let path = match self.location.kind() {
+            Kind::Local(root) => {
+                let path = url::Url::parse(url).ok()?.to_file_path().ok()?;
+                path.strip_prefix(root).ok()?.to_str()?.to_owned()
+            }
+            Kind::Remote { .. } => {
+                url.strip_prefix(self.location.url())?.strip_prefix('/')?.to_owned()
+            }
+        };
+        Some(SourceFile { path, size_bytes, fingerprint: fingerprint.to_owned() })
+    }
+
     /// Reads files in the order given, remote ones ahead of the caller within the budget.
     pub fn read_in_order(&self, files: Vec<SourceFile>) -> InOrder {
         match self.location.kind() {

@@ -3,6 +3,7 @@
 use std::borrow::Cow;
 
 use super::schema::{Column, ColumnType, Row, TableSchema, TimestampUs, rows};
+use crate::audio::feature_names;
 use crate::motion::{CHANNEL_NAMES, channel_unit};
 
 /// The column that names the item a row belongs to, in every table.
@@ -55,6 +56,54 @@ rows! {
     }
 }
 
+rows! {
+    "One row per phrase whose features extract has, with what holds for the whole phrase."
+    ExtractionRow in "extractions" version 1 sorted by [phrase_id]
+    {
+        phrase_id: String, "", "The phrase, as in `phrases`.";
+        origin: String, "", "`audio` (extracted here) or `feature_file` (brought in from `features.npz`, as it was).";
+        source_url: String, "URL", "The file that the features came from.";
+        n_frames: i64, "frames", "Feature frames: 1 + n_samples / 1470, rounded down.";
+        n_samples: Option<i64>, "samples", "Length of the audio at 44.1 kHz.";
+        duration_s: f64, "s", "Length of the audio; without audio, frames / 30.";
+        tuning: Option<f64>, "1/36 octave", "Deviation from A440 with which the chroma was made, from -0.5 to below 0.5.";
+        tuning_source: Option<String>, "", "`estimated` or `given` (by --tuning).";
+        tempo_bpm: Option<f64>, "beats/min", "Tempo of the beat tracker, 1800 / whole frames; none without onsets.";
+        n_beats: i32, "beats", "Rows of the phrase in `beats`.";
+        audio_codec: Option<String>, "", "Codec that was decoded.";
+        sample_rate_hz: Option<i32>, "Hz", "Sample rate of the file.";
+        n_channels: Option<i32>, "channels", "Channels of the file.";
+    }
+}
+
+rows! {
+    "One row per beat."
+    BeatRow in "beats" version 1 sorted by [phrase_id, beat]
+    {
+        phrase_id: String, "", "The phrase, as in `phrases`.";
+        beat: i32, "beats", "Index within the phrase, from 0.";
+        frame: i32, "frames", "The nearest frame.";
+        time_s: f64, "s", "Time of the beat; frame / 30 where the beat tracker found it.";
+    }
+}
+
+/// Name of the feature table.
+pub const FEATURES: &str = "features";
+
+/// Returns the schema of `features`: one row per frame, one column per feature.
+pub fn features() -> TableSchema {
+    let channels = feature_names().map(|(name, block)| Column {
+        name,
+        column_type: ColumnType::Float32,
+        nullable: false,
+        unit: "",
+        description: Cow::Borrowed(block.meaning),
+    });
+    let description =
+        "One row per frame of music at 30 fps: the 163 audio features (docs/features.md).";
+    frame_table(FEATURES, description, channels)
+}
+
 /// Name of the motion table.
 pub const MOTION: &str = "motion";
 
@@ -103,7 +152,14 @@ fn frame_table(
 
 /// Returns every table of a store.
 pub fn all() -> Vec<TableSchema> {
-    vec![PhraseRow::schema(), motion(), FailureRow::schema()]
+    vec![
+        PhraseRow::schema(),
+        motion(),
+        features(),
+        ExtractionRow::schema(),
+        BeatRow::schema(),
+        FailureRow::schema(),
+    ]
 }
 
 #[cfg(test)]

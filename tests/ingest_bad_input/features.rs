@@ -2,7 +2,7 @@
 
 use std::io::{Cursor, Write as _};
 
-use motiongen::motion::npy::write_f32;
+use motiongen::motion::npy::write;
 use zip::CompressionMethod::{Deflated, Stored};
 use zip::write::SimpleFileOptions;
 
@@ -52,7 +52,7 @@ fn archives() -> Vec<Case> {
         Case::npz("npz-is-a-web-page", b"<!DOCTYPE html>\n<html></html>".to_vec(), "npz_format",
             "not an npz file: it starts with \"<!DOCTYPE html>\"; was an error page saved in place \
              of the archive?"),
-        Case::npz("npz-is-an-npy", write_f32(&[3], &[0.5; 3]), "npz_format",
+        Case::npz("npz-is-an-npy", write(&[3], &[0.5; 3]), "npz_format",
             "not an npz file: it starts with bytes 93 4e 55 4d 50 59 01 00; it is a single array, \
              name it .npy"),
         Case::npz("npz-damaged-table", table, "npz_format",
@@ -129,7 +129,7 @@ fn bomb(start: &[u8], n_zeros: usize) -> Vec<u8> {
 
 #[rustfmt::skip]
 fn bombs() -> Vec<Case> {
-    let one = write_f32(&[128, 1], &[0.0; 128]);
+    let one = write(&[128, 1], &[0.0; 128]);
     let honest = npy("'<f4'", "(128, 500000)", &[]);
     let cases = vec![
         // A small array, and then zeros without end.
@@ -154,12 +154,12 @@ fn bombs() -> Vec<Case> {
 
 #[rustfmt::skip]
 fn arrays() -> Vec<Case> {
-    let zeros = |shape: &[usize]| write_f32(shape, &vec![0.0; shape.iter().product()]);
+    let zeros = |shape: &[usize]| write(shape, &vec![0.0; shape.iter().product()]);
     let mut broken_mfcc = vec![0.25; 20 * 23];
     broken_mfcc[3 * 23 + 5] = f32::NAN;
     broken_mfcc[4 * 23 + 6] = f32::INFINITY;
     let none: Vec<Member> =
-        features(23).into_iter().map(|(key, _)| (key, write_f32(&[128, 0], &[]))).collect();
+        features(23).into_iter().map(|(key, _)| (key, write(&[128, 0], &[]))).collect();
     vec![
         Case::npz("npz-wrong-mel-rows", with("mel", zeros(&[80, 23])), "shape",
             "mel has shape [80, 23], expected [128, frames]"),
@@ -171,12 +171,12 @@ fn arrays() -> Vec<Case> {
             "mel has shape [128, 0], expected [128, frames]"),
         Case::npz("npz-frame-counts-differ", with("onset_strength", zeros(&[22])), "shape",
             "onset_strength has 22 frames but mel has 23; extract them again"),
-        Case::npz("npz-nan", with("mfcc", write_f32(&[20, 23], &broken_mfcc)), "non_finite",
+        Case::npz("npz-nan", with("mfcc", write(&[20, 23], &broken_mfcc)), "non_finite",
             "mfcc is NaN at frame 5 (2 non-finite values in all); extract the features again"),
-        Case::npz("npz-negative-beat", with("beat_times", write_f32(&[2], &[-0.5, 1.0])),
+        Case::npz("npz-negative-beat", with("beat_times", write(&[2], &[-0.5, 1.0])),
             "non_finite",
             "beat_times holds -0.5 s; times are finite and not negative"),
-        Case::npz("npz-infinite-beat", with("beat_times", write_f32(&[2], &[0.5, f32::INFINITY])),
+        Case::npz("npz-infinite-beat", with("beat_times", write(&[2], &[0.5, f32::INFINITY])),
             "non_finite",
             "beat_times holds inf s; times are finite and not negative"),
     ]

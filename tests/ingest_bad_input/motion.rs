@@ -1,6 +1,6 @@
 //! Trajectories and captures that are no motion.
 
-use motiongen::motion::npy::write_f32;
+use motiongen::motion::npy::write;
 
 use super::case::Case;
 use crate::support::files::{coherent, npy, trajectory};
@@ -113,7 +113,7 @@ fn foreign_types() -> Vec<Case> {
 
 #[rustfmt::skip]
 fn shapes() -> Vec<Case> {
-    let zeros = |shape: &[usize]| write_f32(shape, &vec![0.0; shape.iter().product()]);
+    let zeros = |shape: &[usize]| write(shape, &vec![0.0; shape.iter().product()]);
     vec![
         Case::npy("npy-24-channels", zeros(&[17, 24]), "shape",
             "{path} has shape [17, 24], expected [frames, 25]"),

@@ -2,7 +2,7 @@
 
 use std::io::{Cursor, Write as _};
 
-use motiongen::motion::npy::write_f32;
+use motiongen::motion::npy::write;
 use motiongen::motion::{MOTION_DIM, quaternion};
 use motiongen::units::FPS;
 use zip::CompressionMethod;
@@ -45,7 +45,7 @@ fn difference(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
 
 /// Returns frames as the bytes of `trajectory.npy`.
 pub fn trajectory(frames: &[Frame]) -> Vec<u8> {
-    write_f32(&[frames.len(), MOTION_DIM], frames.as_flattened())
+    write(&[frames.len(), MOTION_DIM], frames.as_flattened())
 }
 
 /// Returns a version 1.0 `.npy` file of any type: `descr` and `shape` as Python writes them.
@@ -78,7 +78,7 @@ pub fn features(n_frames: usize) -> Vec<Member> {
     let array = |shape: &[usize], start: f32| {
         let n: usize = shape.iter().product();
         let values: Vec<f32> = (0..n).map(|i| start + (i % 101) as f32 / 64.0).collect();
-        write_f32(shape, &values)
+        write(shape, &values)
     };
     vec![
         ("mel", array(&[128, n_frames], -80.0)),
@@ -88,7 +88,7 @@ pub fn features(n_frames: usize) -> Vec<Member> {
         ("spectral_centroid", array(&[1, n_frames], 900.0)),
         ("onset_strength", array(&[n_frames], 0.0)),
         ("tempo", npy("'<f8'", "()", &97.5_f64.to_le_bytes())),
-        ("beat_times", write_f32(&[3], &[0.25, 0.75, 1.25])),
+        ("beat_times", write(&[3], &[0.25, 0.75, 1.25])),
     ]
 }
 

@@ -229,13 +229,13 @@ fn written_as_numpy_writes() {
         b"\x00\x00\x80\x3f\x00\x00\x00\x40",
     ]
     .concat();
-    assert_eq!(write_f32(&[1, 2], &[1.0, 2.0]), expected);
+    assert_eq!(write(&[1, 2], &[1.0, 2.0]), expected);
 }
 
 #[test]
 #[should_panic(expected = "shape [2, 2] against 3 values")]
 fn writing_checks_the_shape() {
-    write_f32(&[2, 2], &[0.0; 3]);
+    write(&[2, 2], &[0.0; 3]);
 }
 
 fn bits(values: &[f32]) -> Vec<u32> {
@@ -248,7 +248,7 @@ proptest! {
         let count = shape.iter().product::<usize>() as u32;
         let values: Vec<f32> =
             (0..count).map(|i| f32::from_bits(seed.wrapping_mul(i.wrapping_add(7)))).collect();
-        let file = write_f32(&shape, &values);
+        let file = write(&shape, &values);
         prop_assert_eq!((file.len() - values.len() * 4) % 64, 0);
         for array in [read_f32(&file).unwrap(), read_f32_from(&file[..], u64::MAX).unwrap()] {
             prop_assert_eq!(&array.shape, &shape);
@@ -285,7 +285,7 @@ proptest! {
         by in any::<u8>(),
         kept in 0_usize..=168,
     ) {
-        let mut file = write_f32(&[2, 5], &[0.5; 10]);
+        let mut file = write(&[2, 5], &[0.5; 10]);
         file[at] ^= by;
         file.truncate(kept);
         if let Ok(array) = read_f64(&file) {

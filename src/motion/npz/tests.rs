@@ -3,7 +3,7 @@ use std::io::Write;
 use proptest::prelude::*;
 use zip::{ZipWriter, write::SimpleFileOptions};
 
-use super::super::npy::write_f32;
+use super::super::npy::write;
 use super::*;
 
 fn archive(members: &[(&str, &[u8])], method: CompressionMethod) -> Vec<u8> {
@@ -17,7 +17,7 @@ fn archive(members: &[(&str, &[u8])], method: CompressionMethod) -> Vec<u8> {
 }
 
 fn sample() -> Vec<u8> {
-    let (mel, beats) = (write_f32(&[2, 3], &[1.5; 6]), write_f32(&[4], &[2.0; 4]));
+    let (mel, beats) = (write(&[2, 3], &[1.5; 6]), write(&[4], &[2.0; 4]));
     let members = [("mel.npy", mel.as_slice()), ("beats.npy", &beats), ("note.txt", b"hello")];
     archive(&members, CompressionMethod::Stored)
 }
@@ -56,7 +56,7 @@ fn whole_archives_are_refused_with_a_sentence() {
          place of the archive?",
     );
     says(
-        Npz::open(&write_f32(&[1], &[0.0])),
+        Npz::open(&write(&[1], &[0.0])),
         "npz_format",
         "not an npz file: it starts with bytes 93 4e 55 4d 50 59 01 00; it is a single array, name \
          it .npy",
@@ -77,7 +77,7 @@ fn whole_archives_are_refused_with_a_sentence() {
 
 #[test]
 fn keys_given_twice_are_refused() {
-    let array = write_f32(&[1], &[0.0]);
+    let array = write(&[1], &[0.0]);
     let stripped =
         archive(&[("a.npy", array.as_slice()), ("a", &array)], CompressionMethod::Stored);
     let sentence = "npz key \"a\" names two members; write the file again with each key once";
@@ -155,7 +155,7 @@ fn members_are_refused_with_a_sentence() {
 #[test]
 fn a_bomb_stops_at_the_limit() {
     // 8 MiB of zeros behind a small array shrink to 8 kB.
-    let member = [write_f32(&[2], &[0.0; 2]), vec![0; 8 << 20]].concat();
+    let member = [write(&[2], &[0.0; 2]), vec![0; 8 << 20]].concat();
     let bytes = archive(&[("a.npy", &member)], CompressionMethod::Deflated);
     assert!(bytes.len() < 100_000);
     says(

@@ -4,14 +4,13 @@
 //! whoever does it, whenever, after however many kills, writes the same bytes under the same name.
 
 use std::collections::BTreeSet;
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
-use super::failure::{Failure, FailureKind};
 use super::layout::{Planned, Role};
 use super::phrase::{Files, Phrase, Rules};
 use super::{Ingest, Refused, Tally};
+use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::{Progress, Stage as _};
 use crate::store::tables::{self, FailureRow, PhraseRow};
 use crate::store::{
@@ -167,19 +166,8 @@ impl Job<'_> {
             Err(failure) => return (without_content(&failure), Err(failure)),
         };
         let input_hash = files.content_hash().to_owned();
-        let checked = catch_unwind(AssertUnwindSafe(|| files.check(self.rules)));
-        let outcome = checked.unwrap_or_else(|panic| {
-            let said = panic
-                .downcast_ref::<String>()
-                .map(String::as_str)
-                .or_else(|| panic.downcast_ref::<&str>().copied())
-                .unwrap_or("no message");
-            let path = planned.files.first().map_or(planned.id.as_str(), |(_, file)| &file.path);
-            let message = format!(
-                "the program broke on this phrase ({said}); please report it with the file"
-            );
-            Err(Failure::new(FailureKind::Panic, path, message))
-        });
+        let path = planned.files.first().map_or(planned.id.as_str(), |(_, file)| &file.path);
+        let outcome = guarded(path, || files.check(self.rules));
         (input_hash, outcome)
     }
 
@@ -201,7 +189,7 @@ impl Job<'_> {
         } else if self.is_out_of_reach(&id, &outcome) {
             id.clone_from(&contested);
         }
-        let failure = outcome.as_ref().err().map(failure_digest);
+        let failure = outcome.as_ref().err().map(Failure::digest);
         let unchanged = !self.force
             && self.ledger.get(&id).is_some_and(|known| {
                 known.params_hash == self.params_hash
@@ -340,10 +328,6 @@ pub fn fingerprint(planned: &Planned) -> String {
         .collect();
     let problem = planned.problem.as_ref().map_or("", |p| p.message.as_str());
     digest(format!("{lines}{problem}").as_bytes())[..32].to_owned()
-}
-
-fn failure_digest(failure: &Failure) -> String {
-    digest(format!("{}\n{}", failure.kind.name(), failure.message).as_bytes())[..32].to_owned()
 }
 
 fn gone(file: &SourceFile) -> Result<Content, StoreError> {

@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crate::store::{Listing, SourceFile, SourceProblem, SourceProblemKind};
 
-use super::failure::{Failure, FailureKind};
+use crate::stages::failure::{Failure, FailureKind};
 
 /// File name endings of audio.
 const AUDIO_EXTENSIONS: [&str; 8] = ["wav", "flac", "mp3", "ogg", "opus", "m4a", "aif", "aiff"];

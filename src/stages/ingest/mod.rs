@@ -1,7 +1,6 @@
 //! `ingest`: phrases or a music library become the tables `phrases` and `motion`.
 
 mod batch;
-mod failure;
 mod layout;
 mod phrase;
 
@@ -13,7 +12,7 @@ use std::time::Instant;
 use super::{ClientParams, Contract, Progress, Stage, Summary};
 use crate::store::{Cache, Ledger, Location, Shard, Source, StoreError, digest};
 
-pub use failure::{Failure, FailureKind};
+use super::failure::Failure;
 pub use layout::{Layout, Plan, Planned, Role, plan};
 pub use phrase::Rules;
 

@@ -4,34 +4,20 @@ use std::io::{Read as _, Seek as _};
 
 use ndarray::Array2;
 
-use super::failure::{Failure, FailureKind};
 use super::layout::Role;
 use crate::audio::header::{AudioHeader, AudioHeaderError, read_header, read_header_from};
 use crate::motion::npy::{self, NpyError};
-use crate::motion::npz::{Npz, NpzError};
 use crate::motion::{
     Beats, BeatsPerBarSource, Bvh, BvhError, CaptureError, ChannelLimits, Trajectory,
     TrajectoryError, convert_bvh,
 };
+use crate::stages::failure::{Failure, FailureKind};
+use crate::stages::feature_file::read_features;
 use crate::store::{Content, SourceFile, StoreError, digest, digest_of};
 use crate::units::{FPS, frames_to_s, s_to_frames};
 
-/// Arrays of a feature file: key and channels (`None`: one value per frame).
-const FEATURE_KEYS: [(&str, Option<usize>); 6] = [
-    ("mel", Some(128)),
-    ("chroma", Some(12)),
-    ("mfcc", Some(20)),
-    ("rms", None),
-    ("spectral_centroid", None),
-    ("onset_strength", None),
-];
-
 /// Largest motion, feature or beat file that is read, in bytes.
 const MAX_FILE_BYTES: u64 = 1 << 30;
-
-/// Largest array of a feature file: over four hours of mel bands. A small archive can hold any
-/// amount of zeros, so this and not the file's size bounds the memory that it takes.
-const MAX_FEATURE_ARRAY_BYTES: u64 = 256 << 20;
 
 /// What makes a phrase acceptable; a change of these makes every phrase be read again.
 #[derive(Clone, Copy, Debug, PartialEq, clap::Args, serde::Serialize)]
@@ -135,11 +121,14 @@ impl Files {
                     beats = Some(read);
                 }
                 Role::Features => {
-                    let features = read_features(path, bytes_of(&file, content)?.as_ref())?;
+                    let bytes = bytes_of(&file, content)?;
+                    let features = read_features(path, &bytes, |_, _, _| {})?;
                     phrase.n_feature_frames = Some(features.n_frames);
-                    phrase.has_beats |= features.has_beats;
+                    phrase.has_beats |= !features.beat_times_s.is_empty();
+                    let source = "features";
+                    let tempo = |bpm| Tempo { bpm, source, beats_per_bar: None };
                     // A beat list beside the audio was written by somebody; a tracker's was not.
-                    phrase.tempo = phrase.tempo.or(features.tempo);
+                    phrase.tempo = phrase.tempo.or(features.tempo_bpm.map(tempo));
                 }
                 Role::MotionNpy | Role::MotionBvh => {
                     let bytes = bytes_of(&file, content)?;
@@ -148,7 +137,7 @@ impl Files {
                     } else {
                         ("bvh", read_bvh(path, &bytes, beats.as_ref())?)
                     };
-                    motion.check(&rules.limits).map_err(|e| failed(path, e.kind(), &e))?;
+                    motion.check(&rules.limits).map_err(|e| Failure::of(path, e.kind(), &e))?;
                     phrase.motion = Some(motion);
                     phrase.motion_format = Some(format);
                     path.clone_into(&mut motion_path);
@@ -217,7 +206,7 @@ fn audio_header(path: &str, content: Content) -> Result<AudioHeader, Failure> {
         Content::Bytes(bytes) => read_header(&bytes, extension),
         Content::File(file) => read_header_from(file, extension),
     };
-    read.map_err(|e: AudioHeaderError| failed(path, e.kind(), &e))
+    read.map_err(|e: AudioHeaderError| Failure::of(path, e.kind(), &e))
 }
 
 fn read_beats(path: &str, bytes: &[u8]) -> Result<Beats, Failure> {
@@ -243,7 +232,7 @@ fn tempo_of(beats: &Beats) -> Tempo {
 }
 
 fn read_trajectory(path: &str, bytes: &[u8]) -> Result<Trajectory, Failure> {
-    let array = npy::read_f32(bytes).map_err(|e: NpyError| failed(path, e.kind(), &e))?;
+    let array = npy::read_f32(bytes).map_err(|e: NpyError| Failure::of(path, e.kind(), &e))?;
     let shape_failure = || {
         let hint =
             if array.shape.len() == 2 && array.shape[0] == 25 { "; transpose it" } else { "" };
@@ -256,7 +245,7 @@ fn read_trajectory(path: &str, bytes: &[u8]) -> Result<Trajectory, Failure> {
     }
     let frames = Array2::from_shape_vec((n_frames, n_channels), array.values)
         .map_err(|e| Failure::new(FailureKind::Shape, path, e))?;
-    Trajectory::new(frames).map_err(|e: TrajectoryError| failed(path, e.kind(), &e))
+    Trajectory::new(frames).map_err(|e: TrajectoryError| Failure::of(path, e.kind(), &e))
 }
 
 fn read_bvh(path: &str, bytes: &[u8], beats: Option<&Beats>) -> Result<Trajectory, Failure> {
@@ -264,70 +253,6 @@ fn read_bvh(path: &str, bytes: &[u8], beats: Option<&Beats>) -> Result<Trajector
         let message = format!("{path} is empty; export the capture again");
         return Err(Failure::new(FailureKind::EmptyFile, path, message));
     }
-    let bvh = Bvh::parse(bytes).map_err(|e: BvhError| failed(path, "bvh_format", &e))?;
-    convert_bvh(&bvh, beats).map_err(|e: CaptureError| failed(path, "bvh_format", &e))
-}
-
-struct Features {
-    n_frames: usize,
-    tempo: Option<Tempo>,
-    has_beats: bool,
-}
-
-fn read_features(path: &str, bytes: &[u8]) -> Result<Features, Failure> {
-    let from_npz = |e: NpzError| failed(path, e.kind(), &e);
-    let mut npz = Npz::open_limited(bytes, MAX_FEATURE_ARRAY_BYTES).map_err(from_npz)?;
-    let mut n_frames = None;
-    for (key, n_channels) in FEATURE_KEYS {
-        let array = npz.read_f32(key).map_err(from_npz)?;
-        let expected = n_channels.map_or("[frames]".into(), |n| format!("[{n}, frames]"));
-        let frames = match (array.shape.as_slice(), n_channels) {
-            (&[frames], None) | (&[1, frames], None) => Some(frames),
-            (&[rows, frames], Some(n)) if rows == n => Some(frames),
-            _ => None,
-        };
-        let Some(frames) = frames.filter(|&frames| frames > 0) else {
-            let message = format!("{path}: {key} has shape {:?}, expected {expected}", array.shape);
-            return Err(Failure::new(FailureKind::Shape, path, message));
-        };
-        let n = *n_frames.get_or_insert(frames);
-        if n != frames {
-            let message =
-                format!("{path}: {key} has {frames} frames but mel has {n}; extract them again");
-            return Err(Failure::new(FailureKind::Shape, path, message));
-        }
-        if let Some(i) = array.values.iter().position(|x| !x.is_finite()) {
-            let count = array.values.iter().filter(|x| !x.is_finite()).count();
-            let (value, frame) = (array.values[i], i % frames);
-            let message = format!(
-                "{path}: {key} is {value} at frame {frame} ({count} non-finite values in all); \
-                 extract the features again"
-            );
-            return Err(Failure::new(FailureKind::NonFinite, path, message));
-        }
-    }
-    let has = |npz: &Npz<'_>, key: &str| npz.keys().iter().any(|k| k == key);
-    let mut features = Features { n_frames: n_frames.unwrap_or(0), tempo: None, has_beats: false };
-    if has(&npz, "tempo") {
-        let tempo = npz.read_f64("tempo").map_err(from_npz)?;
-        let bpm = tempo.values.first().copied().filter(|bpm| bpm.is_finite() && *bpm > 0.0);
-        // librosa reports 0 for a song without a pulse; that is "no tempo", not a broken file.
-        features.tempo = bpm.map(|bpm| Tempo { bpm, source: "features", beats_per_bar: None });
-    }
-    if has(&npz, "beat_times") {
-        let beats = npz.read_f64("beat_times").map_err(from_npz)?;
-        if let Some(time_s) = beats.values.iter().find(|t| !t.is_finite() || **t < 0.0) {
-            let message =
-                format!("{path}: beat_times holds {time_s} s; times are finite and not negative");
-            return Err(Failure::new(FailureKind::NonFinite, path, message));
-        }
-        features.has_beats = !beats.values.is_empty();
-    }
-    Ok(features)
-}
-
-/// Builds a failure from a reader's own kind and sentence, naming the file.
-fn failed(path: &str, kind: &str, error: &dyn std::fmt::Display) -> Failure {
-    let kind = FailureKind::of_reader(kind);
-    Failure::new(kind, path, format!("{path}: {error}"))
+    let bvh = Bvh::parse(bytes).map_err(|e: BvhError| Failure::of(path, "bvh_format", &e))?;
+    convert_bvh(&bvh, beats).map_err(|e: CaptureError| Failure::of(path, "bvh_format", &e))
 }

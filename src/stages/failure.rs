@@ -1,13 +1,23 @@
-//! Why a phrase was refused: one kind, one sentence.
+//! Why an item was refused: one kind, one sentence.
 
 use std::fmt;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+use crate::store::digest;
 
 /// Classes of failure, as the `kind` column of `failures` spells them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum FailureKind {
+    AudioCodec,
+    AudioData,
     AudioHeader,
+    AudioNoSamples,
+    AudioNotFinite,
+    AudioSampleRate,
     BeatsFormat,
     BvhFormat,
+    /// The file was written to while it was read, or since it was ingested.
+    Changed,
     ChannelLimit,
     DuplicateId,
     EmptyFile,
@@ -25,7 +35,9 @@ pub enum FailureKind {
     QuaternionNorm,
     Shape,
     Symlink,
+    Timeout,
     TooLarge,
+    TooLong,
     Truncated,
     Unreadable,
 }
@@ -34,9 +46,15 @@ impl FailureKind {
     /// Returns the kind as tables spell it.
     pub fn name(self) -> &'static str {
         match self {
+            FailureKind::AudioCodec => "audio_codec",
+            FailureKind::AudioData => "audio_data",
             FailureKind::AudioHeader => "audio_header",
+            FailureKind::AudioNoSamples => "audio_no_samples",
+            FailureKind::AudioNotFinite => "audio_not_finite",
+            FailureKind::AudioSampleRate => "audio_sample_rate",
             FailureKind::BeatsFormat => "beats_format",
             FailureKind::BvhFormat => "bvh_format",
+            FailureKind::Changed => "changed",
             FailureKind::ChannelLimit => "channel_limit",
             FailureKind::DuplicateId => "duplicate_id",
             FailureKind::EmptyFile => "empty_file",
@@ -53,7 +71,9 @@ impl FailureKind {
             FailureKind::QuaternionNorm => "quaternion_norm",
             FailureKind::Shape => "shape",
             FailureKind::Symlink => "symlink",
+            FailureKind::Timeout => "timeout",
             FailureKind::TooLarge => "too_large",
+            FailureKind::TooLong => "too_long",
             FailureKind::Truncated => "truncated",
             FailureKind::Unreadable => "unreadable",
         }
@@ -74,14 +94,47 @@ impl Failure {
     pub fn new(kind: FailureKind, path: &str, message: impl fmt::Display) -> Self {
         Self { kind, path: path.to_owned(), message: message.to_string() }
     }
+
+    /// Builds a failure from a reader's own kind and sentence, naming the file.
+    pub fn of(path: &str, kind: &str, error: &dyn fmt::Display) -> Self {
+        Self::new(FailureKind::of_reader(kind), path, format!("{path}: {error}"))
+    }
+
+    /// Returns a digest of kind and message, by which a failure is known again.
+    pub fn digest(&self) -> String {
+        digest(format!("{}\n{}", self.kind.name(), self.message).as_bytes())[..32].to_owned()
+    }
+}
+
+/// Does the work on one item; a defect of ours costs the item, not the job.
+///
+/// # Errors
+/// What `work` says, or [`FailureKind::Panic`] for the file at `path`.
+pub fn guarded<T>(path: &str, work: impl FnOnce() -> Result<T, Failure>) -> Result<T, Failure> {
+    catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| {
+        let said = panic
+            .downcast_ref::<String>()
+            .map(String::as_str)
+            .or_else(|| panic.downcast_ref::<&str>().copied())
+            .unwrap_or("no message");
+        let message =
+            format!("the program broke on this phrase ({said}); please report it with the file");
+        Err(Failure::new(FailureKind::Panic, path, message))
+    })
 }
 
 impl FailureKind {
     /// Every kind, for looking one up by the name that a reader gives.
-    const ALL: [FailureKind; 22] = [
+    const ALL: [FailureKind; 30] = [
+        FailureKind::AudioCodec,
+        FailureKind::AudioData,
         FailureKind::AudioHeader,
+        FailureKind::AudioNoSamples,
+        FailureKind::AudioNotFinite,
+        FailureKind::AudioSampleRate,
         FailureKind::BeatsFormat,
         FailureKind::BvhFormat,
+        FailureKind::Changed,
         FailureKind::ChannelLimit,
         FailureKind::DuplicateId,
         FailureKind::EmptyFile,
@@ -98,7 +151,9 @@ impl FailureKind {
         FailureKind::QuaternionNorm,
         FailureKind::Shape,
         FailureKind::Symlink,
+        FailureKind::Timeout,
         FailureKind::TooLarge,
+        FailureKind::TooLong,
         FailureKind::Truncated,
         FailureKind::Unreadable,
     ];

@@ -1,0 +1,49 @@
+//! Arbitrary bytes through the audio decoder: no panic of ours, no endless stream, finite samples,
+//! no block out of proportion, and the same answer twice.
+//!
+//! A panic inside symphonia is its own; stages catch those.
+#![no_main]
+
+use std::io::Cursor;
+
+use libfuzzer_sys::fuzz_target;
+
+#[path = "../../src/audio"]
+#[allow(dead_code, reason = "this target reaches a part of the modules")]
+mod audio {
+    pub mod decode;
+    pub mod header;
+}
+
+use audio::decode::{DecodeError, Decoder};
+
+/// More than a packet of any codec has: FLAC blocks have 65,535 samples, held Vorbis pages 2^20.
+const MAX_BLOCK: usize = 4 << 20;
+
+/// Counts the samples, and adds them up in a way that their order matters to.
+fn decode(bytes: &[u8]) -> Result<(u64, u64), DecodeError> {
+    let mut decoder = Decoder::open(Cursor::new(bytes), "")?;
+    assert!(decoder.sample_rate_hz() > 0 && decoder.n_channels() > 0);
+    assert!(!decoder.codec().is_empty());
+    let (mut n_samples, mut sum) = (0, 0_u64);
+    let mut block = Vec::new();
+    while decoder.next_block(&mut block)? {
+        assert!(!block.is_empty() && block.len() <= MAX_BLOCK, "{} samples", block.len());
+        assert!(block.iter().all(|x| x.is_finite()));
+        n_samples += block.len() as u64;
+        sum = block.iter().fold(sum, |sum, x| sum.rotate_left(5) ^ u64::from(x.to_bits()));
+        block.clear();
+    }
+    assert!(n_samples > 0 && block.is_empty());
+    Ok((n_samples, sum))
+}
+
+fuzz_target!(|bytes: &[u8]| {
+    let answer = decode(bytes);
+    if let Err(error) = &answer {
+        let message = error.to_string();
+        assert!(message.len() < 1000 && !error.kind().is_empty(), "{message}");
+    }
+    let text = |answer: Result<(u64, u64), DecodeError>| answer.map_err(|e| e.to_string());
+    assert_eq!(text(decode(bytes)), text(answer));
+});

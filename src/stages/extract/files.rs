@@ -1,0 +1,226 @@
+//! Without a store: audio files become feature files.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+
+use anyhow::{Context as _, bail};
+
+use super::one::{Extracted, Origin, extract, needed_bytes};
+use super::pool::{self, Budget, lock};
+use super::{Done, Job};
+use crate::audio::BLOCKS;
+use crate::audio::header::read_header_from;
+use crate::motion::{npy, npz};
+use crate::stages::failure::{Failure, FailureKind};
+use crate::store::{
+    Content, PartWriter, SourceFile, StoreError, replace_file, tables, temporary_beside,
+};
+
+/// Files up to this size are read at once.
+const IN_MEMORY_BYTES: u64 = 16 << 20;
+
+/// Where features go.
+#[derive(Debug)]
+enum Output {
+    /// One `NAME.npz` per file in a folder.
+    Folder(PathBuf),
+    Npz(PathBuf),
+    /// One table of all files.
+    Parquet(PathBuf),
+}
+
+impl Output {
+    fn of(path: &Path, n_files: usize) -> anyhow::Result<Self> {
+        match path.extension().and_then(|e| e.to_str()) {
+            Some("npz") if !path.is_dir() => {
+                if n_files != 1 {
+                    bail!(
+                        "--output {} holds the features of one file, but --audio names {n_files}; \
+                         name a folder, or a .parquet file, which holds any number",
+                        path.display()
+                    );
+                }
+                Ok(Self::Npz(path.to_owned()))
+            }
+            Some("parquet") if !path.is_dir() => Ok(Self::Parquet(path.to_owned())),
+            _ => Ok(Self::Folder(path.to_owned())),
+        }
+    }
+}
+
+struct Task {
+    index: usize,
+    name: String,
+    path: PathBuf,
+    size_bytes: u64,
+    duration_s: f64,
+}
+
+/// Extracts the features of `audio` into `output`.
+///
+/// # Errors
+/// When the output cannot be written, or two files would have one name in it.
+pub fn run(job: &Job<'_>, audio: &[PathBuf], output: &Path) -> anyhow::Result<Done> {
+    let output = Output::of(output, audio.len())?;
+    let tasks = tasks(audio)?;
+    let total_s: f64 = tasks.iter().map(|task| task.duration_s).sum();
+    if job.dry_run {
+        return Ok(Done { n_todo: tasks.len() as u64, todo_s: total_s, ..Done::default() });
+    }
+    let table = match &output {
+        Output::Parquet(path) => Some(Mutex::new(Table::new(path)?)),
+        Output::Folder(folder) => {
+            std::fs::create_dir_all(folder)
+                .with_context(|| format!("while making the folder {}", folder.display()))?;
+            None
+        }
+        Output::Npz(_) => None,
+    };
+    job.progress.start_audio("extract", total_s.ceil() as u64);
+    let done = Mutex::new(Done { n_todo: tasks.len() as u64, todo_s: total_s, ..Done::default() });
+    let budget = Budget::new(job.memory_bytes);
+    let mut queue = tasks.into_iter();
+    pool::run(
+        job.n_workers,
+        || queue.next(),
+        |task| -> anyhow::Result<()> {
+            let outcome = {
+                let _share = budget.take(needed_bytes(task.duration_s, task.size_bytes));
+                let outcome = extract_file(&task, job);
+                if let Ok(extracted) = &outcome {
+                    match &output {
+                        Output::Folder(folder) => {
+                            write_npz(&folder.join(format!("{}.npz", task.name)), extracted)?;
+                        }
+                        Output::Npz(path) => write_npz(path, extracted)?,
+                        Output::Parquet(_) => {}
+                    }
+                }
+                outcome
+            };
+            job.progress.advance(task.duration_s.round() as u64);
+            lock(&done).add(&task.name, &outcome);
+            if let Some(table) = &table {
+                lock(table).add(task.index, &task.name, outcome.ok())?;
+            }
+            Ok(())
+        },
+    )?;
+    job.progress.finish();
+    if let Some(table) = table {
+        table.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner).finish()?;
+    }
+    Ok(done.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner))
+}
+
+fn tasks(audio: &[PathBuf]) -> anyhow::Result<Vec<Task>> {
+    let mut names: BTreeMap<String, &Path> = BTreeMap::new();
+    let mut tasks = Vec::with_capacity(audio.len());
+    for (index, path) in audio.iter().enumerate() {
+        let name = path.file_stem().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+        if let Some(other) = names.insert(name.clone(), path) {
+            bail!(
+                "{} and {} would both be called {name}; extract them into two folders",
+                other.display(),
+                path.display()
+            );
+        }
+        let size_bytes = std::fs::metadata(path).map_or(0, |meta| meta.len());
+        let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default();
+        // Only for the order of things; what is wrong with a file is said when it is decoded.
+        let header = File::open(path).ok().and_then(|f| read_header_from(f, extension).ok());
+        let duration_s = header.map_or(0.0, |header| header.duration_s);
+        tasks.push(Task { index, name, path: path.clone(), size_bytes, duration_s });
+    }
+    Ok(tasks)
+}
+
+fn extract_file(task: &Task, job: &Job<'_>) -> Result<Extracted, Failure> {
+    let path = task.path.display().to_string();
+    let io = |e| StoreError::Io { action: "read", place: path.clone(), source: e };
+    if task.path.is_dir() {
+        let message = format!("{path}: is a folder; name the files in it");
+        return Err(Failure::new(FailureKind::NotAFile, &path, message));
+    }
+    let content = if task.size_bytes <= IN_MEMORY_BYTES {
+        std::fs::read(&task.path).map(|bytes| Content::Bytes(bytes.into())).map_err(io)
+    } else {
+        File::open(&task.path).map(Content::File).map_err(io)
+    };
+    let (size_bytes, fingerprint) = (task.size_bytes, String::new());
+    let file = SourceFile { path: path.clone(), size_bytes, fingerprint };
+    extract(Origin::Audio, &file, content, &job.rules)
+}
+
+/// Writes the reference's keys, and what else a reader may want of the file.
+fn write_npz(path: &Path, extracted: &Extracted) -> anyhow::Result<()> {
+    let n_frames = extracted.frames.nrows();
+    let mut members = Vec::new();
+    let mut first = 0;
+    for block in BLOCKS {
+        let mut values: Vec<f32> = Vec::with_capacity(block.len * n_frames);
+        for column in extracted.frames.columns().into_iter().skip(first).take(block.len) {
+            values.extend(column);
+        }
+        first += block.len;
+        let shape = [block.len, n_frames];
+        let shape = if block.len == 1 { &shape[1..] } else { &shape[..] };
+        members.push((block.name, npy::write(shape, &values)));
+    }
+    let all: Vec<f32> = extracted.frames.columns().into_iter().flatten().copied().collect();
+    members.push(("features", npy::write(&[all.len() / n_frames.max(1), n_frames], &all)));
+    let beat_times_s: Vec<f64> = extracted.beats.iter().map(|beat| beat.1).collect();
+    let beat_frames: Vec<i64> = extracted.beats.iter().map(|beat| beat.0 as i64).collect();
+    members.push(("tempo", npy::write(&[], &[extracted.tempo_bpm.unwrap_or(0.0)])));
+    members.push(("beat_times", npy::write(&[beat_times_s.len()], &beat_times_s)));
+    members.push(("beat_frames", npy::write(&[beat_frames.len()], &beat_frames)));
+    if let Some(heard) = extracted.audio {
+        members.push(("tuning", npy::write(&[], &[heard.tuning.bins()])));
+        members.push(("n_samples", npy::write(&[], &[heard.n_samples as i64])));
+    }
+    let write = || -> std::io::Result<()> {
+        let mut file = temporary_beside(&std::path::absolute(path)?)?;
+        npz::write(BufWriter::new(file.as_file_mut()), &members)?;
+        replace_file(path, file)
+    };
+    write().with_context(|| format!("while writing {}", path.display()))
+}
+
+/// A Parquet file of all files' frames, in the order of the command line.
+struct Table {
+    path: PathBuf,
+    writer: PartWriter,
+    /// Files that were done before one that comes earlier.
+    waiting: BTreeMap<usize, (String, Option<Extracted>)>,
+    n_written: usize,
+}
+
+impl Table {
+    fn new(path: &Path) -> anyhow::Result<Self> {
+        let file = std::path::absolute(path)
+            .and_then(|path| temporary_beside(&path))
+            .with_context(|| format!("while writing {}", path.display()))?;
+        let writer = PartWriter::new(tables::features(), file)?;
+        Ok(Self { path: path.to_owned(), writer, waiting: BTreeMap::new(), n_written: 0 })
+    }
+
+    fn add(&mut self, index: usize, name: &str, done: Option<Extracted>) -> Result<(), StoreError> {
+        self.waiting.insert(index, (name.to_owned(), done));
+        while let Some((name, done)) = self.waiting.remove(&self.n_written) {
+            if let Some(extracted) = done {
+                self.writer.write_frames(&name, extracted.frames.view())?;
+            }
+            self.n_written += 1;
+        }
+        Ok(())
+    }
+
+    fn finish(self) -> anyhow::Result<()> {
+        let finished = self.writer.finish(&[])?;
+        replace_file(&self.path, finished.file)
+            .with_context(|| format!("while writing {}", self.path.display()))
+    }
+}

@@ -1,0 +1,265 @@
+//! `extract`: audio becomes the tables `features`, `extractions` and `beats`, or feature files.
+
+mod files;
+mod one;
+mod phrases;
+mod pool;
+
+use std::io::{self, Write};
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use super::failure::Failure;
+use super::{ClientParams, Contract, Progress, Stage, Summary};
+use crate::audio::Tuning;
+use crate::store::{Location, Shard, digest};
+
+pub use one::{Extracted, Rules};
+
+/// Raised when extract writes something else for the same input and parameters.
+const OUTPUT_VERSION: u32 = 1;
+
+/// Files and failures that the summary spells out.
+const N_SHOWN: usize = 10;
+
+/// The stage.
+pub struct Extract;
+
+/// What the user asks for.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Params {
+    /// Folder or bucket of the tables: extracts every phrase that has audio (or a feature file) and
+    /// no current features.
+    #[arg(long, value_name = "URL", required_unless_present = "audio", conflicts_with = "audio")]
+    pub store: Option<String>,
+    /// Audio files to extract without a store (WAV, AIFF, FLAC, MP3, Ogg Vorbis, M4A or AAC).
+    #[arg(long, value_name = "FILE", num_args = 1.., requires = "output")]
+    pub audio: Vec<PathBuf>,
+    /// With --audio: FILE.npz for one file, FILE.parquet for any number in one table, or a folder for
+    /// one NAME.npz each.
+    #[arg(long, value_name = "FILE|DIR", requires = "audio")]
+    pub output: Option<PathBuf>,
+    /// Deviation from A440 in bins of 1/36 octave, from -0.5 to below 0.5, instead of the estimate.
+    #[arg(long, value_name = "BINS", allow_hyphen_values = true)]
+    pub tuning: Option<Tuning>,
+    /// Part of the job that this process does: i/n, or auto inside an array job.
+    #[arg(long, value_name = "I/N", default_value_t = Shard::WHOLE.to_string())]
+    pub shard: String,
+    /// Files under way at once.
+    #[arg(long, value_name = "N", default_value_t = default_workers())]
+    pub workers: NonZeroUsize,
+    /// Memory that the files under way may take, in GB (10^9 bytes); a file that needs more is done
+    /// alone.
+    #[arg(long, value_name = "GB", default_value_t = 2.0)]
+    pub memory: f64,
+    /// Longest time for one file, in seconds; then it counts as failed.
+    #[arg(long, value_name = "S", default_value_t = 900.0)]
+    pub timeout: f64,
+    /// Longest audio of one file, in seconds; a longer one counts as failed.
+    #[arg(long, value_name = "S", default_value_t = 24.0 * 3600.0)]
+    pub max_duration: f64,
+    #[command(flatten)]
+    pub client: ClientParams,
+    /// Say what would be done, and do nothing.
+    #[arg(long)]
+    pub dry_run: bool,
+    /// Do every phrase again, done or not.
+    #[arg(long)]
+    pub force: bool,
+}
+
+fn default_workers() -> NonZeroUsize {
+    std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN)
+}
+
+/// What both ways of running share.
+struct Job<'a> {
+    rules: Rules,
+    n_workers: NonZeroUsize,
+    memory_bytes: u64,
+    dry_run: bool,
+    progress: &'a dyn Progress,
+}
+
+impl Stage for Extract {
+    const NAME: &'static str = "extract";
+    const ABOUT: &'static str = "extract the 163 audio features and the beats";
+    const CONTRACT: Contract = Contract {
+        reads: "phrases and their audio, or audio files",
+        writes: "features, extractions, beats, failures, or feature files",
+    };
+    type Params = Params;
+
+    fn run(params: Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
+        let started = Instant::now();
+        let positive = |flag: &str, value: f64| {
+            if value > 0.0 {
+                return Ok(value);
+            }
+            Err(anyhow::anyhow!("{flag} {value} is not above 0; give a positive number"))
+        };
+        let timeout_s = positive("--timeout", params.timeout)?;
+        let job = Job {
+            rules: Rules {
+                tuning: params.tuning,
+                max_duration_s: positive("--max-duration", params.max_duration)?,
+                timeout: Duration::try_from_secs_f64(timeout_s).unwrap_or(Duration::MAX),
+            },
+            n_workers: params.workers,
+            memory_bytes: (positive("--memory", params.memory)? * 1e9) as u64,
+            dry_run: params.dry_run,
+            progress,
+        };
+        let (place, done) = match (&params.store, &params.output) {
+            (Some(store), _) => {
+                let options = params.client.options();
+                let store = Location::open(store, &options)?;
+                let target = phrases::Target {
+                    store: &store,
+                    options,
+                    shard: Shard::parse(&params.shard, |name| std::env::var(name).ok())?,
+                    params_hash: &params_hash(params.tuning),
+                    force: params.force,
+                };
+                (Place::Store(store.to_string()), phrases::run(&job, &target)?)
+            }
+            (None, Some(output)) => {
+                let done = files::run(&job, &params.audio, output)?;
+                (Place::Files(output.display().to_string()), done)
+            }
+            (None, None) => anyhow::bail!("nothing to do: give --store, or --audio with --output"),
+        };
+        let took_s = started.elapsed().as_secs_f64();
+        Ok(Box::new(Report { place, done, dry_run: params.dry_run, took_s }))
+    }
+}
+
+/// Returns the digest of everything but the input that determines extract's output.
+fn params_hash(tuning: Option<Tuning>) -> String {
+    let tuning = tuning.map(Tuning::bins);
+    let text = serde_json::json!({ "output_version": OUTPUT_VERSION, "tuning": tuning });
+    digest(text.to_string().as_bytes())
+}
+
+/// What became of the files.
+#[derive(Debug, Default)]
+struct Done {
+    n_todo: u64,
+    todo_s: f64,
+    n_unchanged: u64,
+    /// Phrases with neither audio nor a feature file.
+    n_without: u64,
+    n_frames: u64,
+    duration_s: f64,
+    n_imported: u64,
+    /// One line on each of the first files that were done.
+    told: Vec<String>,
+    n_done: u64,
+    failed: Vec<(String, Failure)>,
+}
+
+impl Done {
+    fn add(&mut self, name: &str, outcome: &Result<Extracted, Failure>) {
+        match outcome {
+            Ok(extracted) => {
+                self.n_done += 1;
+                self.n_frames += extracted.frames.nrows() as u64;
+                self.duration_s += extracted.duration_s();
+                self.n_imported += u64::from(extracted.audio.is_none());
+                if self.told.len() <= N_SHOWN {
+                    self.told.push(told(name, extracted));
+                }
+            }
+            Err(failure) => self.failed.push((name.to_owned(), failure.clone())),
+        }
+    }
+}
+
+fn told(name: &str, extracted: &Extracted) -> String {
+    let tempo = match extracted.tempo_bpm {
+        Some(bpm) => format!("{bpm:.1} bpm, {} beats", extracted.beats.len()),
+        None => "no tempo".to_owned(),
+    };
+    let tuning = extracted
+        .audio
+        .map_or(String::new(), |heard| format!(", tuning {:+.2}/36 octave", heard.tuning.bins()));
+    let (n_frames, duration_s) = (extracted.frames.nrows(), extracted.duration_s());
+    format!("{name}: {duration_s:.1} s, {n_frames} frames, {tempo}{tuning}")
+}
+
+enum Place {
+    Store(String),
+    Files(String),
+}
+
+struct Report {
+    place: Place,
+    done: Done,
+    dry_run: bool,
+    took_s: f64,
+}
+
+impl Summary for Report {
+    fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
+        let Report { place, done, took_s, .. } = self;
+        let (Place::Store(name) | Place::Files(name)) = &*place;
+        let items = if matches!(place, Place::Store(_)) { "phrases" } else { "files" };
+        writeln!(out, "extract → {name}")?;
+        if self.dry_run {
+            let Done { n_todo, todo_s, n_unchanged, .. } = done;
+            writeln!(
+                out,
+                "  would extract {n_todo} {items} ({todo_s:.1} s of audio), leave {n_unchanged} as \
+                 they are"
+            )?;
+            return Ok(());
+        }
+        done.failed.sort_by(|a, b| a.0.cmp(&b.0));
+        let n_failed = done.failed.len();
+        if done.n_todo == 0 {
+            writeln!(out, "  nothing to do: {} {items} are up to date", done.n_unchanged)?;
+        } else {
+            writeln!(
+                out,
+                "  {} {items} extracted ({:.1} s, {} frames), {} up to date, {n_failed} failed; \
+                 {took_s:.1} s, {:.0} × real time",
+                done.n_done,
+                done.duration_s,
+                done.n_frames,
+                done.n_unchanged,
+                done.duration_s / took_s.max(1e-9)
+            )?;
+        }
+        if done.n_imported > 0 {
+            writeln!(out, "  {} of them brought in from feature files", done.n_imported)?;
+        }
+        if done.n_without > 0 {
+            writeln!(out, "  {} phrases have neither audio nor features", done.n_without)?;
+        }
+        if done.told.len() <= N_SHOWN && matches!(place, Place::Files(_)) {
+            done.told.sort();
+            for line in &done.told {
+                writeln!(out, "  {line}")?;
+            }
+        }
+        for (name, failure) in done.failed.iter().take(N_SHOWN) {
+            writeln!(out, "  failed [{}] {name}: {}", failure.kind.name(), failure.message)?;
+        }
+        if n_failed > N_SHOWN {
+            writeln!(out, "  … and {} more", n_failed - N_SHOWN)?;
+        }
+        if let (Place::Store(store), true) = (&*place, n_failed > 0) {
+            writeln!(
+                out,
+                "  all of them: motiongen query --store {store} \
+                 \"select phrase_id, kind, message from failures\""
+            )?;
+        }
+        Ok(())
+    }
+
+    fn n_failed(&self) -> u64 {
+        self.done.failed.len() as u64
+    }
+}

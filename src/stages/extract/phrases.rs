@@ -1,0 +1,358 @@
+//! With a store: the phrases that have no current features get them, batch by batch.
+//!
+//! As in ingest, a batch is a range of the phrases' stable hash, cut by the table of phrases alone:
+//! whoever does it, whenever, writes the same bytes under the same name. Files of a batch are done
+//! side by side, the longest first, and the batch is committed when its last file is done.
+
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::sync::Mutex;
+
+use super::one::{Extracted, Origin, extract, needed_bytes};
+use super::pool::{self, Budget, lock};
+use super::{Done, Extract, Job};
+use crate::stages::Stage as _;
+use crate::stages::failure::{Failure, FailureKind};
+use crate::store::tables::{self, BeatRow, ExtractionRow, FailureRow, PhraseRow};
+use crate::store::{
+    ClientOptions, Commit, Content, InOrder, Item, Ledger, Location, Row as _, Shard, Snapshot,
+    Source, SourceFile, StoreError, TimestampUs, batch_of,
+};
+
+/// Where the items of this stage come from, as its commits name it.
+const ITEMS_FROM: &str = "phrases";
+/// Most audio in a batch, about: what a kill can cost, and what waits in memory to be written.
+const MAX_BATCH_S: f64 = 1800.0;
+/// Most phrases in a batch, about.
+const MAX_BATCH_PHRASES: usize = 512;
+
+/// The store and what is asked of it.
+pub struct Target<'a> {
+    pub store: &'a Location,
+    pub options: ClientOptions,
+    pub shard: Shard,
+    pub params_hash: &'a str,
+    pub force: bool,
+}
+
+/// A phrase to be done.
+struct Task {
+    batch: usize,
+    row: PhraseRow,
+    origin: Origin,
+    url: String,
+    size_bytes: u64,
+}
+
+type Outcome = Result<Extracted, Failure>;
+
+/// A batch under way.
+struct Batch {
+    n_missing: usize,
+    outcomes: BTreeMap<String, (Task, Outcome)>,
+}
+
+/// Extracts the features of every phrase of `target` that lacks them.
+///
+/// # Errors
+/// When the store cannot be read or written; what was committed stays.
+pub fn run(job: &Job<'_>, target: &Target<'_>) -> anyhow::Result<Done> {
+    let rows: Vec<PhraseRow> = Snapshot::take(target.store, PhraseRow::schema())?.rows()?;
+    if rows.is_empty() {
+        anyhow::bail!(
+            "store {} has no phrases; run first: motiongen ingest --source … --store {}",
+            target.store,
+            target.store
+        );
+    }
+    let ledger = Ledger::read(target.store, Extract::NAME)?;
+    let names: BTreeSet<String> = rows.iter().map(|row| row.phrase_id.clone()).collect();
+    let n_phrases = rows.len() as u64;
+    let mut tasks = plan(rows);
+    let mut done = Done { n_without: n_phrases - tasks.len() as u64, ..Done::default() };
+    tasks.retain(|task| target.shard.takes(&task.row.phrase_id));
+    let n_mine = tasks.len();
+    tasks.retain(|task| target.force || !is_settled(task, &ledger, target.params_hash));
+    done.n_unchanged = (n_mine - tasks.len()) as u64;
+    done.n_todo = tasks.len() as u64;
+    done.todo_s = tasks.iter().map(|task| task.row.duration_s).sum();
+    if job.dry_run {
+        return Ok(done);
+    }
+    target.store.sweep()?;
+    job.progress.start_audio("extract", done.todo_s.ceil() as u64);
+    let writer = Writer { target, ledger: &ledger };
+    let done = Mutex::new(done);
+    work_off(job, target, tasks, &writer, &done)?;
+    writer.forget_failures(&names)?;
+    job.progress.finish();
+    Ok(done.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner))
+}
+
+/// Returns the phrases that can have features, with their batches.
+fn plan(rows: Vec<PhraseRow>) -> Vec<Task> {
+    let with_input = |row: PhraseRow| {
+        let input = match (&row.audio_url, &row.features_url) {
+            (Some(url), _) => Some((Origin::Audio, url.clone(), row.audio_bytes)),
+            (None, Some(url)) => Some((Origin::FeatureFile, url.clone(), row.features_bytes)),
+            (None, None) => None,
+        };
+        let (origin, url, size_bytes) = input?;
+        let size_bytes = size_bytes.and_then(|n| u64::try_from(n).ok()).unwrap_or(0);
+        Some(Task { batch: 0, row, origin, url, size_bytes })
+    };
+    let mut tasks: Vec<Task> = rows.into_iter().filter_map(with_input).collect();
+    let total_s: f64 = tasks.iter().map(|task| task.row.duration_s).sum();
+    let by_length = (total_s / MAX_BATCH_S).ceil() as u64;
+    let by_count = tasks.len().div_ceil(MAX_BATCH_PHRASES) as u64;
+    // A power of two, so that shards in powers of two hold whole batches.
+    let n_batches = by_length.max(by_count).max(1).next_power_of_two();
+    for task in &mut tasks {
+        task.batch = batch_of(&task.row.phrase_id, n_batches) as usize;
+    }
+    let size = |task: &Task| (task.row.duration_s * 1e3) as u64;
+    tasks.sort_by(|a, b| {
+        (a.batch, Reverse(size(a)), &a.row.phrase_id).cmp(&(
+            b.batch,
+            Reverse(size(b)),
+            &b.row.phrase_id,
+        ))
+    });
+    tasks
+}
+
+/// Returns whether the store has the phrase's features for this content and these parameters.
+fn is_settled(task: &Task, ledger: &Ledger, params_hash: &str) -> bool {
+    let id = &task.row.phrase_id;
+    let is_refused = ledger.get(&beside(id)).is_some_and(|known| known.item.failure.is_some());
+    !is_refused
+        && ledger.get(id).is_some_and(|known| {
+            known.params_hash == params_hash
+                && known.item.succeeded()
+                && known.item.input_hash == task.row.content_hash
+        })
+}
+
+/// The name under which a phrase fails whose earlier rows stay.
+fn beside(id: &str) -> String {
+    format!("{id} @ {}", Extract::NAME)
+}
+
+fn work_off(
+    job: &Job<'_>,
+    target: &Target<'_>,
+    tasks: Vec<Task>,
+    writer: &Writer<'_>,
+    done: &Mutex<Done>,
+) -> anyhow::Result<()> {
+    let mut batches: HashMap<usize, Batch> = HashMap::new();
+    for task in &tasks {
+        let empty = || Batch { n_missing: 0, outcomes: BTreeMap::new() };
+        batches.entry(task.batch).or_insert_with(empty).n_missing += 1;
+    }
+    let batches = Mutex::new(batches);
+    let budget = Budget::new(job.memory_bytes);
+    let mut inputs = Inputs::open(&tasks, &target.options);
+    let mut queue = tasks.into_iter();
+    pool::run(
+        job.n_workers,
+        || {
+            let task = queue.next()?;
+            let input = inputs.next(&task);
+            Some((task, input))
+        },
+        |(task, input): (Task, Input)| -> anyhow::Result<()> {
+            let Input { file, content, _permit } = input;
+            let outcome = {
+                let _share = budget.take(needed_bytes(task.row.duration_s, task.size_bytes));
+                extract(task.origin, &file, content, &job.rules)
+            };
+            job.progress.advance(task.row.duration_s.round() as u64);
+            lock(done).add(&task.row.phrase_id, &outcome);
+            let number = task.batch;
+            let finished = {
+                let mut batches = lock(&batches);
+                let Some(batch) = batches.get_mut(&number) else { return Ok(()) };
+                batch.outcomes.insert(task.row.phrase_id.clone(), (task, outcome));
+                batch.n_missing -= 1;
+                if batch.n_missing == 0 { batches.remove(&number) } else { None }
+            };
+            if let Some(batch) = finished {
+                writer.commit(batch)?;
+            }
+            Ok(())
+        },
+    )
+}
+
+/// The files of the tasks, read in the tasks' order.
+struct Inputs {
+    sources: HashMap<String, Result<(Source, InOrder), String>>,
+}
+
+struct Input {
+    file: SourceFile,
+    content: Result<Content, StoreError>,
+    /// The read-ahead budget of the file, given back when the phrase is done.
+    _permit: Option<Box<dyn Send>>,
+}
+
+impl Inputs {
+    fn open(tasks: &[Task], options: &ClientOptions) -> Self {
+        let mut files: BTreeMap<&str, Vec<&Task>> = BTreeMap::new();
+        for task in tasks {
+            files.entry(&task.row.source).or_default().push(task);
+        }
+        let open = |url: &str, tasks: Vec<&Task>| {
+            let source = Source::open(url, options, None).map_err(|e| e.to_string())?;
+            let wanted = tasks.iter().filter_map(|task| Self::file(&source, task)).collect();
+            let reader = source.read_in_order(wanted);
+            Ok((source, reader))
+        };
+        let sources = files.into_iter().map(|(url, tasks)| (url.to_owned(), open(url, tasks)));
+        Self { sources: sources.collect() }
+    }
+
+    fn file(source: &Source, task: &Task) -> Option<SourceFile> {
+        source.recorded(&task.url, task.size_bytes, &task.row.content_hash)
+    }
+
+    fn next(&mut self, task: &Task) -> Input {
+        let missing = |hint| StoreError::NotFound { place: task.url.clone(), hint };
+        let unknown = SourceFile {
+            path: task.url.clone(),
+            size_bytes: task.size_bytes,
+            fingerprint: String::new(),
+        };
+        let found = match self.sources.get_mut(&task.row.source) {
+            Some(Ok((source, reader))) => {
+                Self::file(source, task).and_then(|file| Some((file, reader.next()?)))
+            }
+            Some(Err(_)) | None => None,
+        };
+        match found {
+            Some((file, (content, permit))) => {
+                let permit = permit.map(|permit| Box::new(permit) as Box<dyn Send>);
+                Input { file, content, _permit: permit }
+            }
+            None => Input { file: unknown, content: Err(missing("")), _permit: None },
+        }
+    }
+}
+
+/// Writes finished batches.
+struct Writer<'a> {
+    target: &'a Target<'a>,
+    ledger: &'a Ledger,
+}
+
+impl Writer<'_> {
+    fn start(&self) -> Commit<'_> {
+        Commit::new(self.target.store, Extract::NAME, self.target.params_hash, ITEMS_FROM)
+    }
+
+    fn commit(&self, batch: Batch) -> Result<(), StoreError> {
+        let mut commit = self.start();
+        let (mut extractions, mut beats, mut failures) = (Vec::new(), Vec::new(), Vec::new());
+        for (id, (task, outcome)) in batch.outcomes {
+            let id = self.name_for(id, &outcome, &mut commit);
+            let failure = outcome.as_ref().err().map(Failure::digest);
+            let input_hash = task.row.content_hash.clone();
+            let unchanged = self.ledger.get(&id).is_some_and(|known| {
+                known.params_hash == self.target.params_hash
+                    && known.item.input_hash == input_hash
+                    && known.item.failure == failure
+            });
+            if unchanged && !(self.target.force && failure.is_none()) {
+                continue;
+            }
+            match outcome {
+                Ok(extracted) => {
+                    let part = commit.part(tables::FEATURES, tables::features)?;
+                    part.write_frames(&id, extracted.frames.view())?;
+                    extractions.push(extraction_row(&id, &task, &extracted));
+                    beats.extend(beat_rows(&id, &extracted));
+                }
+                Err(failure) => failures.push(FailureRow {
+                    stage: Extract::NAME.to_owned(),
+                    phrase_id: id.clone(),
+                    source: task.url,
+                    kind: failure.kind.name().to_owned(),
+                    message: failure.message,
+                    time: TimestampUs::now(),
+                }),
+            }
+            let fingerprint = input_hash.clone();
+            commit.settle(Item { id, fingerprint, input_hash, failure }, self.ledger);
+        }
+        if !extractions.is_empty() {
+            let schema = ExtractionRow::schema;
+            commit.part(schema().name, schema)?.write_rows(&extractions)?;
+        }
+        if !beats.is_empty() {
+            commit.part(BeatRow::schema().name, BeatRow::schema)?.write_rows(&beats)?;
+        }
+        if !failures.is_empty() {
+            failures.sort_by(|a, b| a.phrase_id.cmp(&b.phrase_id));
+            commit.part(FailureRow::schema().name, FailureRow::schema)?.write_rows(&failures)?;
+        }
+        if commit.is_empty() { Ok(()) } else { commit.publish().map(|_| ()) }
+    }
+
+    /// Returns the name to settle: the phrase's own, or one beside it when a file that cannot be
+    /// read just now says nothing against the rows that are there.
+    fn name_for(&self, id: String, outcome: &Outcome, commit: &mut Commit<'_>) -> String {
+        let beside = beside(&id);
+        let has_rows = self.ledger.get(&id).is_some_and(|known| known.item.succeeded());
+        let is_out_of_reach =
+            outcome.as_ref().is_err_and(|failure| failure.kind == FailureKind::Unreadable);
+        if is_out_of_reach && has_rows {
+            return beside;
+        }
+        if self.ledger.get(&beside).is_some_and(|known| known.item.failure.is_some()) {
+            commit.settle(Item::forgotten(&beside), self.ledger);
+        }
+        id
+    }
+
+    /// Removes the failures of phrases that the table of phrases no longer has.
+    fn forget_failures(&self, names: &BTreeSet<String>) -> Result<(), StoreError> {
+        let mut commit = self.start();
+        let suffix = beside("");
+        for id in self.ledger.failed(ITEMS_FROM) {
+            let phrase = id.strip_suffix(&suffix).unwrap_or(id);
+            if !names.contains(phrase) && self.target.shard.takes(phrase) {
+                commit.settle(Item::forgotten(id), self.ledger);
+            }
+        }
+        if commit.is_empty() { Ok(()) } else { commit.publish().map(|_| ()) }
+    }
+}
+
+fn extraction_row(id: &str, task: &Task, extracted: &Extracted) -> ExtractionRow {
+    let heard = extracted.audio;
+    ExtractionRow {
+        phrase_id: id.to_owned(),
+        origin: extracted.origin.name().to_owned(),
+        source_url: task.url.clone(),
+        n_frames: extracted.frames.nrows() as i64,
+        n_samples: heard.map(|h| h.n_samples as i64),
+        duration_s: extracted.duration_s(),
+        tuning: heard.map(|h| h.tuning.bins()),
+        tuning_source: heard.map(|h| h.tuning_source.to_owned()),
+        tempo_bpm: extracted.tempo_bpm,
+        n_beats: extracted.beats.len() as i32,
+        audio_codec: heard.map(|h| h.encoding.codec.to_owned()),
+        sample_rate_hz: heard.map(|h| h.encoding.sample_rate_hz as i32),
+        n_channels: heard.map(|h| i32::from(h.encoding.n_channels)),
+    }
+}
+
+fn beat_rows<'a>(id: &'a str, extracted: &'a Extracted) -> impl Iterator<Item = BeatRow> + 'a {
+    extracted.beats.iter().enumerate().map(|(beat, &(frame, time_s))| BeatRow {
+        phrase_id: id.to_owned(),
+        beat: beat as i32,
+        frame: frame as i32,
+        time_s,
+    })
+}
