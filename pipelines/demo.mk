@@ -1,4 +1,5 @@
-# The demo: real music and real motion capture (tests/data) become tables, and queries answer.
+# The demo: real music and real motion capture (tests/data) become tables, the music's features are
+# extracted, and queries answer.
 #
 #   make demo                              builds first
 #   make -f pipelines/demo.mk BIN=…        with executables that are there already
@@ -28,6 +29,11 @@ INGESTED := $(SOURCES:%=$(STAMPS)/ingest-%.done)
 $(INGESTED): $(STAMPS)/ingest-%.done: $(STAMPS)/%.list $(CONFIG) $(MOTIONGEN)
 	$(call stage,$(MOTIONGEN) ingest --config $(CONFIG) --source $(DATA)/$* --store $(STORE))
 
+# extract: the audio features of every song.
+EXTRACTED := $(STAMPS)/extract.done
+$(EXTRACTED): $(INGESTED) $(CONFIG) $(MOTIONGEN)
+	$(call stage,$(MOTIONGEN) extract --config $(CONFIG) --store $(STORE))
+
 # query: what the tables tell.
 define SPLITS
 select split, count(*) as phrases, round(sum(duration_s), 1) as seconds
@@ -43,6 +49,12 @@ round(avg(sqrt(velocity_x * velocity_x + velocity_y * velocity_y + velocity_z * 
 as mean_speed_m_per_s
 from motion group by phrase_id order by mean_speed_m_per_s desc, phrase_id
 endef
+define LOUDNESS
+select e.phrase_id, round(e.tempo_bpm, 1) as tempo_bpm, e.n_beats, round(avg(f.rms), 3) as mean_rms,
+round(avg(f.onset_strength), 3) as mean_onset_strength, round(avg(f.spectral_centroid), 3) as mean_centroid
+from extractions e join features f on e.phrase_id = f.phrase_id
+group by e.phrase_id, e.tempo_bpm, e.n_beats order by e.phrase_id
+endef
 # Lines become spaces on the way to the shell.
 define newline
 
@@ -52,10 +64,11 @@ comma := ,
 ask = @{ echo; echo '$(1)'; $(MOTIONGEN) query --config $(CONFIG) --store $(STORE) \
 	'$(subst $(newline), ,$($(2)))'; } | tee --append $@.new
 
-$(ANSWERS): $(INGESTED)
+$(ANSWERS): $(INGESTED) $(EXTRACTED)
 	@rm -f $@.new
 	@{ echo; echo 'What is there?'; $(MOTIONGEN) query --store $(STORE) --tables; } | tee $@.new
 	$(call ask,How much is in each split?,SPLITS)
 	$(call ask,Which songs are the longest$(comma) and what is their tempo?,LONGEST_SONGS)
 	$(call ask,How fast does each capture move?,SPEEDS)
+	$(call ask,What do the songs sound like?,LOUDNESS)
 	@mv $@.new $@

@@ -8,14 +8,15 @@ use std::io::Cursor;
 
 use libfuzzer_sys::fuzz_target;
 
-#[path = "../../src/audio"]
-#[allow(dead_code, reason = "this target reaches a part of the modules")]
-mod audio {
-    pub mod decode;
-    pub mod header;
-}
+#[path = "../../src/audio/mod.rs"]
+#[allow(dead_code, unused_imports, reason = "this target reaches a part of the modules")]
+mod audio;
+#[path = "../../src/units.rs"]
+#[allow(dead_code, reason = "this target reaches a part of the module")]
+mod units;
 
 use audio::decode::{DecodeError, Decoder};
+use audio::recording::{Options, Recording};
 
 /// More than a packet of any codec has: FLAC blocks have 65,535 samples, held Vorbis pages 2^20.
 const MAX_BLOCK: usize = 4 << 20;
@@ -38,7 +39,27 @@ fn decode(bytes: &[u8]) -> Result<(u64, u64), DecodeError> {
     Ok((n_samples, sum))
 }
 
+/// Longest audio that goes on to features, in seconds: longer inputs say nothing new.
+const MAX_DURATION_S: f64 = 2.0;
+
+/// Extracts the features, holding all samples or none, which must not matter.
+fn features(bytes: &[u8], max_held_samples: usize) -> Result<Vec<f32>, String> {
+    let options = Options {
+        tuning: None,
+        max_duration_s: MAX_DURATION_S,
+        is_late: &|| false,
+        max_held_samples,
+    };
+    let recording = Recording::analyse(|| Ok(Cursor::new(bytes)), "", &options);
+    let features = recording.map_err(|e| e.to_string())?.raw.normalize();
+    assert_eq!(features.frames.nrows() as u64, 1 + features.n_samples / 1470);
+    let frames: Vec<f32> = features.frames.iter().copied().collect();
+    assert!(frames.iter().all(|x| x.is_finite()));
+    Ok(frames)
+}
+
 fuzz_target!(|bytes: &[u8]| {
+    assert_eq!(features(bytes, usize::MAX), features(bytes, 0));
     let answer = decode(bytes);
     if let Err(error) = &answer {
         let message = error.to_string();

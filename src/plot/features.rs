@@ -7,7 +7,7 @@ use super::page::{self, Page};
 use super::panel::{FEATURE_DIM, N_MEL, Panel};
 use super::scene::{Rect, Scene};
 use super::style::MARGIN_PX;
-use super::{Format, PlotError, heatmap, write};
+use super::{Format, Picture, PlotError, heatmap, write};
 
 /// Features of a file, or of an excerpt, and what is known of its beats.
 #[derive(Clone, Copy, Debug)]
@@ -28,8 +28,8 @@ pub struct FeaturesPlot<'a> {
 }
 
 /// Widths in CSS pixels that a plot can have.
-const MIN_WIDTH_PX: u32 = 320;
-const MAX_WIDTH_PX: u32 = 8192;
+pub const MIN_WIDTH_PX: u32 = 320;
+pub const MAX_WIDTH_PX: u32 = 8192;
 /// Times on which the axis stays exact.
 const MAX_START_S: f64 = 1e7;
 
@@ -47,7 +47,7 @@ pub fn features(
     panels: &[Panel],
     width_px: u32,
     format: Format,
-) -> Result<Vec<u8>, PlotError> {
+) -> Result<Picture, PlotError> {
     write(&scene(plot, panels, width_px)?, format)
 }
 

@@ -23,7 +23,7 @@ mod svg;
 mod tests;
 
 pub use error::PlotError;
-pub use features::{FeaturesPlot, features};
+pub use features::{FeaturesPlot, MAX_WIDTH_PX, MIN_WIDTH_PX, features};
 pub use panel::Panel;
 
 /// The file formats of a plot.
@@ -46,10 +46,22 @@ impl Format {
     }
 }
 
+/// A finished plot.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Picture {
+    /// The file.
+    pub bytes: Vec<u8>,
+    /// Size in pixels: of the device for PNG, of CSS for SVG.
+    pub width_px: u32,
+    pub height_px: u32,
+}
+
 /// Writes a scene in a format.
-fn write(scene: &scene::Scene, format: Format) -> Result<Vec<u8>, PlotError> {
-    match format {
-        Format::Png => raster::write(scene),
-        Format::Svg => svg::write(scene),
-    }
+fn write(scene: &scene::Scene, format: Format) -> Result<Picture, PlotError> {
+    let (bytes, scale) = match format {
+        Format::Png => (raster::write(scene)?, style::SCALE),
+        Format::Svg => (svg::write(scene)?, 1),
+    };
+    let side = |css_px: f64| (css_px * f64::from(scale)).round() as u32;
+    Ok(Picture { bytes, width_px: side(scene.width_px), height_px: side(scene.height_px) })
 }

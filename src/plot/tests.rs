@@ -111,8 +111,9 @@ fn the_png_has_the_page_at_two_pixels_for_one() {
     let plot = plot(values.view(), &[], &mel_hz);
     for width_px in [333, 1000] {
         let scene = scene(&plot, &Panel::ALL, width_px).unwrap();
-        let bytes = features(&plot, &Panel::ALL, width_px, Format::Png).unwrap();
-        let (width, height, pixels) = decode(&bytes);
+        let picture = features(&plot, &Panel::ALL, width_px, Format::Png).unwrap();
+        let (width, height, pixels) = decode(&picture.bytes);
+        assert_eq!((picture.width_px as usize, picture.height_px as usize), (width, height));
         assert_eq!((width, height), (2 * width_px as usize, (2.0 * scene.height_px) as usize));
         assert_eq!(pixels[..3], [255; 3], "the corner is paper");
     }
@@ -126,7 +127,8 @@ fn a_bright_cell_is_where_its_band_and_frame_are() {
     values[[3, 127]] = f32::NAN;
     let plot = plot(values.view(), &[], &mel_hz);
     let map = images(&scene(&plot, &[Panel::Mel], 800).unwrap())[0];
-    let (width, _, pixels) = decode(&features(&plot, &[Panel::Mel], 800, Format::Png).unwrap());
+    let (width, _, pixels) =
+        decode(&features(&plot, &[Panel::Mel], 800, Format::Png).unwrap().bytes);
     let color = |frame: f64, band: f64| {
         let x = 2.0 * (map.left + (frame + 0.5) / 10.0 * map.width);
         let y = 2.0 * (map.bottom() - (band + 0.5) / 128.0 * map.height);
@@ -159,7 +161,8 @@ fn beats_are_lines_over_the_onset_panel() {
     let values = Array2::zeros((31, FEATURE_DIM));
     let plot = plot(values.view(), &beats, &mel_hz);
     let panels = [Panel::OnsetStrength];
-    let (width, height, pixels) = decode(&features(&plot, &panels, 500, Format::Png).unwrap());
+    let (width, height, pixels) =
+        decode(&features(&plot, &panels, 500, Format::Png).unwrap().bytes);
     // Half a second is frame 15 of 31: the middle of the panel.
     let is_beat = |x: usize| pixels[3 * (height / 2 * width + x)..][..3] == style::VERMILLION;
     let found: Vec<_> = (0..width).filter(|&x| is_beat(x)).collect();
@@ -175,8 +178,9 @@ fn the_svg_has_its_labels_and_stays_small() {
     let values = values(241);
     let mut plot = plot(values.view(), &beats, &mel_hz);
     plot.title = "Tom & Jerry <live>";
-    let bytes = features(&plot, &Panel::ALL, 1000, Format::Svg).unwrap();
-    let svg = String::from_utf8(bytes).unwrap();
+    let picture = features(&plot, &Panel::ALL, 1000, Format::Svg).unwrap();
+    assert_eq!(picture.width_px, 1000);
+    let svg = String::from_utf8(picture.bytes).unwrap();
     let wanted = [
         "<title>Tom &amp; Jerry &lt;live&gt;</title>",
         ">Tom &amp; Jerry &lt;live&gt;</text>",
@@ -213,12 +217,12 @@ fn two_hours_are_brought_to_the_width_of_the_page() {
     let (values, mel_hz) = (values(216_000), mel_hz());
     let beats: Vec<f64> = (0..14_400).map(|i| f64::from(i) * 0.5).collect();
     let plot = plot(values.view(), &beats, &mel_hz);
-    let svg = features(&plot, &Panel::ALL, 1000, Format::Svg).unwrap();
+    let svg = features(&plot, &Panel::ALL, 1000, Format::Svg).unwrap().bytes;
     assert!(svg.len() < 1_000_000, "{} bytes", svg.len());
     let svg = String::from_utf8(svg).unwrap();
     assert!(svg.contains(">14400 beats, too close to draw<"));
     assert!(svg.contains(">columns: means of "), "the plot does not say that it shows means");
-    assert!(features(&plot, &Panel::ALL, 1000, Format::Png).unwrap().len() < 2_000_000);
+    assert!(features(&plot, &Panel::ALL, 1000, Format::Png).unwrap().bytes.len() < 2_000_000);
 }
 
 #[test]
@@ -235,7 +239,7 @@ fn odd_input_is_drawn_all_the_same() {
             let mut plot = plot(values.view(), &[0.0, f64::NAN, f64::INFINITY, -1e300], &mel_hz);
             plot.tempo_bpm = Some(f64::NAN);
             plot.title = "";
-            let bytes = features(&plot, &Panel::ALL, 321, format).unwrap();
+            let bytes = features(&plot, &Panel::ALL, 321, format).unwrap().bytes;
             assert!(bytes.len() > 1000, "{} bytes", bytes.len());
         }
     }

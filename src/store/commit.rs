@@ -175,6 +175,28 @@ pub fn live_parts(store: &Location) -> Result<BTreeMap<String, Vec<LivePart>>, S
     Ok(tables)
 }
 
+/// Returns the parts, by table, that hold whatever rows an item has: those of the latest commit of
+/// each stage that settled it.
+///
+/// # Errors
+/// [`StoreError`] when commits cannot be read.
+pub fn parts_of(store: &Location, id: &str) -> Result<BTreeMap<String, Vec<Part>>, StoreError> {
+    let mut by_stage: BTreeMap<String, Manifest> = BTreeMap::new();
+    for manifest in manifests(store, None)? {
+        let is_later =
+            |known: &Manifest| (manifest.sequence, &manifest.key) > (known.sequence, &known.key);
+        let settles = manifest.items.iter().any(|item| item.id == id);
+        if settles && by_stage.get(&manifest.stage).is_none_or(is_later) {
+            by_stage.insert(manifest.stage.clone(), manifest);
+        }
+    }
+    let mut tables: BTreeMap<String, Vec<Part>> = BTreeMap::new();
+    for part in by_stage.into_values().flat_map(|manifest| manifest.parts) {
+        tables.entry(part.table.clone()).or_default().push(part);
+    }
+    Ok(tables)
+}
+
 fn manifests(store: &Location, stage: Option<&str>) -> Result<Vec<Manifest>, StoreError> {
     let folder = stage.map_or(FOLDER.to_owned(), |stage| format!("{FOLDER}/{stage}"));
     let mut listed = store.list(&folder)?;

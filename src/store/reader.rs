@@ -4,16 +4,21 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use arrow_array::{Array as _, BooleanArray, RecordBatch, StringArray};
+use arrow_schema::ArrowError;
 use bytes::Bytes;
 use futures::future::BoxFuture;
 use futures::{FutureExt as _, StreamExt as _, TryFutureExt as _};
 use object_store::path::Path as ObjectPath;
 use object_store::{ObjectStore, ObjectStoreExt as _};
-use parquet::arrow::ParquetRecordBatchStreamBuilder;
-use parquet::arrow::arrow_reader::{ArrowReaderOptions, ParquetRecordBatchReaderBuilder};
+use parquet::arrow::arrow_reader::{
+    ArrowPredicateFn, ArrowReaderBuilder, ArrowReaderOptions, ParquetRecordBatchReaderBuilder,
+    RowFilter,
+};
 use parquet::arrow::async_reader::AsyncFileReader;
+use parquet::arrow::{ParquetRecordBatchStreamBuilder, ProjectionMask};
 use parquet::errors::{ParquetError, Result as ParquetResult};
-use parquet::file::metadata::{ParquetMetaData, ParquetMetaDataReader};
+use parquet::file::metadata::{ParquetMetaData, ParquetMetaDataReader, RowGroupMetaData};
+use parquet::file::statistics::Statistics;
 
 use super::StoreError;
 use super::client::block_on;
@@ -32,6 +37,8 @@ pub struct Snapshot {
     store: Location,
     schema: TableSchema,
     parts: Vec<LivePart>,
+    /// The one item whose rows are wanted; `None` for all.
+    item: Option<String>,
 }
 
 impl Snapshot {
@@ -42,10 +49,20 @@ impl Snapshot {
     /// commits cannot be read.
     pub fn take(store: &Location, schema: TableSchema) -> Result<Self, StoreError> {
         let parts = live_parts(store)?.remove(schema.name).unwrap_or_default();
+        Self::new(store, schema, parts, None)
+    }
+
+    /// Returns the snapshot of some parts, or of one item's rows in them.
+    pub(super) fn new(
+        store: &Location,
+        schema: TableSchema,
+        parts: Vec<LivePart>,
+        item: Option<String>,
+    ) -> Result<Self, StoreError> {
         for live in &parts {
             check_version(store, &schema, live)?;
         }
-        Ok(Self { store: store.clone(), schema, parts })
+        Ok(Self { store: store.clone(), schema, parts, item })
     }
 
     pub fn parts(&self) -> &[LivePart] {
@@ -60,7 +77,7 @@ impl Snapshot {
                 place: self.store.url_of(&live.part.path),
                 source: Box::new(source),
             };
-            let batches: Batches = match open(&self.store, &live.part.path) {
+            let batches: Batches = match open(&self.store, &live.part.path, self.item.as_deref()) {
                 Ok(batches) => batches,
                 Err(e) => Box::new(std::iter::once(Err(e))),
             };
@@ -147,9 +164,7 @@ fn without(batch: &RecordBatch, superseded: &[String]) -> Result<RecordBatch, Pa
     if superseded.is_empty() {
         return Ok(batch.clone());
     }
-    let items = batch
-        .column_by_name(ITEM_COLUMN)
-        .and_then(|c| c.as_any().downcast_ref::<StringArray>())
+    let items = items(batch)
         .ok_or_else(|| ParquetError::General(format!("no text column {ITEM_COLUMN}")))?;
     let dead: std::collections::HashSet<&str> = superseded.iter().map(String::as_str).collect();
     let keep: BooleanArray =
@@ -157,12 +172,43 @@ fn without(batch: &RecordBatch, superseded: &[String]) -> Result<RecordBatch, Pa
     Ok(arrow_select::filter::filter_record_batch(batch, &keep)?)
 }
 
-fn open(store: &Location, path: &str) -> ParquetResult<Batches> {
+fn items(batch: &RecordBatch) -> Option<&StringArray> {
+    batch.column_by_name(ITEM_COLUMN)?.as_any().downcast_ref::<StringArray>()
+}
+
+/// Narrows a reader to the rows of `item`: row groups that cannot hold it are not read, and of the
+/// others only its rows are decoded.
+fn narrow<T>(builder: ArrowReaderBuilder<T>, item: Option<&str>) -> ArrowReaderBuilder<T> {
+    let Some(item) = item else { return builder };
+    let groups = builder.metadata().row_groups().iter().enumerate();
+    let groups = groups.filter(|(_, group)| may_hold(group, item)).map(|(i, _)| i).collect();
+    let mask = ProjectionMask::columns(builder.parquet_schema(), [ITEM_COLUMN]);
+    let item = item.to_owned();
+    let is_wanted = ArrowPredicateFn::new(mask, move |batch| {
+        let found = items(&batch)
+            .ok_or_else(|| ArrowError::SchemaError(format!("no text column {ITEM_COLUMN}")))?;
+        Ok(found.iter().map(|found| Some(found == Some(item.as_str()))).collect())
+    });
+    builder.with_row_groups(groups).with_row_filter(RowFilter::new(vec![Box::new(is_wanted)]))
+}
+
+/// Returns whether the statistics of a row group leave room for `item`.
+fn may_hold(group: &RowGroupMetaData, item: &str) -> bool {
+    let column = group.columns().iter().find(|c| c.column_path().string() == ITEM_COLUMN);
+    let Some(Statistics::ByteArray(names)) = column.and_then(|c| c.statistics()) else {
+        return true;
+    };
+    // Both ends may be cut short, the least downwards and the greatest upwards.
+    names.min_opt().is_none_or(|min| min.data() <= item.as_bytes())
+        && names.max_opt().is_none_or(|max| max.data() >= item.as_bytes())
+}
+
+fn open(store: &Location, path: &str, item: Option<&str>) -> ParquetResult<Batches> {
     match store.kind() {
         Kind::Local(root) => {
             let file = std::fs::File::open(root.join(path))?;
             Ok(Box::new(
-                ParquetRecordBatchReaderBuilder::try_new(file)?
+                narrow(ParquetRecordBatchReaderBuilder::try_new(file)?, item)
                     .build()?
                     .map(|batch| batch.map_err(ParquetError::from)),
             ))
@@ -172,7 +218,7 @@ fn open(store: &Location, path: &str) -> ParquetResult<Batches> {
             let stream = block_on(async {
                 let size = store.head(&path).await.map_err(external)?.size;
                 let object = RemotePart { store: Arc::clone(store), path, size };
-                ParquetRecordBatchStreamBuilder::new(object).await?.build()
+                narrow(ParquetRecordBatchStreamBuilder::new(object).await?, item).build()
             })?;
             let mut stream = Box::pin(stream);
             Ok(Box::new(std::iter::from_fn(move || block_on(stream.next()))))

@@ -1,0 +1,38 @@
+//! `plot`: pictures of what files and tables hold.
+
+mod features;
+
+use super::{Contract, Progress, Stage, Summary};
+
+/// The stage.
+pub struct Plot;
+
+/// What the user asks for.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Params {
+    #[command(subcommand)]
+    pub kind: Kind,
+}
+
+/// The kinds of plot.
+#[derive(Clone, Debug, clap::Subcommand)]
+pub enum Kind {
+    /// draw the audio features of a file or a phrase over time
+    Features(features::Params),
+}
+
+impl Stage for Plot {
+    const NAME: &'static str = "plot";
+    const ABOUT: &'static str = "draw features as PNG or SVG";
+    const CONTRACT: Contract = Contract {
+        reads: "an audio file, or features, extractions and beats",
+        writes: "an image file",
+    };
+    type Params = Params;
+
+    fn run(params: Params, _progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
+        match params.kind {
+            Kind::Features(params) => features::run(&params),
+        }
+    }
+}

@@ -1,0 +1,281 @@
+//! `plot features`: the blocks of features of a file or a phrase, one panel each.
+
+use std::fs::File;
+use std::io::{self, Write};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, anyhow, bail};
+use ndarray::{Array2, s};
+
+use crate::audio::recording::{MAX_HELD_SAMPLES, Options, Recording};
+use crate::audio::spectral::MEL_RANGE_HZ;
+use crate::audio::{Tuning, mel};
+use crate::plot::{self, FeaturesPlot, Format, MAX_WIDTH_PX, MIN_WIDTH_PX, Panel, Picture};
+use crate::stages::extract::Extract;
+use crate::stages::failure::{Failure, guarded};
+use crate::stages::{ClientParams, Stage as _, Summary};
+use crate::store::tables::{self, BeatRow, ExtractionRow, FailureRow, PhraseRow};
+use crate::store::{self, ItemTables, Location, Row as _, Snapshot, StoreError};
+use crate::units::{frames_to_s, s_to_frames};
+
+/// Names that an unknown phrase is told.
+const N_NEAREST: usize = 3;
+
+/// What the user asks for.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Params {
+    /// Audio file whose features are extracted and drawn (WAV, AIFF, FLAC, MP3, Ogg Vorbis, M4A or
+    /// AAC).
+    #[arg(long, value_name = "FILE")]
+    pub audio: Option<PathBuf>,
+    /// Folder or bucket of the tables, for --phrase.
+    #[arg(long, value_name = "URL")]
+    pub store: Option<String>,
+    /// Instead of --audio: the phrase whose features in the store are drawn.
+    #[arg(long, value_name = "ID")]
+    pub phrase: Option<String>,
+    /// The picture, FILE.png or FILE.svg; written whole or not at all.
+    #[arg(long, value_name = "FILE")]
+    pub output: PathBuf,
+    /// Panels to draw, from the top: the flag several times, or names with commas between them.
+    #[arg(long = "panel", value_name = "PANEL", value_delimiter = ',',
+          default_values = Panel::ALL.map(Panel::name))]
+    pub panels: Vec<Panel>,
+    /// Where the picture begins, in seconds; features stay relative to the whole file.
+    #[arg(long, value_name = "S", default_value_t = 0.0, allow_negative_numbers = true)]
+    pub start: f64,
+    /// Length of the excerpt, in seconds; without it, up to the end.
+    #[arg(long, value_name = "S", allow_negative_numbers = true)]
+    pub duration: Option<f64>,
+    /// Width in CSS pixels, 320 to 8192; a PNG has two pixels for each.
+    #[arg(long, value_name = "PX", default_value_t = 1000,
+          value_parser = clap::value_parser!(u32).range(WIDTHS_PX))]
+    pub width: u32,
+    /// Deviation from A440 in bins of 1/36 octave, from -0.5 to below 0.5, instead of the estimate.
+    #[arg(long, value_name = "BINS", allow_hyphen_values = true)]
+    pub tuning: Option<Tuning>,
+    #[command(flatten)]
+    pub client: ClientParams,
+}
+
+const WIDTHS_PX: std::ops::RangeInclusive<i64> = MIN_WIDTH_PX as i64..=MAX_WIDTH_PX as i64;
+
+/// Draws the plot.
+///
+/// # Errors
+/// When there is nothing to draw, or the picture cannot be written.
+pub fn run(params: &Params) -> anyhow::Result<Box<dyn Summary>> {
+    let output = &params.output;
+    let format = format_of(output)?;
+    check_excerpt(params.start, params.duration)?;
+    let subject = match (&params.audio, &params.phrase, &params.store) {
+        (Some(_), Some(phrase), _) => bail!(
+            "--audio and --phrase {phrase} name two things to draw; give one of them"
+        ),
+        (Some(audio), None, _) => from_audio(audio, params.tuning)?,
+        (None, Some(phrase), Some(store)) => {
+            let store = Location::open(store, &params.client.options())?;
+            from_store(&store, phrase, params.tuning)?
+        }
+        (None, Some(phrase), None) => {
+            bail!("--phrase {phrase} is a name in a store; say which with --store")
+        }
+        (None, None, _) => {
+            bail!("nothing to draw: give --audio FILE, or --store URL and --phrase ID")
+        }
+    };
+    let frames = excerpt(&subject, params.start, params.duration)?;
+    let features = FeaturesPlot {
+        title: &subject.title,
+        values: subject.frames.slice(s![frames.clone(), ..]),
+        beat_times_s: &subject.beat_times_s,
+        tempo_bpm: subject.tempo_bpm,
+        mel_hz: &mel::centres_hz(MEL_RANGE_HZ.0, MEL_RANGE_HZ.1),
+        start_s: frames_to_s(frames.start),
+    };
+    let picture = plot::features(&features, &params.panels, params.width, format)?;
+    store::write_file(output, |out| out.write_all(&picture.bytes))
+        .with_context(|| format!("while writing {}", output.display()))?;
+    Ok(Box::new(Drawn {
+        output: output.clone(),
+        width_px: picture.width_px,
+        height_px: picture.height_px,
+        n_frames: frames.len(),
+    }))
+}
+
+/// What is drawn.
+struct Subject {
+    title: String,
+    /// [T, 163].
+    frames: Array2<f32>,
+    tempo_bpm: Option<f64>,
+    beat_times_s: Vec<f64>,
+}
+
+fn format_of(output: &Path) -> anyhow::Result<Format> {
+    let extension = output.extension().map(|e| e.to_string_lossy()).unwrap_or_default();
+    Format::of_path_extension(&extension).ok_or_else(|| {
+        let found = match extension.as_ref() {
+            "" => "has no extension".to_owned(),
+            other => format!("has the extension .{other}"),
+        };
+        anyhow!(
+            "--output {} {found}, which is no format of plots; name it .png or .svg",
+            output.display()
+        )
+    })
+}
+
+fn check_excerpt(start_s: f64, duration_s: Option<f64>) -> anyhow::Result<()> {
+    if !(start_s.is_finite() && start_s >= 0.0) {
+        bail!("--start {start_s} is no time in a file; give seconds from 0 on");
+    }
+    match duration_s {
+        Some(s) if !(s.is_finite() && s > 0.0) => {
+            bail!("--duration {s} is not above 0; give a positive number of seconds")
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Returns the frames of an excerpt, at least one.
+fn excerpt(
+    subject: &Subject,
+    start_s: f64,
+    duration_s: Option<f64>,
+) -> anyhow::Result<Range<usize>> {
+    let n_frames = subject.frames.nrows();
+    let nearest = |time_s: f64| s_to_frames(time_s).round() as usize;
+    let first = nearest(start_s);
+    if first >= n_frames {
+        bail!(
+            "--start {start_s} is after the end of {}, whose last frame of {n_frames} is at {:.2} s; \
+             begin earlier",
+            subject.title,
+            frames_to_s(n_frames.saturating_sub(1))
+        );
+    }
+    let length = duration_s.map_or(n_frames, nearest).max(1);
+    Ok(first..first.saturating_add(length).min(n_frames))
+}
+
+/// Extracts the features of an audio file.
+fn from_audio(path: &Path, tuning: Option<Tuning>) -> anyhow::Result<Subject> {
+    let place = path.display().to_string();
+    if path.is_dir() {
+        bail!("{place}: is a folder; name a file in it");
+    }
+    // Who waits for one picture decides how long.
+    let options = Options {
+        tuning,
+        max_duration_s: f64::INFINITY,
+        is_late: &|| false,
+        max_held_samples: MAX_HELD_SAMPLES,
+    };
+    let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default();
+    let recording = guarded(&place, || {
+        Recording::analyse(|| File::open(path), extension, &options)
+            .map_err(|e| Failure::of(&place, e.kind(), &e))
+    });
+    let features = recording.map_err(|failure| anyhow!(failure.message))?.raw.normalize();
+    let rhythm = features.rhythm;
+    Ok(Subject {
+        title: path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned(),
+        frames: features.frames,
+        tempo_bpm: Some(rhythm.tempo_bpm).filter(|&bpm| bpm > 0.0),
+        beat_times_s: rhythm.beat_frames.into_iter().map(frames_to_s).collect(),
+    })
+}
+
+/// Reads the features of a phrase.
+fn from_store(
+    store: &Location,
+    phrase: &str,
+    tuning: Option<Tuning>,
+) -> anyhow::Result<Subject> {
+    let rows = ItemTables::take(store, phrase)?;
+    let Some(frames) = rows.frames(tables::features())? else {
+        return Err(missing(store, phrase, &rows)?);
+    };
+    let extraction = rows.rows::<ExtractionRow>()?.pop();
+    let known = extraction.as_ref().and_then(|e| e.tuning);
+    if let Some(wanted) = tuning.filter(|wanted| known != Some(wanted.bins())) {
+        let known = known.map_or("from a feature file".to_owned(), |t| format!("with tuning {t}"));
+        bail!(
+            "store {store} has the features of phrase \"{phrase}\" {known}, not with --tuning \
+             {wanted}; leave the flag out, or draw the audio file itself with --audio"
+        );
+    }
+    let mut beats = rows.rows::<BeatRow>()?;
+    beats.sort_by_key(|beat| beat.beat);
+    Ok(Subject {
+        title: phrase.to_owned(),
+        frames,
+        tempo_bpm: extraction.and_then(|e| e.tempo_bpm),
+        beat_times_s: beats.into_iter().map(|beat| beat.time_s).collect(),
+    })
+}
+
+/// Returns why a phrase has no features in the store, and the way out.
+fn missing(
+    store: &Location,
+    phrase: &str,
+    rows: &ItemTables,
+) -> Result<anyhow::Error, StoreError> {
+    let failures: Vec<FailureRow> = rows.rows()?;
+    if let Some(failure) = failures.into_iter().find(|f| f.stage == Extract::NAME) {
+        return Ok(anyhow!(
+            "store {store} has no features of phrase \"{phrase}\", since extract failed on it: {}",
+            failure.message
+        ));
+    }
+    let known: Option<PhraseRow> = rows.rows()?.pop();
+    if known.as_ref().is_some_and(|row| !row.has_audio && !row.has_features) {
+        return Ok(anyhow!(
+            "store {store}: phrase \"{phrase}\" has neither audio nor a feature file, so there are \
+             no features to draw; ingest it with its audio, then run extract"
+        ));
+    }
+    let mut names: Vec<String> = Vec::new();
+    if known.is_none() {
+        let extractions: Vec<ExtractionRow> =
+            Snapshot::take(store, ExtractionRow::schema())?.rows()?;
+        names = extractions.into_iter().map(|row| row.phrase_id).collect();
+    }
+    if names.is_empty() {
+        return Ok(anyhow!(
+            "store {store} has no features of phrase \"{phrase}\"; run motiongen extract --store \
+             {store} first"
+        ));
+    }
+    let likeness = |name: &String| strsim::jaro_winkler(phrase, name);
+    names.sort_by(|a, b| likeness(b).total_cmp(&likeness(a)).then_with(|| a.cmp(b)));
+    names.truncate(N_NEAREST);
+    Ok(anyhow!("store {store} has no phrase \"{phrase}\"; nearest: {}", names.join(", ")))
+}
+
+/// What was drawn.
+struct Drawn {
+    output: PathBuf,
+    width_px: u32,
+    height_px: u32,
+    n_frames: usize,
+}
+
+impl Summary for Drawn {
+    fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
+        let Drawn { output, width_px, height_px, n_frames } = self;
+        let seconds = frames_to_s(*n_frames);
+        writeln!(
+            out,
+            "{n_frames} frames ({seconds:.2} s) → {} ({width_px} × {height_px} px)",
+            output.display()
+        )
+    }
+
+    fn n_failed(&self) -> u64 {
+        0
+    }
+}
