@@ -67,8 +67,9 @@ bench: build/bench-venv/ready ## measure side by side with peers [BENCH_PROFILE=
 
 .PHONY: bench-audio
 bench-audio: build/bench-venv/ready ## measure the audio features beside librosa [BENCH_PROFILE, BENCH_ARGS]
-	$(CARGO) build --locked --profile $(BENCH_PROFILE) --bin motiongen
+	$(CARGO) build --locked --profile $(BENCH_PROFILE) --bin motiongen --example audio-blocks
 	build/bench-venv/bin/python benches/audio.py --profile $(BENCH_PROFILE) --bin $(BENCH_BIN) $(BENCH_ARGS)
+	$(BENCH_BIN)/examples/audio-blocks build/bench-audio/corpus-*/songs/song.mp3
 
 .PHONY: bench-parity
 bench-parity: build/bench-venv/ready ## compare the audio features with those of librosa [BENCH_ARGS=--per-clip]

@@ -15,6 +15,9 @@ pub const MAX_HELD_SAMPLES: usize = 6 * 60 * SAMPLE_RATE_HZ as usize;
 const MIN_RATE_HZ: u32 = 1_000;
 const MAX_RATE_HZ: u32 = 768_000;
 
+/// Largest sample. The power of a frame, (2048 · sample)², has to stay below f32's 3·10³⁸.
+const MAX_SAMPLE: f32 = 1e12;
+
 /// What an encoded recording is read from.
 pub trait Input: Read + Seek + Send + Sync {}
 impl<T: Read + Seek + Send + Sync> Input for T {}
@@ -61,9 +64,15 @@ pub enum RecordingError {
          converted; its header is probably damaged, encode it again"
     )]
     Rate { found_hz: u32 },
+    /// A sample whose power would not fit the numbers that features are computed in.
+    #[error(
+        "sample at {time_s:.3} s is {value:e}, and full scale is 1; samples above {MAX_SAMPLE:e} are \
+         no audio, export the file again, for example as 16-bit integers"
+    )]
+    TooLarge { time_s: f64, value: f32 },
     /// The limit on length.
     #[error(
-        "is longer than {limit_s:.0} s, the longest recording that is taken; split it or raise \
+        "is longer than {limit_s} s, the longest recording that is taken; split it or raise \
          --max-duration"
     )]
     TooLong { limit_s: f64 },
@@ -86,6 +95,7 @@ impl RecordingError {
             Self::Decode(e) => e.kind(),
             Self::Features(FeatureError::Empty) => "audio_no_samples",
             Self::Rate { .. } => "audio_sample_rate",
+            Self::TooLarge { .. } => "audio_data",
             Self::TooLong { .. } => "too_long",
             Self::Late { .. } => "timeout",
             Self::Changed => "changed",
@@ -162,6 +172,10 @@ fn decode(
     loop {
         packet.clear();
         let goes_on = decoder.next_block(&mut packet)?;
+        if let Some(i) = packet.iter().position(|y| y.abs() > MAX_SAMPLE) {
+            let time_s = (n_samples + i as u64) as f64 / f64::from(rate_hz);
+            return Err(RecordingError::TooLarge { time_s, value: packet[i] });
+        }
         n_samples += packet.len() as u64;
         resampler.push(&packet, &mut block);
         if block.len() >= BLOCK_SAMPLES {
@@ -203,5 +217,95 @@ impl Digest {
         for sample in samples {
             self.0 = (self.0 ^ u64::from(sample.to_bits())).wrapping_mul(0x0000_0100_0000_01b3);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::io::Cursor;
+
+    /// A WAV file of 32-bit floats, mono.
+    fn wav(rate_hz: u32, samples: &[f32]) -> Vec<u8> {
+        let format = hound::SampleFormat::Float;
+        let spec = hound::WavSpec {
+            channels: 1,
+            sample_rate: rate_hz,
+            bits_per_sample: 32,
+            sample_format: format,
+        };
+        let mut bytes = Cursor::new(Vec::new());
+        let mut writer = hound::WavWriter::new(&mut bytes, spec).expect("a header");
+        samples.iter().for_each(|&sample| writer.write_sample(sample).expect("a sample"));
+        writer.finalize().expect("an end");
+        bytes.into_inner()
+    }
+
+    fn options(max_held_samples: usize) -> Options<'static> {
+        Options { tuning: None, max_duration_s: 10.0, is_late: &|| false, max_held_samples }
+    }
+
+    fn analyse(bytes: &[u8], options: &Options<'_>) -> Result<Recording, RecordingError> {
+        Recording::analyse(|| Ok(Cursor::new(bytes)), "wav", options)
+    }
+
+    fn tones(n: usize) -> Vec<f32> {
+        (0..n).map(|i| (i as f32 * 0.05).sin() * 0.4 + (i as f32 * 0.171).sin() * 0.2).collect()
+    }
+
+    #[test]
+    fn decoding_twice_gives_what_holding_gives() {
+        let bytes = wav(48_000, &tones(70_001));
+        let held = analyse(&bytes, &options(usize::MAX)).expect("features");
+        let twice = analyse(&bytes, &options(1000)).expect("features");
+        assert_eq!(held, twice);
+        assert_eq!(held.raw.n_samples, 64_314);
+        let encoding = Encoding { codec: "pcm_f32le", sample_rate_hz: 48_000, n_channels: 1 };
+        assert_eq!(held.encoding, encoding);
+    }
+
+    #[test]
+    fn a_file_that_changes_between_the_passes_is_refused() {
+        let files = [wav(44_100, &tones(30_000)), wav(44_100, &[0.25; 30_000])];
+        let mut n_opened = 0;
+        let open = || {
+            n_opened += 1;
+            Ok(Cursor::new(&files[n_opened - 1]))
+        };
+        let error = Recording::analyse(open, "wav", &options(0)).expect_err("two contents");
+        assert_eq!(
+            error.to_string(),
+            "changed while it was read; run extract again when nobody writes it"
+        );
+    }
+
+    #[test]
+    #[rustfmt::skip]
+    fn limits_are_sentences() {
+        let refused = |bytes: &[u8], options: &Options<'_>| {
+            let error = analyse(bytes, options).expect_err("refused");
+            (error.kind(), error.to_string())
+        };
+        let sound = wav(44_100, &tones(30_000));
+        let mut loud = tones(30_000);
+        loud[4410] = -2e20;
+        let short = Options { max_duration_s: 0.5, ..options(0) };
+        let late = Options { is_late: &|| true, ..options(0) };
+        for (found, kind, sentence) in [
+            (refused(&sound, &short), "too_long",
+             "is longer than 0.5 s, the longest recording that is taken; split it or raise \
+              --max-duration"),
+            (refused(&wav(44_100, &loud), &options(0)), "audio_data",
+             "sample at 0.100 s is -2e20, and full scale is 1; samples above 1e12 are no audio, \
+              export the file again, for example as 16-bit integers"),
+            (refused(&wav(999, &[0.1; 50]), &options(0)), "audio_sample_rate",
+             "has a sample rate of 999 Hz, outside the 1000 to 768000 Hz that are converted; its \
+              header is probably damaged, encode it again"),
+        ] {
+            assert_eq!(found, (kind, sentence.to_owned()));
+        }
+        let (kind, sentence) = refused(&sound, &late);
+        assert_eq!(kind, "timeout");
+        assert!(sentence.starts_with("was not done in time, after 0."), "{sentence}");
     }
 }

@@ -159,7 +159,7 @@ fn arrays() -> Vec<Case> {
     broken_mfcc[3 * 23 + 5] = f32::NAN;
     broken_mfcc[4 * 23 + 6] = f32::INFINITY;
     let none: Vec<Member> =
-        features(23).into_iter().map(|(key, _)| (key, write(&[128, 0], &[]))).collect();
+        features(23).into_iter().map(|(key, _)| (key, write::<f32>(&[128, 0], &[]))).collect();
     vec![
         Case::npz("npz-wrong-mel-rows", with("mel", zeros(&[80, 23])), "shape",
             "mel has shape [80, 23], expected [128, frames]"),
