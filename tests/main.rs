@@ -1,6 +1,7 @@
 //! The one integration-test crate; every file of `tests/` is a module of it.
 
 mod audio_header;
+mod extract;
 mod ingest_bad_input;
 mod ingest_kill;
 mod ingest_local;
@@ -8,6 +9,7 @@ mod ingest_remote;
 mod motion_capture;
 mod npy_files;
 mod object_store_conformance;
+mod plot_features;
 mod query_tables;
 mod rooms;
 mod schemas;

@@ -3,16 +3,27 @@
 //! A TOML value becomes the default of its flag before the command line is parsed, so clap checks
 //! it like a typed one, `--help` shows it, and no parameter is declared twice.
 
+use std::collections::BTreeSet;
 use std::ffi::OsString;
 
 use anyhow::{Context as _, bail};
-use clap::{ArgAction, Command};
+use clap::{Arg, ArgAction, Command, Id};
 
 /// The flag that names the file.
 pub const FLAG: &str = "config";
 const VARIABLE_PREFIX: &str = "MOTIONGEN_";
 
-/// Gives every flag of a command its environment variable, `MOTIONGEN_<FLAG>`.
+/// Returns the text about the flag that names the file.
+pub fn help(command: &Command) -> String {
+    let stage = command.get_name();
+    let tables = match command.get_subcommands().next() {
+        Some(kind) => format!("in [{stage}], or in a kind's own [{stage}.{}]", kind.get_name()),
+        None => format!("or in [{stage}]"),
+    };
+    format!("Take defaults from this TOML file: flags without their dashes, top level, {tables}")
+}
+
+/// Gives every flag of a command and its kinds its environment variable, `MOTIONGEN_<FLAG>`.
 pub fn with_environment(mut command: Command) -> Command {
     let flags: Vec<_> = command
         .get_arguments()
@@ -22,7 +33,7 @@ pub fn with_environment(mut command: Command) -> Command {
     for (id, variable) in flags {
         command = command.mut_arg(id, |arg| arg.env(variable));
     }
-    command
+    command.mut_subcommands(with_environment)
 }
 
 fn variable(flag: &str) -> String {
@@ -31,14 +42,14 @@ fn variable(flag: &str) -> String {
 
 /// Makes the values of the configuration file, if one is named, the defaults of `command`.
 ///
-/// With `stages`, `command` is the front door and the stage that `arguments` name is configured;
-/// without, it is the stage itself.
+/// Of the front door, the stage that `arguments` name is configured; any other `command` is the stage
+/// itself.
 ///
 /// # Errors
 /// When the file cannot be read, is not TOML, or has a key that the stage does not know.
 pub fn apply(
-    mut command: Command,
-    stages: &[&str],
+    command: Command,
+    is_front_door: bool,
     arguments: &[OsString],
 ) -> anyhow::Result<Command> {
     let Some(path) = file_named(arguments) else { return Ok(command) };
@@ -47,24 +58,33 @@ pub fn apply(
     let table: toml::Table = text
         .parse()
         .with_context(|| format!("configuration {}: is not TOML", path.to_string_lossy()))?;
-    if stages.is_empty() {
+    // Top-level values are for every stage.
+    let shared: Vec<_> = table.iter().filter(|(_, value)| !value.is_table()).collect();
+    let file = File { path: path.to_string_lossy().into_owned(), arguments };
+    if !is_front_door {
         let name = command.get_name().trim_start_matches("motiongen-").to_owned();
-        return with_defaults(command, &name, &table, &path.to_string_lossy());
+        return file.configure(command, &name, &shared, table.get(&name));
     }
-    let chosen = arguments.iter().skip(1).find_map(|a| {
-        let word = a.to_str()?;
-        stages.iter().find(|stage| **stage == word)
-    });
-    let Some(chosen) = chosen else { return Ok(command) };
+    try_mut_subcommand(command, arguments, |stage, command| {
+        file.configure(command, stage, &shared, table.get(stage))
+    })
+}
+
+/// Changes the subcommand that `arguments` name, if they name one.
+fn try_mut_subcommand(
+    command: Command,
+    arguments: &[OsString],
+    change: impl FnOnce(&str, Command) -> anyhow::Result<Command>,
+) -> anyhow::Result<Command> {
+    let mut words = arguments.iter().skip(1).filter_map(|a| a.to_str());
+    let chosen = words.find_map(|word| command.find_subcommand(word));
+    let Some(name) = chosen.map(|sub| sub.get_name().to_owned()) else { return Ok(command) };
     let mut outcome = Ok(());
-    command = command.mut_subcommand(chosen, |sub| {
-        match with_defaults(sub.clone(), chosen, &table, &path.to_string_lossy()) {
-            Ok(configured) => configured,
-            Err(e) => {
-                outcome = Err(e);
-                sub
-            }
-        }
+    let command = command.mut_subcommand(&name, |sub| {
+        change(&name, sub.clone()).unwrap_or_else(|e| {
+            outcome = Err(e);
+            sub
+        })
     });
     outcome.map(|()| command)
 }
@@ -87,49 +107,80 @@ pub fn file_named(arguments: &[OsString]) -> Option<OsString> {
     std::env::var_os(variable(FLAG)).filter(|value| !value.is_empty())
 }
 
-fn with_defaults(
-    mut command: Command,
-    stage: &str,
-    table: &toml::Table,
-    path: &str,
-) -> anyhow::Result<Command> {
-    // Top-level values are for every stage; a stage's own table wins over them.
-    let shared = table.iter().filter(|(_, value)| !value.is_table()).map(|kv| (kv, false));
-    let own = table.get(stage).and_then(toml::Value::as_table);
-    let own = own.into_iter().flatten().map(|kv| (kv, true));
-    for ((key, value), is_own) in shared.chain(own) {
-        let flag = key.replace('_', "-");
-        let known = command.get_arguments().find(|a| {
-            a.get_long() == Some(flag.as_str()) && !matches!(a.get_action(), ArgAction::Count)
-        });
-        let Some(argument) = known.filter(|_| flag != FLAG) else {
-            // A shared key may be meant for another stage.
-            if !is_own {
-                continue;
-            }
-            bail!("configuration {path}: {}", unknown_key(&command, stage, key));
-        };
-        let id = argument.get_id().clone();
-        let values = texts(value)
-            .with_context(|| format!("configuration {path}: [{stage}] {key} cannot be a table"))?;
-        command = command.mut_arg(id, |arg| arg.default_values(values).required(false));
-    }
-    Ok(command)
+/// A configuration file that was read.
+struct File<'a> {
+    path: String,
+    arguments: &'a [OsString],
 }
 
-fn unknown_key(command: &Command, stage: &str, key: &str) -> String {
-    let known: Vec<_> = command
-        .get_arguments()
+/// A key and its value.
+type Entry<'a> = (&'a String, &'a toml::Value);
+
+impl File<'_> {
+    /// Makes values the defaults of `command` and of the kind of it that was chosen.
+    ///
+    /// `shared` are values for whoever knows them; those of the command's own table win over them
+    /// and must be known.
+    fn configure(
+        &self,
+        mut command: Command,
+        section: &str,
+        shared: &[Entry<'_>],
+        own: Option<&toml::Value>,
+    ) -> anyhow::Result<Command> {
+        let path = &self.path;
+        let own = own.and_then(toml::Value::as_table);
+        let is_kind = |(key, value): &Entry<'_>| {
+            value.is_table() && command.get_subcommands().any(|kind| kind.get_name() == *key)
+        };
+        let own_values: Vec<_> = own.into_iter().flatten().filter(|kv| !is_kind(kv)).collect();
+        let entries = shared.iter().map(|kv| (*kv, false));
+        for ((key, value), is_own) in entries.chain(own_values.iter().map(|kv| (*kv, true))) {
+            let Some(id) = find(&command, key) else {
+                // A shared key may be meant for another stage, an own one for a kind.
+                if is_own && !command.get_subcommands().any(|kind| find(kind, key).is_some()) {
+                    bail!("configuration {path}: {}", unknown_key(&command, section, key));
+                }
+                continue;
+            };
+            let values = texts(value).with_context(|| {
+                format!("configuration {path}: [{section}] {key} cannot be a table")
+            })?;
+            command = command.mut_arg(id, |arg| arg.default_values(values).required(false));
+        }
+        let shared: Vec<_> = shared.iter().chain(&own_values).copied().collect();
+        try_mut_subcommand(command, self.arguments, |kind, command| {
+            let own = own.and_then(|table| table.get(kind));
+            self.configure(command, &format!("{section}.{kind}"), &shared, own)
+        })
+    }
+}
+
+/// Returns the argument that a key sets.
+fn find(command: &Command, key: &str) -> Option<Id> {
+    let flag = key.replace('_', "-");
+    let is_it = |a: &&Arg| {
+        a.get_long() == Some(flag.as_str()) && !matches!(a.get_action(), ArgAction::Count)
+    };
+    command.get_arguments().find(is_it).filter(|_| flag != FLAG).map(|a| a.get_id().clone())
+}
+
+fn unknown_key(command: &Command, section: &str, key: &str) -> String {
+    let mut known: Vec<_> = std::iter::once(command)
+        .chain(command.get_subcommands())
+        .flat_map(Command::get_arguments)
         .filter(|a| !matches!(a.get_action(), ArgAction::Count))
         .filter_map(|a| a.get_long())
         .filter(|flag| !["help", "version", FLAG].contains(flag))
         .collect();
+    let mut seen = BTreeSet::new();
+    known.retain(|flag| seen.insert(*flag));
     let nearest = known
         .iter()
         .max_by(|a, b| strsim::jaro_winkler(key, a).total_cmp(&strsim::jaro_winkler(key, b)))
         .map_or("", |flag| flag);
     format!(
-        "[{stage}] has no key \"{key}\"; nearest: {nearest}; {stage} knows {}",
+        "[{section}] has no key \"{key}\"; nearest: {nearest}; {section} knows {}",
         known.join(", ")
     )
 }

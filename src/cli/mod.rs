@@ -16,6 +16,7 @@ use clap::{Arg, ArgAction, ArgMatches, Command, FromArgMatches as _};
 
 use crate::stages::extract::Extract;
 use crate::stages::ingest::Ingest;
+use crate::stages::plot::Plot;
 #[cfg(feature = "query")]
 use crate::stages::query::Query;
 use crate::stages::{Stage, Summary};
@@ -40,6 +41,7 @@ fn entries() -> Vec<Entry> {
     vec![
         Entry::of::<Ingest>(),
         Entry::of::<Extract>(),
+        Entry::of::<Plot>(),
         #[cfg(feature = "query")]
         Entry::of::<Query>(),
     ]
@@ -49,7 +51,7 @@ fn entries() -> Vec<Entry> {
 pub fn stage<S: Stage>() -> ExitCode {
     let command = command::<S>().name(format!("motiongen-{}", S::NAME)).version(VERSION);
     let arguments: Vec<OsString> = std::env::args_os().collect();
-    let matches = match matches(command, &[], &arguments) {
+    let matches = match matches(command, false, &arguments) {
         Ok(matches) => matches,
         Err(code) => return code,
     };
@@ -71,8 +73,7 @@ pub fn front_door() -> ExitCode {
     if arguments.len() < 2 {
         return exit::report(list_stages(&entries));
     }
-    let names: Vec<_> = entries.iter().map(|e| e.name).collect();
-    let matches = match matches(command, &names, &arguments) {
+    let matches = match matches(command, true, &arguments) {
         Ok(matches) => matches,
         Err(code) => return code,
     };
@@ -88,10 +89,11 @@ pub fn front_door() -> ExitCode {
 /// Parses the command line over the configuration file; what is wrong is printed.
 fn matches(
     command: Command,
-    stages: &[&str],
+    is_front_door: bool,
     arguments: &[OsString],
 ) -> Result<ArgMatches, ExitCode> {
-    let command = config::apply(command, stages, arguments).map_err(|e| exit::report(Err(e)))?;
+    let command =
+        config::apply(command, is_front_door, arguments).map_err(|e| exit::report(Err(e)))?;
     command
         .try_get_matches_from(arguments)
         .map_err(|e| exit::usage(&e, config::file_named(arguments).as_deref()))
@@ -105,19 +107,26 @@ fn command<S: Stage>() -> Command {
     let contract =
         format!("Reads: {}\nWrites: {}\n\n{AFTER}", S::CONTRACT.reads, S::CONTRACT.writes);
     // The parameters' own doc comment would become the text about the stage, so that comes after.
-    let command = S::Params::augment_args(Command::new(S::NAME))
+    let mut command = S::Params::augment_args(Command::new(S::NAME))
         .about(S::ABOUT)
         .long_about(S::ABOUT)
-        .after_help(contract)
+        .after_help(contract.clone());
+    if command.has_subcommands() {
+        command = command
+            .subcommand_value_name("KIND")
+            .subcommand_help_heading("Kinds")
+            .disable_help_subcommand(true)
+            .mut_subcommands(|kind| kind.after_help(contract.clone()));
+    }
+    let config_help = config::help(&command);
+    let command = command
         .arg(
             Arg::new(config::FLAG)
                 .long(config::FLAG)
                 .value_name("FILE")
-                .help(
-                    "Take defaults from this TOML file: the keys above, top level or in a table \
-                       named like the stage",
-                )
-                .help_heading("General"),
+                .help(config_help)
+                .help_heading("General")
+                .global(true),
         )
         .arg(
             Arg::new(log::VERBOSE)
@@ -125,7 +134,8 @@ fn command<S: Stage>() -> Command {
                 .short('v')
                 .action(ArgAction::Count)
                 .help("Log more: -v progress of the work, -vv details, -vvv requests")
-                .help_heading("General"),
+                .help_heading("General")
+                .global(true),
         )
         .arg(
             Arg::new(log::QUIET)
@@ -133,7 +143,8 @@ fn command<S: Stage>() -> Command {
                 .short('q')
                 .action(ArgAction::SetTrue)
                 .help("Show neither progress nor warnings")
-                .help_heading("General"),
+                .help_heading("General")
+                .global(true),
         );
     config::with_environment(command)
 }

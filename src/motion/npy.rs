@@ -88,10 +88,22 @@ writable!(i64, "<i8");
 /// # Panics
 /// If the lengths in `shape` do not multiply to the number of values, or there are over 64.
 pub fn write<T: Writable>(shape: &[usize], values: &[T]) -> Vec<u8> {
-    assert!(shape.len() <= 64, "shape has {} axes and NumPy allows 64", shape.len());
     let count = shape.iter().try_fold(1_usize, |count, &length| count.checked_mul(length));
     assert_eq!(count, Some(values.len()), "shape {shape:?} against {} values", values.len());
+    let mut file = header::<T>(shape);
+    file.reserve(size_of_val(values));
+    for value in values {
+        value.append_to(&mut file);
+    }
+    file
+}
 
+/// Returns what comes before the values, in C order, of an array of `shape`: see [`write`].
+///
+/// # Panics
+/// If there are over 64 axes.
+pub fn header<T: Writable>(shape: &[usize]) -> Vec<u8> {
+    assert!(shape.len() <= 64, "shape has {} axes and NumPy allows 64", shape.len());
     let lengths: Vec<String> = shape.iter().map(usize::to_string).collect();
     let comma = if shape.len() == 1 { "," } else { "" };
     let mut header = format!(
@@ -106,16 +118,13 @@ pub fn write<T: Writable>(shape: &[usize], values: &[T]) -> Vec<u8> {
     header.extend(std::iter::repeat_n(' ', growth + 64 - fixed % 64));
     header.push('\n');
 
-    let mut file = Vec::with_capacity(MAGIC.len() + 4 + header.len() + size_of_val(values));
-    file.extend_from_slice(MAGIC);
-    file.extend_from_slice(&[1, 0]);
+    let mut bytes = Vec::with_capacity(MAGIC.len() + 4 + header.len());
+    bytes.extend_from_slice(MAGIC);
+    bytes.extend_from_slice(&[1, 0]);
     // 64 lengths of at most 20 digits stay far below the 65,535 bytes that version 1.0 can say.
-    file.extend_from_slice(&(header.len() as u16).to_le_bytes());
-    file.extend_from_slice(header.as_bytes());
-    for value in values {
-        value.append_to(&mut file);
-    }
-    file
+    bytes.extend_from_slice(&(header.len() as u16).to_le_bytes());
+    bytes.extend_from_slice(header.as_bytes());
+    bytes
 }
 
 /// `at_hand_bytes` is how many bytes the reader surely holds, and so how much may be reserved

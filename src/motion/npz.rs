@@ -1,4 +1,4 @@
-//! Reads arrays out of NumPy `.npz` archives: zip files whose members are `.npy` files.
+//! Reads arrays out of NumPy `.npz` archives, and writes them: zip files whose members are `.npy` files.
 //!
 //! Sources: `numpy.savez` and `numpy.savez_compressed`; PKWARE APPNOTE sections 4.3 (layout) and
 //! 4.5.3 (zip64). The declared sizes of a member are never trusted: reading stops at a limit.
@@ -6,11 +6,12 @@
 #[cfg(test)]
 mod tests;
 
-use std::io::{Cursor, Read};
+use std::io::{self, Cursor, Read, Seek, Write};
 
-use zip::{CompressionMethod, ZipArchive};
+use zip::write::SimpleFileOptions;
+use zip::{CompressionMethod, DateTime, ZipArchive, ZipWriter};
 
-use super::npy::{self, MAX_ARRAY_BYTES, NpyArray, NpyError};
+use super::npy::{self, MAX_ARRAY_BYTES, NpyArray, NpyError, Writable};
 
 /// Room for a member's header over the limit on its array.
 const HEADER_ROOM_BYTES: u64 = 128 * 1024;
@@ -99,29 +100,66 @@ fn list(keys: &[String]) -> String {
     format!("{}{more}", named.join(", "))
 }
 
-/// Writes an archive of `.npy` members, stored as they are (`numpy.savez`).
+/// Writes an archive of `.npy` members, stored as they are (`numpy.savez`), one after the other.
 ///
 /// The same members give the same bytes: no member carries a time.
-///
-/// # Errors
-/// What the output says.
-pub fn write(
-    out: impl std::io::Write + std::io::Seek,
-    members: &[(&str, Vec<u8>)],
-) -> std::io::Result<()> {
-    use std::io::Write as _;
-    let options = zip::write::SimpleFileOptions::default()
-        .compression_method(CompressionMethod::Stored)
-        .last_modified_time(zip::DateTime::default());
-    let mut archive = zip::ZipWriter::new(out);
-    for (key, bytes) in members {
-        // NumPy, too, asks for the room of large files up front.
-        let options = options.large_file(bytes.len() as u64 > u64::from(u32::MAX / 2));
-        archive.start_file(format!("{key}.npy"), options)?;
-        archive.write_all(bytes)?;
+pub struct NpzWriter<W: Write + Seek> {
+    archive: ZipWriter<W>,
+    values: Vec<u8>,
+}
+
+/// Bytes of an array that are written at once.
+const PIECE_BYTES: usize = 64 << 10;
+
+impl<W: Write + Seek> NpzWriter<W> {
+    /// Starts an archive.
+    pub fn new(out: W) -> Self {
+        Self { archive: ZipWriter::new(out), values: Vec::new() }
     }
-    archive.finish()?;
-    Ok(())
+
+    /// Adds an array of `shape`, whose values come in C order.
+    ///
+    /// # Errors
+    /// What the output says.
+    ///
+    /// # Panics
+    /// If the values are not as many as the shape says.
+    pub fn add<T: Writable>(
+        &mut self,
+        key: &str,
+        shape: &[usize],
+        values: impl IntoIterator<Item = T>,
+    ) -> io::Result<()> {
+        let n_values: usize = shape.iter().product();
+        let n_bytes = n_values as u64 * size_of::<T>() as u64;
+        let options = SimpleFileOptions::default()
+            .compression_method(CompressionMethod::Stored)
+            .last_modified_time(DateTime::default())
+            // Beyond 4 GiB a member needs fields that must be asked for up front.
+            .large_file(n_bytes > u64::from(u32::MAX / 2));
+        self.archive.start_file(format!("{key}.npy"), options)?;
+        self.archive.write_all(&npy::header::<T>(shape))?;
+        let mut n_written = 0;
+        self.values.clear();
+        for value in values {
+            value.append_to(&mut self.values);
+            n_written += 1;
+            if self.values.len() >= PIECE_BYTES {
+                self.archive.write_all(&self.values)?;
+                self.values.clear();
+            }
+        }
+        assert_eq!(n_written, n_values, "values of {key}, shape {shape:?}");
+        self.archive.write_all(&self.values)
+    }
+
+    /// Ends the archive and returns the output.
+    ///
+    /// # Errors
+    /// What the output says.
+    pub fn finish(self) -> io::Result<W> {
+        Ok(self.archive.finish()?)
+    }
 }
 
 /// An opened archive over bytes in memory.

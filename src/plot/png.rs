@@ -16,6 +16,8 @@ pub(super) fn rgb(width: u32, height: u32, pixels: &[u8]) -> Result<Vec<u8>, Plo
     encoder.set_color(ColorType::Rgb);
     encoder.set_depth(BitDepth::Eight);
     encoder.set_compression(Compression::High);
+    // Rows of heat maps and paper repeat as they are; differences of cells are noise.
+    encoder.set_filter(::png::Filter::NoFilter);
     // So that viewers and printers show the page at its size.
     let per_m = (CSS_PX_PER_M * f64::from(SCALE)).round() as u32;
     encoder.set_pixel_dims(Some(PixelDimensions { xppu: per_m, yppu: per_m, unit: Unit::Meter }));

@@ -82,7 +82,7 @@ rows! {
     {
         phrase_id: String, "", "The phrase, as in `phrases`.";
         beat: i32, "beats", "Index within the phrase, from 0.";
-        frame: i32, "frames", "The nearest frame.";
+        frame: i32, "frames", "The nearest frame of the phrase.";
         time_s: f64, "s", "Time of the beat; frame / 30 where the beat tracker found it.";
     }
 }

@@ -17,7 +17,7 @@ fn archive(members: &[(&str, &[u8])], method: CompressionMethod) -> Vec<u8> {
 }
 
 fn sample() -> Vec<u8> {
-    let (mel, beats) = (write(&[2, 3], &[1.5; 6]), write(&[4], &[2.0; 4]));
+    let (mel, beats) = (write::<f32>(&[2, 3], &[1.5; 6]), write::<f32>(&[4], &[2.0; 4]));
     let members = [("mel.npy", mel.as_slice()), ("beats.npy", &beats), ("note.txt", b"hello")];
     archive(&members, CompressionMethod::Stored)
 }
@@ -186,4 +186,27 @@ proptest! {
             }
         }
     }
+}
+
+#[test]
+fn what_is_written_is_read() {
+    let large: Vec<f32> = (0..30_011).map(|i| i as f32 * 0.5).collect();
+    let write = || {
+        let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
+        npz.add("large", &[30_011], large.iter().copied()).unwrap();
+        npz.add("scalar", &[], [-2.5f64]).unwrap();
+        npz.add("counts", &[1, 3], [7i64, -1, 1 << 40]).unwrap();
+        npz.add("none", &[0], Vec::<f32>::new()).unwrap();
+        npz.finish().unwrap().into_inner()
+    };
+    let bytes = write();
+    assert_eq!(bytes, write());
+    let mut npz = Npz::open(&bytes).unwrap();
+    assert_eq!(npz.keys(), ["large", "scalar", "counts", "none"]);
+    assert_eq!(npz.read_f32("large").unwrap(), NpyArray { shape: vec![30_011], values: large });
+    let of =
+        |shape: &[usize], values: &[f64]| NpyArray { shape: shape.into(), values: values.into() };
+    assert_eq!(npz.read_f64("scalar").unwrap(), of(&[], &[-2.5]));
+    assert_eq!(npz.read_f64("counts").unwrap(), of(&[1, 3], &[7.0, -1.0, (1u64 << 40) as f64]));
+    assert_eq!(npz.read_f64("none").unwrap(), of(&[0], &[]));
 }

@@ -7,13 +7,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
 use anyhow::{Context as _, bail};
+use ndarray::s;
 
 use super::one::{Extracted, Origin, extract, needed_bytes};
 use super::pool::{self, Budget, lock};
 use super::{Done, Job};
 use crate::audio::BLOCKS;
 use crate::audio::header::read_header_from;
-use crate::motion::{npy, npz};
+use crate::motion::npz::NpzWriter;
 use crate::stages::failure::{Failure, FailureKind};
 use crate::store::{
     Content, PartWriter, SourceFile, StoreError, replace_file, tables, temporary_beside,
@@ -152,38 +153,35 @@ fn extract_file(task: &Task, job: &Job<'_>) -> Result<Extracted, Failure> {
     };
     let (size_bytes, fingerprint) = (task.size_bytes, String::new());
     let file = SourceFile { path: path.clone(), size_bytes, fingerprint };
-    extract(Origin::Audio, &file, content, &job.rules)
+    extract(Origin::Audio, &file, content, |_| true, &job.rules)
 }
 
 /// Writes the reference's keys, and what else a reader may want of the file.
 fn write_npz(path: &Path, extracted: &Extracted) -> anyhow::Result<()> {
-    let n_frames = extracted.frames.nrows();
-    let mut members = Vec::new();
-    let mut first = 0;
-    for block in BLOCKS {
-        let mut values: Vec<f32> = Vec::with_capacity(block.len * n_frames);
-        for column in extracted.frames.columns().into_iter().skip(first).take(block.len) {
-            values.extend(column);
-        }
-        first += block.len;
-        let shape = [block.len, n_frames];
-        let shape = if block.len == 1 { &shape[1..] } else { &shape[..] };
-        members.push((block.name, npy::write(shape, &values)));
-    }
-    let all: Vec<f32> = extracted.frames.columns().into_iter().flatten().copied().collect();
-    members.push(("features", npy::write(&[all.len() / n_frames.max(1), n_frames], &all)));
-    let beat_times_s: Vec<f64> = extracted.beats.iter().map(|beat| beat.1).collect();
-    let beat_frames: Vec<i64> = extracted.beats.iter().map(|beat| beat.0 as i64).collect();
-    members.push(("tempo", npy::write(&[], &[extracted.tempo_bpm.unwrap_or(0.0)])));
-    members.push(("beat_times", npy::write(&[beat_times_s.len()], &beat_times_s)));
-    members.push(("beat_frames", npy::write(&[beat_frames.len()], &beat_frames)));
-    if let Some(heard) = extracted.audio {
-        members.push(("tuning", npy::write(&[], &[heard.tuning.bins()])));
-        members.push(("n_samples", npy::write(&[], &[heard.n_samples as i64])));
-    }
     let write = || -> std::io::Result<()> {
         let mut file = temporary_beside(&std::path::absolute(path)?)?;
-        npz::write(BufWriter::new(file.as_file_mut()), &members)?;
+        let mut npz = NpzWriter::new(BufWriter::new(file.as_file_mut()));
+        let n_frames = extracted.frames.nrows();
+        let mut first = 0;
+        for block in BLOCKS {
+            let columns = s![.., first..first + block.len];
+            // Columns of the frames are rows of the reference's arrays.
+            let values = extracted.frames.slice(columns).reversed_axes();
+            let shape = [block.len, n_frames];
+            let shape = if block.len == 1 { &shape[1..] } else { &shape[..] };
+            npz.add(block.name, shape, values.iter().copied())?;
+            first += block.len;
+        }
+        npz.add("features", &[first, n_frames], extracted.frames.t().iter().copied())?;
+        let beats = &extracted.beats;
+        npz.add("tempo", &[], [extracted.tempo_bpm.unwrap_or(0.0)])?;
+        npz.add("beat_times", &[beats.len()], beats.iter().map(|beat| beat.1))?;
+        npz.add("beat_frames", &[beats.len()], beats.iter().map(|beat| beat.0 as i64))?;
+        if let Some(heard) = extracted.audio {
+            npz.add("tuning", &[], [heard.tuning.bins()])?;
+            npz.add("n_samples", &[], [heard.n_samples as i64])?;
+        }
+        npz.finish()?.into_inner().map_err(std::io::IntoInnerError::into_error)?;
         replace_file(path, file)
     };
     write().with_context(|| format!("while writing {}", path.display()))

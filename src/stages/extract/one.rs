@@ -9,7 +9,7 @@ use crate::audio::recording::{Encoding, MAX_HELD_SAMPLES, Options, Recording};
 use crate::audio::{BLOCKS, FEATURE_DIM, Tuning};
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::feature_file::read_features;
-use crate::store::{Content, SourceFile, StoreError};
+use crate::store::{Content, SourceFile, StoreError, digest, digest_of};
 use crate::units::{frames_to_s, s_to_frames};
 
 /// How every phrase is done.
@@ -88,20 +88,29 @@ pub fn needed_bytes(duration_s: f64, file_bytes: u64) -> u64 {
 
 /// Turns the content of a file into features; a defect of ours costs the file, not the job.
 ///
+/// `is_as_recorded` is asked about the content's digest.
+///
 /// # Errors
 /// A [`Failure`] that names the file.
 pub fn extract(
     origin: Origin,
     file: &SourceFile,
     content: Result<Content, StoreError>,
+    is_as_recorded: impl FnOnce(&str) -> bool,
     rules: &Rules,
 ) -> Result<Extracted, Failure> {
     let path = file.path.as_str();
-    let content = content.map_err(|e| {
+    let mut content = content.map_err(|e| {
         let cause = std::error::Error::source(&e).map(|e| format!(" ({e})")).unwrap_or_default();
         Failure::new(FailureKind::Unreadable, path, format!("{e}{cause}"))
     })?;
     check_size(file, &content)?;
+    if !is_as_recorded(&hash_of(path, &mut content)?) {
+        let message = format!(
+            "{path}: has other content than when it was looked at; run ingest again, then extract"
+        );
+        return Err(Failure::new(FailureKind::Changed, path, message));
+    }
     guarded(path, || match origin {
         Origin::Audio => from_audio(path, content, rules),
         Origin::FeatureFile => from_feature_file(path, content),
@@ -123,6 +132,15 @@ fn check_size(file: &SourceFile, content: &Content) -> Result<(), Failure> {
         file.path, file.size_bytes
     );
     Err(Failure::new(FailureKind::Changed, &file.path, message))
+}
+
+fn hash_of(path: &str, content: &mut Content) -> Result<String, Failure> {
+    match content {
+        Content::Bytes(bytes) => Ok(digest(bytes)),
+        Content::File(open) => digest_of(open)
+            .and_then(|hash| open.rewind().map(|()| hash))
+            .map_err(|e| Failure::new(FailureKind::Unreadable, path, e)),
+    }
 }
 
 fn from_audio(path: &str, content: Content, rules: &Rules) -> Result<Extracted, Failure> {
@@ -181,7 +199,8 @@ fn from_feature_file(path: &str, content: Content) -> Result<Extracted, Failure>
             column.iter_mut().zip(row).for_each(|(to, from)| *to = *from);
         }
     })?;
-    let frame = |time_s: f64| s_to_frames(time_s).round() as usize;
+    let last = file.n_frames.saturating_sub(1);
+    let frame = |time_s: f64| (s_to_frames(time_s).round() as usize).min(last);
     let beats = file.beat_times_s.iter().map(|&time_s| (frame(time_s), time_s)).collect();
     Ok(Extracted {
         origin: Origin::FeatureFile,

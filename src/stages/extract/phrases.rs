@@ -13,6 +13,7 @@ use super::pool::{self, Budget, lock};
 use super::{Done, Extract, Job};
 use crate::stages::Stage as _;
 use crate::stages::failure::{Failure, FailureKind};
+use crate::stages::ingest::content_hash_of_audio;
 use crate::store::tables::{self, BeatRow, ExtractionRow, FailureRow, PhraseRow};
 use crate::store::{
     ClientOptions, Commit, Content, InOrder, Item, Ledger, Location, Row as _, Shard, Snapshot,
@@ -133,6 +134,16 @@ fn is_settled(task: &Task, ledger: &Ledger, params_hash: &str) -> bool {
         })
 }
 
+/// Returns whether a file with this digest can be the one that ingest saw.
+///
+/// The table has one digest of all files of a phrase, which is enough to tell where there is one.
+fn is_as_recorded(task: &Task, hash: &str) -> bool {
+    let row = &task.row;
+    let is_alone =
+        row.motion_url.is_none() && row.features_url.is_none() && row.beats_url.is_none();
+    !is_alone || content_hash_of_audio(hash) == row.content_hash
+}
+
 /// The name under which a phrase fails whose earlier rows stay.
 fn beside(id: &str) -> String {
     format!("{id} @ {}", Extract::NAME)
@@ -165,7 +176,7 @@ fn work_off(
             let Input { file, content, _permit } = input;
             let outcome = {
                 let _share = budget.take(needed_bytes(task.row.duration_s, task.size_bytes));
-                extract(task.origin, &file, content, &job.rules)
+                extract(task.origin, &file, content, |hash| is_as_recorded(&task, hash), &job.rules)
             };
             job.progress.advance(task.row.duration_s.round() as u64);
             lock(done).add(&task.row.phrase_id, &outcome);

@@ -14,7 +14,7 @@ use crate::store::{Cache, Ledger, Location, Shard, Source, StoreError, digest};
 
 use super::failure::Failure;
 pub use layout::{Layout, Plan, Planned, Role, plan};
-pub use phrase::Rules;
+pub use phrase::{Rules, content_hash_of_audio};
 
 /// Raised when ingest writes something else for the same input and rules.
 const OUTPUT_VERSION: u32 = 1;

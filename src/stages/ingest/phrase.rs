@@ -83,7 +83,7 @@ impl Files {
                     .and_then(|hash| file_content.rewind().map(|()| hash))
                     .map_err(|e| Failure::new(FailureKind::Unreadable, &file.path, e))?,
             };
-            lines += &format!("{} {hash}\n", role.name());
+            lines += &hash_line(role, &hash);
             taken.push((role, file, content));
         }
         Ok(Self { content_hash: digest(lines.as_bytes()), files: taken })
@@ -147,6 +147,16 @@ impl Files {
         check_lengths(&phrase, rules, &motion_path)?;
         Ok(phrase)
     }
+}
+
+/// One line of what a phrase's content hash is the digest of.
+fn hash_line(role: Role, hash: &str) -> String {
+    format!("{} {hash}\n", role.name())
+}
+
+/// Returns the content hash of a phrase that is an audio file with this digest and nothing else.
+pub fn content_hash_of_audio(hash: &str) -> String {
+    digest(hash_line(Role::Audio, hash).as_bytes())
 }
 
 fn check_lengths(phrase: &Phrase, rules: &Rules, motion_path: &str) -> Result<(), Failure> {

@@ -11,7 +11,7 @@ use ndarray::{Array2, s};
 use crate::audio::recording::{MAX_HELD_SAMPLES, Options, Recording};
 use crate::audio::spectral::MEL_RANGE_HZ;
 use crate::audio::{Tuning, mel};
-use crate::plot::{self, FeaturesPlot, Format, MAX_WIDTH_PX, MIN_WIDTH_PX, Panel, Picture};
+use crate::plot::{self, FeaturesPlot, Format, MAX_WIDTH_PX, MIN_WIDTH_PX, Panel};
 use crate::stages::extract::Extract;
 use crate::stages::failure::{Failure, guarded};
 use crate::stages::{ClientParams, Stage as _, Summary};
@@ -70,9 +70,9 @@ pub fn run(params: &Params) -> anyhow::Result<Box<dyn Summary>> {
     let format = format_of(output)?;
     check_excerpt(params.start, params.duration)?;
     let subject = match (&params.audio, &params.phrase, &params.store) {
-        (Some(_), Some(phrase), _) => bail!(
-            "--audio and --phrase {phrase} name two things to draw; give one of them"
-        ),
+        (Some(_), Some(phrase), _) => {
+            bail!("--audio and --phrase {phrase} name two things to draw; give one of them")
+        }
         (Some(audio), None, _) => from_audio(audio, params.tuning)?,
         (None, Some(phrase), Some(store)) => {
             let store = Location::open(store, &params.client.options())?;
@@ -190,11 +190,7 @@ fn from_audio(path: &Path, tuning: Option<Tuning>) -> anyhow::Result<Subject> {
 }
 
 /// Reads the features of a phrase.
-fn from_store(
-    store: &Location,
-    phrase: &str,
-    tuning: Option<Tuning>,
-) -> anyhow::Result<Subject> {
+fn from_store(store: &Location, phrase: &str, tuning: Option<Tuning>) -> anyhow::Result<Subject> {
     let rows = ItemTables::take(store, phrase)?;
     let Some(frames) = rows.frames(tables::features())? else {
         return Err(missing(store, phrase, &rows)?);
@@ -219,15 +215,14 @@ fn from_store(
 }
 
 /// Returns why a phrase has no features in the store, and the way out.
-fn missing(
-    store: &Location,
-    phrase: &str,
-    rows: &ItemTables,
-) -> Result<anyhow::Error, StoreError> {
+fn missing(store: &Location, phrase: &str, rows: &ItemTables) -> Result<anyhow::Error, StoreError> {
     let failures: Vec<FailureRow> = rows.rows()?;
-    if let Some(failure) = failures.into_iter().find(|f| f.stage == Extract::NAME) {
+    // What extract says is later than what ingest says.
+    let last = failures.into_iter().max_by_key(|failure| failure.stage == Extract::NAME);
+    if let Some(failure) = last {
         return Ok(anyhow!(
-            "store {store} has no features of phrase \"{phrase}\", since extract failed on it: {}",
+            "store {store} has no features of phrase \"{phrase}\", since {} failed on it: {}",
+            failure.stage,
             failure.message
         ));
     }
@@ -268,9 +263,10 @@ impl Summary for Drawn {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
         let Drawn { output, width_px, height_px, n_frames } = self;
         let seconds = frames_to_s(*n_frames);
+        let unit = if *n_frames == 1 { "frame" } else { "frames" };
         writeln!(
             out,
-            "{n_frames} frames ({seconds:.2} s) → {} ({width_px} × {height_px} px)",
+            "{n_frames} {unit} ({seconds:.2} s) → {} ({width_px} × {height_px} px)",
             output.display()
         )
     }
