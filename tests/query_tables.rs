@@ -191,7 +191,9 @@ fn tables_counts_rows_bytes_and_parts_of_what_is_live() {
     let expected = |tables: [(&str, usize); 3]| {
         let mut text =
             String::from("table                    rows          bytes   parts  version\n");
-        for (name, n_rows) in tables {
+        let of_extract = ["features", "extractions", "beats"].map(|name| (name, 0));
+        let [phrases, motion, failures] = tables;
+        for (name, n_rows) in [phrases, motion].into_iter().chain(of_extract).chain([failures]) {
             let live = live_files(&store, name);
             let n_bytes: u64 = live.iter().sum();
             text += &format!("{name:<16} {n_rows:>12} {n_bytes:>14} {:>7}        1\n", live.len());
@@ -311,6 +313,9 @@ fn an_empty_store_has_every_table_without_rows() {
 table                    rows          bytes   parts  version
 phrases                     0              0       0        1
 motion                      0              0       0        1
+features                    0              0       0        1
+extractions                 0              0       0        1
+beats                       0              0       0        1
 failures                    0              0       0        1
 ";
     let output = ask(&store, &["--tables"]);
@@ -355,14 +360,15 @@ fn an_unknown_column_comes_with_the_nearest_ones() {
 fn an_unknown_table_comes_with_the_nearest_and_all_others() {
     let dir = Dir::new();
     for (sql, table, nearest) in [
-        ("select * from phrase", "phrase", "phrases, failures, motion"),
+        ("select * from phrase", "phrase", "phrases, beats, failures"),
         ("select * from phrases join motions using (phrase_id)", "motions", "motion"),
         ("select count(*) from failure", "failure", "failures"),
     ] {
         let sentence = refusal(&dir.at("store"), sql);
         let start = format!("table \"{table}\" not found; nearest: {nearest}");
         assert!(sentence.starts_with(&start), "{sentence}");
-        assert!(sentence.ends_with("; a store has phrases, motion, failures"), "{sentence}");
+        let all = "; a store has phrases, motion, features, extractions, beats, failures";
+        assert!(sentence.ends_with(all), "{sentence}");
     }
 }
 
@@ -467,5 +473,6 @@ fn a_store_in_memory_is_asked_inside_the_process() {
     assert!(matches!(error, StoreError::Query(_)), "{error:?}");
     let infos = table_infos(&store, &options).expect("a store");
     let counts: Vec<_> = infos.iter().map(|i| (i.name, i.n_rows, i.n_parts)).collect();
-    assert_eq!(counts, [("phrases", 0, 0), ("motion", 0, 0), ("failures", 3, 2)]);
+    let empty = ["phrases", "motion", "features", "extractions", "beats"].map(|name| (name, 0, 0));
+    assert_eq!(counts, [&empty[..], &[("failures", 3, 2)]].concat());
 }

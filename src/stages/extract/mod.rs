@@ -30,8 +30,8 @@ pub struct Extract;
 #[derive(Clone, Debug, clap::Args)]
 pub struct Params {
     /// Folder or bucket of the tables: extracts every phrase that has audio (or a feature file) and
-    /// no current features.
-    #[arg(long, value_name = "URL", required_unless_present = "audio", conflicts_with = "audio")]
+    /// no current features. Not used with --audio.
+    #[arg(long, value_name = "URL", required_unless_present = "audio")]
     pub store: Option<String>,
     /// Audio files to extract without a store (WAV, AIFF, FLAC, MP3, Ogg Vorbis, M4A or AAC).
     #[arg(long, value_name = "FILE", num_args = 1.., requires = "output")]
@@ -111,8 +111,13 @@ impl Stage for Extract {
             dry_run: params.dry_run,
             progress,
         };
-        let (place, done) = match (&params.store, &params.output) {
-            (Some(store), _) => {
+        let output = params.output.as_ref().filter(|_| !params.audio.is_empty());
+        let (place, done) = match (&params.store, output) {
+            (_, Some(output)) => {
+                let done = files::run(&job, &params.audio, output)?;
+                (Place::Files(output.display().to_string()), done)
+            }
+            (Some(store), None) => {
                 let options = params.client.options();
                 let store = Location::open(store, &options)?;
                 let target = phrases::Target {
@@ -123,10 +128,6 @@ impl Stage for Extract {
                     force: params.force,
                 };
                 (Place::Store(store.to_string()), phrases::run(&job, &target)?)
-            }
-            (None, Some(output)) => {
-                let done = files::run(&job, &params.audio, output)?;
-                (Place::Files(output.display().to_string()), done)
             }
             (None, None) => anyhow::bail!("nothing to do: give --store, or --audio with --output"),
         };
