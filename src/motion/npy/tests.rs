@@ -229,13 +229,13 @@ fn written_as_numpy_writes() {
         b"\x00\x00\x80\x3f\x00\x00\x00\x40",
     ]
     .concat();
-    assert_eq!(write(&[1, 2], &[1.0, 2.0]), expected);
+    assert_eq!(write::<f32>(&[1, 2], &[1.0, 2.0]), expected);
 }
 
 #[test]
 #[should_panic(expected = "shape [2, 2] against 3 values")]
 fn writing_checks_the_shape() {
-    write(&[2, 2], &[0.0; 3]);
+    write::<f32>(&[2, 2], &[0.0; 3]);
 }
 
 fn bits(values: &[f32]) -> Vec<u32> {
