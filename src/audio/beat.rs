@@ -1,9 +1,7 @@
 //! Tempo and beats from an onset envelope (Ellis 2007, "Beat tracking by dynamic programming"), as
 //! librosa's `beat_track` with its defaults at 30 frames per second.
 
-use realfft::RealFftPlanner;
-
-use super::stft::hann;
+use super::stft::{hann, planner};
 use crate::units::FPS;
 
 /// Frames per minute: a lag of k frames is a tempo of 1800/k bpm.
@@ -80,8 +78,10 @@ fn mean_autocorrelation(e: &[f64]) -> Vec<f64> {
     let padded: Vec<f64> = before.chain(e.iter().copied()).chain(after).collect();
 
     let window: Vec<f64> = (0..N_LAGS).map(|n| hann(n, N_LAGS)).collect();
-    let mut planner = RealFftPlanner::new();
-    let (forward, inverse) = (planner.plan_fft_forward(N_FFT), planner.plan_fft_inverse(N_FFT));
+    let (forward, inverse) = {
+        let mut planner = planner();
+        (planner.plan_fft_forward(N_FFT), planner.plan_fft_inverse(N_FFT))
+    };
     let (mut time, mut spectrum) = (forward.make_input_vec(), forward.make_output_vec());
     let mut scratch = forward.make_scratch_vec();
     // The mean commutes with the inverse transform, so one of those is enough.

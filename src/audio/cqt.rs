@@ -39,8 +39,10 @@ const ROUNDING_SHARE: [(f64, f64); N_OCTAVES] = [
     (3.815e-6, -9.427e-7),
 ];
 /// Bins around a kernel's centre whose magnitudes are summed exactly; what lies beyond is less
-/// than 10⁻⁶ of the total, and estimated.
-const EXACT_BINS: usize = 1024;
+/// than 10⁻⁵ of the total, and estimated.
+const EXACT_BINS: usize = 384;
+/// Bins on either side of a kernel's centre among which its weights are sought; it keeps 24 at most.
+const REACH_BINS: usize = 24;
 
 /// Where an octave is taken from.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -167,6 +169,11 @@ fn octave_kernels(octave: Octave, tuning: Tuning) -> OctaveKernels {
     (lowest..lowest + BINS_PER_OCTAVE).map(|k| Wavelet::new(octave, tuning, k).kernel()).collect()
 }
 
+/// |b|, without the guard against overflow that makes `norm` slow.
+fn magnitude(b: &Complex64) -> f64 {
+    b.norm_sqr().sqrt()
+}
+
 /// A Hann-windowed complex exponential of about Q periods.
 struct Wavelet {
     n_fft: usize,
@@ -180,6 +187,8 @@ struct Wavelet {
     scale: f64,
     /// The row's part of [`ROUNDING_SHARE`].
     rounding_share: f64,
+    /// Sine and cosine of π/K.
+    window_turn: (f64, f64),
 }
 
 impl Wavelet {
@@ -199,6 +208,7 @@ impl Wavelet {
         let position = (k % BINS_PER_OCTAVE) as f64 / (BINS_PER_OCTAVE - 1) as f64;
         Self {
             rounding_share: lowest + more * position,
+            window_turn: (PI / n as f64).sin_cos(),
             n_fft: octave.n_fft,
             frequency: hz / octave.rate_hz,
             n,
@@ -220,6 +230,26 @@ impl Wavelet {
     /// S(φ) = Σⱼ e^(iφj) = e^(iφ(K−1)/2) · sin(Kφ/2)/sin(φ/2)
     fn spectrum(&self, m: usize) -> Complex64 {
         let n = self.n as f64;
+        let phi = self.phi(m);
+        // S(φ ± 2π/K) has the same sin(Kφ/2) but for its sign, so one sine serves all three.
+        let (sin, cos) = (phi / 2.0).sin_cos();
+        let (turn_sin, turn_cos) = self.window_turn;
+        let above = sin * turn_cos + cos * turn_sin;
+        let below = sin * turn_cos - cos * turn_sin;
+        if sin.abs().min(above.abs()).min(below.abs()) < 1e-7 {
+            return self.spectrum_at_peak(m);
+        }
+        let (a, b) = (0.25 / above, 0.25 / below);
+        let window = Complex64::new(0.5 / sin - turn_cos * (a + b), turn_sin * (a - b));
+        // Reduced before it becomes an angle, which keeps it exact.
+        let turns = (m * self.offset % self.n_fft) as f64 / self.n_fft as f64;
+        let phase = phi / 2.0 * (n - 1.0) - TAU * turns;
+        window * Complex64::from_polar((n * phi / 2.0).sin(), phase)
+    }
+
+    /// [`Wavelet::spectrum`] where a term is 0/0: at the middle or a first zero of the window.
+    fn spectrum_at_peak(&self, m: usize) -> Complex64 {
+        let n = self.n as f64;
         let sum = |phi: f64| {
             let half = phi / 2.0;
             let ratio = if half.sin().abs() < 1e-12 { n } else { (n * half).sin() / half.sin() };
@@ -227,7 +257,6 @@ impl Wavelet {
         };
         let phi = self.phi(m);
         let window = sum(phi) * 0.5 - (sum(phi + TAU / n) + sum(phi - TAU / n)) * 0.25;
-        // Reduced before it becomes an angle, which keeps it exact.
         let turns = (m * self.offset % self.n_fft) as f64 / self.n_fft as f64;
         window * Complex64::from_polar(1.0, -TAU * turns)
     }
@@ -243,7 +272,7 @@ impl Wavelet {
         let mut fast = Complex64::from_polar(1.0, n * half);
         let slow_step = Complex64::from_polar(1.0, -PI / self.n_fft as f64);
         let fast_step = Complex64::from_polar(1.0, -PI * n / self.n_fft as f64);
-        let (sin, cos) = (PI / n).sin_cos();
+        let (sin, cos) = self.window_turn;
         let mut sum = 0.0;
         for _ in bins {
             let above = slow.im * cos + slow.re * sin;
@@ -261,12 +290,16 @@ impl Wavelet {
     /// Returns the wavelet's sparse spectrum: the bins that hold all but [`SPARSITY`] of its
     /// magnitude.
     fn kernel(&self) -> Kernel {
-        let bins: Vec<Complex64> = DFT_BINS.map(|m| self.spectrum(m)).collect();
-        let mut magnitudes: Vec<f64> = bins.iter().map(|b| b.norm()).collect();
+        // Bins further from the wavelet's frequency than this are below any threshold.
+        let centre = (self.frequency * self.n_fft as f64).round() as usize;
+        let start = centre.saturating_sub(REACH_BINS).max(*DFT_BINS.start());
+        let end = (centre + REACH_BINS).min(*DFT_BINS.end()) + 1;
+        let bins: Vec<Complex64> = (start..end).map(|m| self.spectrum(m)).collect();
+        let mut magnitudes: Vec<f64> = bins.iter().map(magnitude).collect();
         let near: f64 = magnitudes.iter().sum();
-        let far = self.magnitude_sum(0..*DFT_BINS.start()) + self.magnitude_above();
+        let far = self.magnitude_sum(0..start) + self.magnitude_above(end);
         // librosa sorts all magnitudes of the row and keeps those from the one on at which the
-        // cumulative sum reaches the share. Bins outside DFT_BINS are all below it.
+        // cumulative sum reaches the share.
         let total = near + far;
         magnitudes.sort_unstable_by(f64::total_cmp);
         let mut cumulative = far;
@@ -278,16 +311,18 @@ impl Wavelet {
                 break;
             }
         }
-        let is_kept = |b: &Complex64| b.norm() >= threshold;
+        let is_kept = |b: &Complex64| magnitude(b) >= threshold;
         let first = bins.iter().position(is_kept).unwrap_or(0);
         let last = bins.iter().rposition(is_kept).unwrap_or(0);
         let weight = |b: &Complex64| if is_kept(b) { b * self.scale } else { Complex64::default() };
-        Kernel::new(first, &bins[first..=last].iter().map(weight).collect::<Vec<_>>())
+        Kernel::new(
+            start - DFT_BINS.start() + first,
+            &bins[first..=last].iter().map(weight).collect::<Vec<_>>(),
+        )
     }
 
-    /// Returns Σ |W| over the bins above [`DFT_BINS`] up to the Nyquist frequency.
-    fn magnitude_above(&self) -> f64 {
-        let start = *DFT_BINS.end() + 1;
+    /// Returns Σ |W| over the bins from `start` up to the Nyquist frequency.
+    fn magnitude_above(&self, start: usize) -> f64 {
         let nyquist = self.n_fft / 2;
         let end = (start + EXACT_BINS).min(nyquist + 1);
         let exact = self.magnitude_sum(start..end);

@@ -1,10 +1,12 @@
 //! Halving the sample rate, for the lower octaves of the constant-Q transform.
 
 use std::f64::consts::PI;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use realfft::num_complex::Complex64;
-use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
+use realfft::{ComplexToReal, RealToComplex};
+
+use super::stft::planner;
 
 /// Taps of the filter, symmetric around the middle one.
 pub const N_TAPS: usize = 389;
@@ -61,8 +63,7 @@ fn bessel_i0(x: f64) -> f64 {
 pub struct Halver {
     forward: Arc<dyn RealToComplex<f64>>,
     inverse: Arc<dyn ComplexToReal<f64>>,
-    /// Transform of the taps, scaled by √2 and the transforms' own factor.
-    response: Vec<Complex64>,
+    response: &'static [Complex64],
     /// The last samples that were not yet filtered, after the overlap with the block before.
     pending: Vec<f32>,
     time: Vec<f64>,
@@ -74,27 +75,34 @@ pub struct Halver {
     n_out: usize,
 }
 
+/// Returns the transform of the taps, scaled by √2 and the transforms' own factor.
+fn response(forward: &dyn RealToComplex<f64>) -> Vec<Complex64> {
+    let mut time = forward.make_input_vec();
+    // √2 keeps the energy; 1/N_FFT undoes the two transforms' gain of N_FFT/2 and the fold of 2.
+    let scale = 2f64.sqrt() / N_FFT as f64;
+    for (t, h) in time.iter_mut().zip(taps()) {
+        *t = h * scale;
+    }
+    let mut response = forward.make_output_vec();
+    forward.process(&mut time, &mut response).expect("invariant: buffers of the plan");
+    response
+}
+
 impl Halver {
     pub fn new() -> Self {
-        let mut planner = RealFftPlanner::new();
-        let forward = planner.plan_fft_forward(N_FFT);
-        let inverse = planner.plan_fft_inverse(N_FFT / 2);
-        let mut time = forward.make_input_vec();
-        // √2 keeps the energy; 1/N_FFT undoes the two transforms' gain of N_FFT/2 and the fold of 2.
-        let scale = 2f64.sqrt() / N_FFT as f64;
-        for (t, h) in time.iter_mut().zip(taps()) {
-            *t = h * scale;
-        }
-        let mut response = forward.make_output_vec();
-        forward.process(&mut time, &mut response).expect("invariant: buffers of the plan");
+        static RESPONSE: OnceLock<Vec<Complex64>> = OnceLock::new();
+        let (forward, inverse) = {
+            let mut planner = planner();
+            (planner.plan_fft_forward(N_FFT), planner.plan_fft_inverse(N_FFT / 2))
+        };
         let n_scratch = forward.get_scratch_len().max(inverse.get_scratch_len());
         Self {
+            response: RESPONSE.get_or_init(|| response(forward.as_ref())),
             spectrum: forward.make_output_vec(),
             folded: inverse.make_input_vec(),
             halved: inverse.make_output_vec(),
             scratch: vec![Complex64::default(); n_scratch],
-            time,
-            response,
+            time: forward.make_input_vec(),
             // The filter's centre lies 194 taps behind its end: that much zero signal comes first.
             pending: vec![0.0; OVERLAP - CENTRE],
             n_in: 0,
@@ -157,7 +165,7 @@ impl Halver {
         self.forward
             .process_with_scratch(&mut self.time, &mut self.spectrum, &mut self.scratch)
             .expect("invariant: buffers of the plan");
-        for (x, h) in self.spectrum.iter_mut().zip(&self.response) {
+        for (x, h) in self.spectrum.iter_mut().zip(self.response) {
             *x *= h;
         }
         // Keeping every second sample folds bin k onto bin N/2 − k.

@@ -26,7 +26,7 @@ const HOP: usize = 735;
 /// Samples on either side of a block's middle.
 const HALF: usize = HOP / 2;
 /// Frames that are updated by one product.
-const BATCH: usize = 64;
+const BATCH: usize = 32;
 /// Part of the longest wave that a basis may miss. Errors of this size stay in D for
 /// ever, so it lies near the precision of f64.
 const RANK_TOLERANCE: f64 = 1e-13;

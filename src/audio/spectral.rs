@@ -1,5 +1,7 @@
 //! Features that follow from one frame at a time: RMS, spectral centroid, mel bands.
 
+use std::sync::LazyLock;
+
 use super::framing::Framer;
 use super::mel::{MelBank, N_MELS, power_to_db};
 use super::stft::{Dft, hann_power};
@@ -9,6 +11,10 @@ use super::{HOP, N_FFT, SAMPLE_RATE_HZ};
 pub const MEL_RANGE_HZ: (f64, f64) = (20.0, 8000.0);
 /// Range of the mel bands from which MFCC, onsets and beats come: everything.
 const FULL_RANGE_HZ: (f64, f64) = (0.0, 22_050.0);
+
+static MEL_BANK: LazyLock<MelBank> = LazyLock::new(|| MelBank::new(MEL_RANGE_HZ.0, MEL_RANGE_HZ.1));
+static FULL_BANK: LazyLock<MelBank> =
+    LazyLock::new(|| MelBank::new(FULL_RANGE_HZ.0, FULL_RANGE_HZ.1));
 
 /// Root mean square of a frame: √(Σ y² / N).
 pub fn rms(frame: &[f32]) -> f32 {
@@ -34,8 +40,6 @@ pub fn centroid_hz(magnitude: &[f64]) -> f64 {
 pub struct SpectralPass {
     framer: Framer,
     dft: Dft,
-    mel_bank: MelBank,
-    full_bank: MelBank,
     power: Vec<f64>,
     magnitude: Vec<f64>,
     pub found: Spectral,
@@ -57,8 +61,6 @@ impl SpectralPass {
         Self {
             framer: Framer::new(N_FFT, HOP),
             dft: Dft::new(N_FFT),
-            mel_bank: MelBank::new(MEL_RANGE_HZ.0, MEL_RANGE_HZ.1),
-            full_bank: MelBank::new(FULL_RANGE_HZ.0, FULL_RANGE_HZ.1),
             power: vec![0.0; N_FFT / 2 + 1],
             magnitude: vec![0.0; N_FFT / 2 + 1],
             found: Spectral::default(),
@@ -67,16 +69,14 @@ impl SpectralPass {
 
     /// Takes the next samples at 44.1 kHz.
     pub fn push(&mut self, samples: &[f32]) {
-        let Self { framer, dft, mel_bank, full_bank, power, magnitude, found } = self;
-        framer.push(samples, |frame| {
-            found.add(frame, dft, (mel_bank, full_bank), power, magnitude);
-        });
+        let Self { framer, dft, power, magnitude, found } = self;
+        framer.push(samples, |frame| found.add(frame, dft, power, magnitude));
     }
 
     /// Ends the signal.
     pub fn finish(mut self) -> Spectral {
-        let Self { framer, dft, mel_bank, full_bank, power, magnitude, found } = &mut self;
-        framer.finish(|frame| found.add(frame, dft, (mel_bank, full_bank), power, magnitude));
+        let Self { framer, dft, power, magnitude, found } = &mut self;
+        framer.finish(|frame| found.add(frame, dft, power, magnitude));
         self.found
     }
 }
@@ -88,14 +88,7 @@ impl Default for SpectralPass {
 }
 
 impl Spectral {
-    fn add(
-        &mut self,
-        frame: &[f32],
-        dft: &mut Dft,
-        (mel_bank, full_bank): (&MelBank, &MelBank),
-        power: &mut [f64],
-        magnitude: &mut [f64],
-    ) {
+    fn add(&mut self, frame: &[f32], dft: &mut Dft, power: &mut [f64], magnitude: &mut [f64]) {
         hann_power(dft.of(frame), power);
         for (s, p) in magnitude.iter_mut().zip(power.iter_mut()) {
             // librosa squares the magnitude that it has rounded to f32.
@@ -106,8 +99,8 @@ impl Spectral {
         self.rms.push(rms(frame));
         self.centroid_hz.push(centroid_hz(magnitude));
         let db = |bank: &MelBank| -> [f32; N_MELS] { bank.apply(power).map(power_to_db) };
-        self.mel_db.extend(db(mel_bank));
-        self.full_db.extend(db(full_bank));
+        self.mel_db.extend(db(&MEL_BANK));
+        self.full_db.extend(db(&FULL_BANK));
     }
 }
 

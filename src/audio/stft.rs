@@ -1,10 +1,18 @@
 //! The discrete Fourier transform of one frame, in f64 as librosa computes it.
 
 use std::f64::consts::TAU;
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock, Mutex, MutexGuard, PoisonError};
 
 use realfft::num_complex::{Complex32, Complex64};
 use realfft::{RealFftPlanner, RealToComplex};
+
+/// Returns the planner of this process, which keeps its plans: short files spend more on planning
+/// than on transforming.
+pub fn planner() -> MutexGuard<'static, RealFftPlanner<f64>> {
+    static PLANNER: LazyLock<Mutex<RealFftPlanner<f64>>> =
+        LazyLock::new(|| Mutex::new(RealFftPlanner::new()));
+    PLANNER.lock().unwrap_or_else(PoisonError::into_inner)
+}
 
 /// Transforms frames of a fixed even length.
 ///
@@ -19,7 +27,7 @@ pub struct Dft {
 impl Dft {
     /// Plans the transform of `n` samples.
     pub fn new(n: usize) -> Self {
-        let fft = RealFftPlanner::new().plan_fft_forward(n);
+        let fft = planner().plan_fft_forward(n);
         let (frame, spectrum) = (fft.make_input_vec(), fft.make_output_vec());
         let scratch = fft.make_scratch_vec();
         Self { fft, frame, spectrum, scratch }
