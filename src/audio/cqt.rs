@@ -86,7 +86,7 @@ impl Spectrum {
 /// Terms that a kernel sums side by side.
 const LANES: usize = 4;
 
-/// One row of the transform: C = |Σ_f B[f] · D[f]|.
+/// One row of the transform: C = |Σ_f B\[f\] · D\[f\]|.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Kernel {
     /// Index of the first weight's DFT bin, counted from the start of [`DFT_BINS`].

@@ -24,7 +24,7 @@ const OVERLAP: usize = N_TAPS - 1;
 /// Even, so that every block starts on a sample that is kept.
 const BLOCK: usize = N_FFT - OVERLAP;
 
-/// h[i] = F_c · sinc(F_c z) · I₀(β√(1 − (z/194.5)²)) / I₀(β), z = i − 194.
+/// h\[i\] = F_c · sinc(F_c z) · I₀(β√(1 − (z/194.5)²)) / I₀(β), z = i − 194.
 pub fn taps() -> Vec<f64> {
     (0..N_TAPS)
         .map(|i| {
@@ -56,7 +56,7 @@ fn bessel_i0(x: f64) -> f64 {
     sum
 }
 
-/// Halves the rate of a stream: y₂[m] = √2 · Σᵢ h[i] · y[2m + 194 − i], ⌈n/2⌉ samples.
+/// Halves the rate of a stream: y₂\[m\] = √2 · Σᵢ h\[i\] · y\[2m + 194 − i\], ⌈n/2⌉ samples.
 ///
 /// Blocks are convolved by overlap-save; the spectrum is folded at half the rate, so the inverse
 /// transform is half as long. Where the filter sees nothing but zeros the result is exactly 0.

@@ -161,11 +161,11 @@ pub struct RawFeatures {
     pub chroma: Array2<f32>,
     /// [T, 20].
     pub mfcc: Array2<f32>,
-    /// [T].
+    /// \[T\].
     pub rms: Vec<f32>,
-    /// [T], Hz.
+    /// \[T\], Hz.
     pub centroid_hz: Vec<f64>,
-    /// [T], dB.
+    /// \[T\], dB.
     pub onset_strength: Vec<f32>,
 }
 

@@ -9,7 +9,7 @@ pub const N_MFCC: usize = 20;
 
 /// The orthonormal DCT-II of a frame's decibels.
 ///
-/// c_k = s_k · Σₙ D[n] · cos(πk(2n + 1)/2N), N = 128, s₀ = √(1/N), s_k = √(2/N) (Davis and
+/// c_k = s_k · Σₙ D\[n\] · cos(πk(2n + 1)/2N), N = 128, s₀ = √(1/N), s_k = √(2/N) (Davis and
 /// Mermelstein 1980; scaled as in librosa).
 pub struct Dct {
     rows: Vec<[f64; N_MELS]>,

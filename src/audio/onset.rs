@@ -13,7 +13,7 @@ pub struct Onset {
 
 /// Returns the spectral flux of mel decibels, [T, 128] row by row.
 ///
-/// o[0] = 0, o[t] = aggregate over bands b of max(0, D[t, b] − D[t−1, b]) (Böck and Widmer 2013
+/// o\[0\] = 0, o\[t\] = aggregate over bands b of max(0, D\[t, b\] − D\[t−1, b\]) (Böck and Widmer 2013
 /// without the maximum filter, as librosa's default).
 pub fn onset_strength(db: &[f32]) -> Onset {
     let frames = || db.chunks_exact(N_MELS);

@@ -3,11 +3,11 @@
 //! The low octaves of the constant-Q transform need 121 bins of frames of 4096 … 65,536 samples
 //! that advance by 735. Only what enters and what leaves a frame changes its transform:
 //!
-//! D_t[f] = Σ_{n<N} y[a + n] · e^(−iθn), θ = 2πf/N, a = 735t − N/2
-//! D_{t+1} = e^(735iθ) · (D_t + Σ_{n<735} d[n] · e^(−iθn)), d[n] = y[a + N + n] − y[a + n]
+//! D_t\[f\] = Σ_{n<N} y\[a + n\] · e^(−iθn), θ = 2πf/N, a = 735t − N/2
+//! D_{t+1} = e^(735iθ) · (D_t + Σ_{n<735} d\[n\] · e^(−iθn)), d\[n\] = y\[a + N + n\] − y\[a + n\]
 //!
 //! because e^(−iθN) = 1. Around the middle of the block, n = 367 + m, the sum is
-//! e^(−367iθ) · (Σ E[m] cos θm − i Σ O[m] sin θm) with the even and odd parts E, O of d. Over the
+//! e^(−367iθ) · (Σ E\[m\] cos θm − i Σ O\[m\] sin θm) with the even and odd parts E, O of d. Over the
 //! 121 neighbouring frequencies the cosines have low numerical rank: they are projected on an
 //! orthonormal basis of 17 … 60 vectors first, the sines likewise. All of it is a product of
 //! matrices in f64. Compared with one FFT per frame it takes a tenth of the operations.

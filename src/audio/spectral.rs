@@ -22,7 +22,7 @@ pub fn rms(frame: &[f32]) -> f32 {
     (energy / frame.len() as f64).sqrt() as f32
 }
 
-/// Spectral centroid in Hz: Σ_k f_k S[k] / Σ_k S[k]; 0 for silence.
+/// Spectral centroid in Hz: Σ_k f_k S\[k\] / Σ_k S\[k\]; 0 for silence.
 pub fn centroid_hz(magnitude: &[f64]) -> f64 {
     let (mut weighted, mut sum) = (0.0, 0.0);
     for (k, s) in magnitude.iter().enumerate() {

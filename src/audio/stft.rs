@@ -16,7 +16,7 @@ pub fn planner() -> MutexGuard<'static, RealFftPlanner<f64>> {
 
 /// Transforms frames of a fixed even length.
 ///
-/// D[k] = Σₙ y[n] · e^(−2πikn/N), k = 0 … N/2, without a window.
+/// D\[k\] = Σₙ y\[n\] · e^(−2πikn/N), k = 0 … N/2, without a window.
 pub struct Dft {
     fft: Arc<dyn RealToComplex<f64>>,
     frame: Vec<f64>,
@@ -45,9 +45,9 @@ impl Dft {
     }
 }
 
-/// Writes the power |X[k]|² of a frame under a periodic Hann window, from its unwindowed spectrum.
+/// Writes the power |X\[k\]|² of a frame under a periodic Hann window, from its unwindowed spectrum.
 ///
-/// The window ½ − ½cos(2πn/N) in time is X[k] = ½D[k] − ¼(D[k−1] + D[k+1]) in frequency, which
+/// The window ½ − ½cos(2πn/N) in time is X\[k\] = ½D\[k\] − ¼(D\[k−1\] + D\[k+1\]) in frequency, which
 /// lets the constant-Q transform share the transform of the same frame. X is rounded to single
 /// precision, as librosa stores it; the square is taken in f64.
 pub fn hann_power(spectrum: &[Complex64], power: &mut [f64]) {

@@ -60,7 +60,7 @@ pub fn read_f64_from(reader: impl Read, byte_limit: u64) -> Result<NpyArray<f64>
     read_array(reader, byte_limit, 0)
 }
 
-/// A number that [`write`] can store.
+/// A number that [`write()`] can store.
 pub trait Writable: Copy {
     /// NumPy's name of the type.
     const DESCR: &'static str;
@@ -98,7 +98,7 @@ pub fn write<T: Writable>(shape: &[usize], values: &[T]) -> Vec<u8> {
     file
 }
 
-/// Returns what comes before the values, in C order, of an array of `shape`: see [`write`].
+/// Returns what comes before the values, in C order, of an array of `shape`: see [`write()`].
 ///
 /// # Panics
 /// If there are over 64 axes.
