@@ -84,7 +84,7 @@ fuzz: ## fuzz the readers of untrusted files, each for a minute [FUZZ_SECONDS=60
 	for target in $(basename $(notdir $(wildcard fuzz/fuzz_targets/*.rs))); do \
 	  mkdir -p fuzz/corpus/$$target; \
 	  RUSTC_BOOTSTRAP=1 $(CARGO) fuzz run $$target fuzz/corpus/$$target fuzz/seeds/$$target -- \
-	    -max_total_time=$(FUZZ_SECONDS) -rss_limit_mb=512; \
+	    -max_total_time=$(FUZZ_SECONDS) -rss_limit_mb=1024; \
 	done
 
 .PHONY: clean-demo
