@@ -3,7 +3,9 @@
 //! The rooms and what they may use are in `docs/architecture.md`; a test keeps them so.
 
 pub mod audio;
+pub mod autodiff;
 pub mod cli;
+pub mod model;
 pub mod motion;
 pub mod plot;
 pub mod stages;

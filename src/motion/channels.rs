@@ -65,6 +65,19 @@ impl Channel {
         Self::Style,
     ];
 
+    /// The name of the group, with which its columns' names begin.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Position => "position",
+            Self::Velocity => "velocity",
+            Self::Acceleration => "acceleration",
+            Self::Quaternion => "quaternion",
+            Self::AngularVelocity => "angular_velocity",
+            Self::Phase => "phase",
+            Self::Style => "style",
+        }
+    }
+
     /// Number of columns of the group.
     pub const fn width(self) -> usize {
         match self {
@@ -117,17 +130,9 @@ mod tests {
 
     #[test]
     fn names_agree_with_the_groups() {
-        for (group, prefix) in [
-            (Channel::Position, "position_"),
-            (Channel::Velocity, "velocity_"),
-            (Channel::Acceleration, "acceleration_"),
-            (Channel::Quaternion, "quaternion_"),
-            (Channel::AngularVelocity, "angular_velocity_"),
-            (Channel::Phase, "phase"),
-            (Channel::Style, "style_"),
-        ] {
+        for group in Channel::ALL {
             for i in group.range() {
-                assert!(CHANNEL_NAMES[i].starts_with(prefix), "{}", CHANNEL_NAMES[i]);
+                assert!(CHANNEL_NAMES[i].starts_with(group.name()), "{}", CHANNEL_NAMES[i]);
             }
         }
         assert_eq!(CHANNEL_NAMES[9], "quaternion_w");

@@ -1,0 +1,124 @@
+//! Buffers that come back: an array that is no longer needed serves the next one of its size.
+//!
+//! A training step asks for the same sizes in the same order each time. Memory fresh from the system
+//! must be cleared page by page, which costs as much as filling it; after the first step none is.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use ndarray::{Array1, ArrayD, IxDyn, s};
+
+use super::element::Element;
+
+/// Elements to a cache line of `f32`; every array begins on a line.
+const ALIGNMENT: usize = 16;
+
+/// A pool of arrays, shared by its clones.
+#[derive(Clone, Debug)]
+pub struct Arena<E>(Arc<Mutex<Pool<E>>>);
+
+#[derive(Debug)]
+struct Pool<E> {
+    /// Free arrays by length.
+    free: BTreeMap<usize, Vec<Array1<E>>>,
+    in_use: usize,
+    usage: Usage,
+}
+
+/// How much memory an arena has handed out, in bytes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Usage {
+    /// Held by arrays in use.
+    pub in_use_bytes: usize,
+    /// The most that was in use at once.
+    pub peak_bytes: usize,
+    /// Asked of the system so far, in use or free.
+    pub reserved_bytes: usize,
+}
+
+impl<E: Element> Default for Arena<E> {
+    fn default() -> Self {
+        Self(Arc::new(Mutex::new(Pool {
+            free: BTreeMap::new(),
+            in_use: 0,
+            usage: Usage::default(),
+        })))
+    }
+}
+
+impl<E: Element> Arena<E> {
+    /// Returns an array that begins on a cache line, cleared.
+    pub fn aligned(len: usize) -> Array1<E> {
+        let memory = Array1::from_vec(vec![E::ZERO; len + ALIGNMENT]);
+        let bytes = memory.as_ptr() as usize % (ALIGNMENT * size_of::<E>());
+        let skip = (ALIGNMENT - bytes / size_of::<E>()) % ALIGNMENT;
+        memory.slice_move(s![skip..skip + len])
+    }
+
+    /// Returns an array with whatever its memory held before.
+    pub fn take(&self, shape: &[usize]) -> ArrayD<E> {
+        let len = shape.iter().product();
+        let found = {
+            let mut pool = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+            let found = pool.free.get_mut(&len).and_then(Vec::pop);
+            pool.in_use += len;
+            pool.usage.in_use_bytes = pool.in_use * size_of::<E>();
+            pool.usage.peak_bytes = pool.usage.peak_bytes.max(pool.usage.in_use_bytes);
+            if found.is_none() {
+                pool.usage.reserved_bytes += len * size_of::<E>();
+            }
+            found
+        };
+        let flat = found.unwrap_or_else(|| Self::aligned(len));
+        flat.into_shape_with_order(IxDyn(shape)).expect("the length is the product of the shape")
+    }
+
+    /// Returns an array of one value.
+    pub fn filled(&self, shape: &[usize], value: E) -> ArrayD<E> {
+        let mut array = self.take(shape);
+        array.fill(value);
+        array
+    }
+
+    /// Returns a copy of numbers in order.
+    pub fn copy(&self, shape: &[usize], values: &[E]) -> ArrayD<E> {
+        let mut array = self.take(shape);
+        array.as_slice_mut().expect("one run of memory").copy_from_slice(values);
+        array
+    }
+
+    /// Takes an array back.
+    pub fn give(&self, array: ArrayD<E>) {
+        let len = array.len();
+        let flat = array.into_shape_with_order(len).expect("arrays of the arena lie in order");
+        let mut pool = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        pool.in_use = pool.in_use.saturating_sub(len);
+        pool.usage.in_use_bytes = pool.in_use * size_of::<E>();
+        pool.free.entry(len).or_default().push(flat);
+    }
+
+    /// Returns what is in use, and what was at most.
+    pub fn usage(&self) -> Usage {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).usage
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_array_that_was_given_back_is_the_next_of_its_length() {
+        let arena = Arena::<f32>::default();
+        let first = arena.take(&[3, 5]);
+        let address = first.as_ptr();
+        assert_eq!(address as usize % 64, 0);
+        let other = arena.take(&[15]);
+        assert_eq!(arena.usage().in_use_bytes, 2 * 15 * 4);
+        arena.give(first);
+        assert_eq!(arena.take(&[5, 3]).as_ptr(), address);
+        arena.give(other);
+        let usage = arena.usage();
+        assert_eq!((usage.peak_bytes, usage.reserved_bytes), (120, 120));
+    }
+}

@@ -1,0 +1,238 @@
+//! The numbers that tensors hold: `f32` to train and infer, `f64` to check gradients.
+
+use std::fmt::{Debug, Display};
+use std::iter::Sum;
+use std::ops::{Add, AddAssign, Div, DivAssign, Mul, MulAssign, Neg, Sub, SubAssign};
+
+use super::kernel::Tile;
+
+/// A real number that tensors hold.
+///
+/// Everything but the tile of the matrix product is written once for both types; the tile of `f32`
+/// has fast forms that tests hold against the portable one.
+pub trait Element:
+    Copy
+    + Debug
+    + Default
+    + Display
+    + PartialOrd
+    + Send
+    + Sync
+    + 'static
+    + Add<Output = Self>
+    + AddAssign
+    + Div<Output = Self>
+    + DivAssign
+    + Mul<Output = Self>
+    + MulAssign
+    + Neg<Output = Self>
+    + Sub<Output = Self>
+    + SubAssign
+    + Sum
+{
+    const ZERO: Self;
+    const ONE: Self;
+
+    fn from_f64(x: f64) -> Self;
+    fn to_f64(self) -> f64;
+    fn abs(self) -> Self;
+    fn sqrt(self) -> Self;
+    /// e^x; for `f32` within 2e-7 of the truth, relative, and vectorisable.
+    fn exp(self) -> Self;
+    fn ln(self) -> Self;
+    fn ln_1p(self) -> Self;
+    fn tanh(self) -> Self;
+    /// The error function, 2/√π ∫₀ˣ e^(-t²) dt.
+    fn erf(self) -> Self;
+    fn is_finite(self) -> bool;
+    /// a b + self, rounded once where the machine has such an instruction.
+    fn fused(self, a: Self, b: Self) -> Self;
+
+    #[inline(always)]
+    fn larger(self, other: Self) -> Self {
+        if self > other { self } else { other }
+    }
+
+    #[inline(always)]
+    fn smaller(self, other: Self) -> Self {
+        if self < other { self } else { other }
+    }
+
+    /// Runs one tile of a matrix product; see [`Tile`].
+    ///
+    /// # Safety
+    /// The pointers of the tile are valid for what it reads and writes.
+    #[allow(unsafe_code, reason = "declared here, implemented in the kernel module")]
+    unsafe fn run_tile(tile: &Tile<Self>);
+}
+
+/// 1 / (1 + e^-x).
+#[inline(always)]
+pub fn sigmoid<E: Element>(x: E) -> E {
+    E::ONE / (E::ONE + (-x).exp())
+}
+
+/// e^x by Cody and Waite's reduction and a polynomial of degree 6 (Cephes, `expf`).
+///
+/// x = n ln 2 + r with |r| ≤ ln 2 / 2; e^x = 2^n e^r. Without a branch or a call, so that loops over
+/// it become vector code. Below -87.3 it gives the smallest normal number, not a subnormal one;
+/// above 88.7 infinity; NaN stays NaN.
+#[inline(always)]
+pub fn exp_f32(x: f32) -> f32 {
+    const LOG2_E: f32 = std::f32::consts::LOG2_E;
+    /// 1.5 · 2^23: adding it rounds to an integer, which then lies in the low bits.
+    const ROUND: f32 = 12_582_912.0;
+    const LN2_HIGH: f32 = 0.693_359_4;
+    const LN2_LOW: f32 = -2.121_944_4e-4;
+    let bounded = if x < -87.3 { -87.3 } else { x };
+    let bounded = if bounded > 88.7 { 88.7 } else { bounded };
+    let shifted = bounded * LOG2_E + ROUND;
+    let n = shifted - ROUND;
+    let r = bounded - n * LN2_HIGH - n * LN2_LOW;
+    let p = 1.987_569_1e-4;
+    let p = p * r + 1.398_199_9e-3;
+    let p = p * r + 8.333_452e-3;
+    let p = p * r + 4.166_579_6e-2;
+    let p = p * r + 1.666_666_6e-1;
+    let p = p * r + 0.5;
+    let e_r = p * r * r + r + 1.0;
+    // 2^n in two factors: n reaches 128, one more than an exponent holds.
+    let bits = shifted.to_bits().wrapping_sub(ROUND.to_bits()) as i32;
+    let half = bits >> 1;
+    let power = |n: i32| f32::from_bits((n.wrapping_add(127) as u32) << 23);
+    let y = e_r * power(half) * power(bits.wrapping_sub(half));
+    if x > 88.7 { f32::INFINITY } else { y }
+}
+
+impl Element for f32 {
+    const ZERO: Self = 0.0;
+    const ONE: Self = 1.0;
+
+    #[inline(always)]
+    fn from_f64(x: f64) -> Self {
+        x as Self
+    }
+
+    #[inline(always)]
+    fn to_f64(self) -> f64 {
+        f64::from(self)
+    }
+
+    #[inline(always)]
+    fn abs(self) -> Self {
+        self.abs()
+    }
+
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        self.sqrt()
+    }
+
+    #[inline(always)]
+    fn exp(self) -> Self {
+        exp_f32(self)
+    }
+
+    #[inline(always)]
+    fn ln(self) -> Self {
+        self.ln()
+    }
+
+    #[inline(always)]
+    fn ln_1p(self) -> Self {
+        self.ln_1p()
+    }
+
+    #[inline(always)]
+    fn tanh(self) -> Self {
+        self.tanh()
+    }
+
+    #[inline(always)]
+    fn erf(self) -> Self {
+        libm::erff(self)
+    }
+
+    #[inline(always)]
+    fn is_finite(self) -> bool {
+        self.is_finite()
+    }
+
+    #[inline(always)]
+    fn fused(self, a: Self, b: Self) -> Self {
+        // Where the instruction is not part of the target's base, mul_add is a slow call.
+        if cfg!(target_arch = "aarch64") { a.mul_add(b, self) } else { a * b + self }
+    }
+
+    #[allow(unsafe_code, reason = "declared here, implemented in the kernel module")]
+    unsafe fn run_tile(tile: &Tile<Self>) {
+        // SAFETY: the caller's promise is passed on.
+        unsafe { super::kernel::run_f32(tile) }
+    }
+}
+
+impl Element for f64 {
+    const ZERO: Self = 0.0;
+    const ONE: Self = 1.0;
+
+    #[inline(always)]
+    fn from_f64(x: f64) -> Self {
+        x
+    }
+
+    #[inline(always)]
+    fn to_f64(self) -> f64 {
+        self
+    }
+
+    #[inline(always)]
+    fn abs(self) -> Self {
+        self.abs()
+    }
+
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        self.sqrt()
+    }
+
+    #[inline(always)]
+    fn exp(self) -> Self {
+        self.exp()
+    }
+
+    #[inline(always)]
+    fn ln(self) -> Self {
+        self.ln()
+    }
+
+    #[inline(always)]
+    fn ln_1p(self) -> Self {
+        self.ln_1p()
+    }
+
+    #[inline(always)]
+    fn tanh(self) -> Self {
+        self.tanh()
+    }
+
+    #[inline(always)]
+    fn erf(self) -> Self {
+        libm::erf(self)
+    }
+
+    #[inline(always)]
+    fn is_finite(self) -> bool {
+        self.is_finite()
+    }
+
+    #[inline(always)]
+    fn fused(self, a: Self, b: Self) -> Self {
+        a * b + self
+    }
+
+    #[allow(unsafe_code, reason = "declared here, implemented in the kernel module")]
+    unsafe fn run_tile(tile: &Tile<Self>) {
+        // SAFETY: the caller's promise is passed on.
+        unsafe { super::kernel::run_portable(tile) }
+    }
+}

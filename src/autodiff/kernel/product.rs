@@ -1,0 +1,387 @@
+//! The three products of a layer: output, gradient of the input, gradient of the weight.
+//!
+//! Work is shared out by panels of the output, so that each thread streams its part of the weights
+//! once. Every number of the result is summed in the same order whatever the tasks and tiles: taps in
+//! order, channels in blocks of [`BLOCK`]. So the bits do not depend on the number of threads.
+
+use std::ops::Range;
+
+use rayon::prelude::*;
+
+use crate::autodiff::arena::Arena;
+use crate::autodiff::element::Element;
+
+use super::gather::{Conv, Gather, ZERO_ROW};
+use super::pack::{PANEL, pack_strips, panels, transpose_16};
+use super::tile::{MAX_PANELS, MAX_ROWS, Tile};
+
+/// Channels of a block: 3 panels of it (72 kB of `f32`) stay in the second cache while rows pass.
+const BLOCK: usize = 384;
+/// Rows over which a weight's gradient is summed before it is added to memory.
+const GRADIENT_ROWS: usize = 960;
+
+/// A place to write from several tasks, each its own columns.
+struct Shared<E>(*mut E);
+// SAFETY: tasks write disjoint elements (invariant 2 of the module).
+unsafe impl<E: Send> Sync for Shared<E> {}
+
+impl<E> Shared<E> {
+    /// Returns the address of an element. A method, so that closures capture the whole.
+    fn at(&self, i: usize) -> *mut E {
+        self.0.wrapping_add(i)
+    }
+}
+
+/// Splits panels into groups of at most three, evenly, at least one for each thread where possible.
+fn groups(n_panels: usize) -> Vec<Range<usize>> {
+    let threads = rayon::current_num_threads();
+    let n = n_panels.div_ceil(MAX_PANELS).next_multiple_of(threads).min(n_panels);
+    (0..n).map(|i| i * n_panels / n..(i + 1) * n_panels / n).collect()
+}
+
+/// Splits rows into chunks, so that there are enough tasks for the threads.
+fn row_chunks(rows: usize, n_groups: usize) -> Vec<Range<usize>> {
+    let threads = rayon::current_num_threads();
+    let wanted = if n_groups >= threads { 1 } else { (2 * threads).div_ceil(n_groups) };
+    let size = rows.div_ceil(wanted).next_multiple_of(MAX_ROWS);
+    (0..rows).step_by(size.max(1)).map(|at| at..rows.min(at + size)).collect()
+}
+
+/// Rows of zeros that stand in for padding.
+fn zeros<E: Element>() -> Vec<E> {
+    vec![E::ZERO; BLOCK]
+}
+
+/// What a product multiplies with its rows: panels for a run of k.
+struct Block<E> {
+    b: *const E,
+    b_panel: usize,
+    /// Which tap of the gather, by position.
+    tap: usize,
+    /// Channels of the source rows.
+    channels: Range<usize>,
+}
+
+/// Adds one block's products to the rows `rows` of the gather, columns from `column` on.
+///
+/// # Safety
+/// The block has `n_panels` panels of its channels; `out` has `out_columns` columns in each target row,
+/// of which this task alone writes `columns`.
+#[allow(
+    clippy::too_many_arguments,
+    reason = "one loop of two products, split off to be written once"
+)]
+unsafe fn run_rows<E: Element>(
+    gather: &Gather,
+    rows: Range<usize>,
+    source: &[E],
+    source_channels: usize,
+    block: &Block<E>,
+    zeros: &[E],
+    out: &Shared<E>,
+    out_columns: usize,
+    columns: Range<usize>,
+    add: bool,
+) {
+    let tap_rows = &gather.source[block.tap * gather.target.len()..][..gather.target.len()];
+    let k = block.channels.len();
+    let row_of = |i: usize| match tap_rows[i] {
+        ZERO_ROW => zeros[..k].as_ptr(),
+        row => source[row * source_channels..][block.channels.clone()].as_ptr(),
+    };
+    for first in rows.clone().step_by(MAX_ROWS) {
+        let n_rows = (rows.end - first).min(MAX_ROWS);
+        let index = |r: usize| first + r.min(n_rows - 1);
+        let tile = Tile {
+            rows: std::array::from_fn(|r| row_of(index(r))),
+            n_rows,
+            step: 1,
+            k,
+            segments: 1,
+            a_segment: 0,
+            b: block.b,
+            b_panel: block.b_panel,
+            b_segment: 0,
+            n_panels: panels(columns.len()),
+            c: std::array::from_fn(|r| {
+                out.at(gather.target[index(r)] * out_columns + columns.start)
+            }),
+            c_panel: PANEL,
+            n_columns: columns.len(),
+            add,
+        };
+        // SAFETY: rows are slices of k elements; the rest is the caller's promise.
+        unsafe { E::run_tile(&tile) };
+    }
+}
+
+/// Computes out = rows of `source` times the weight, plus the bias.
+///
+/// out[target] = bias + Σ_tap W_tap source[tap, target]
+///
+/// # Shapes
+/// - `source`: [rows, channels]; `weight`: panels of [taps · channels]; `bias`: [n]
+/// - `out`: [target rows, n]
+pub fn product<E: Element>(
+    source: &[E],
+    channels: usize,
+    gather: &Gather,
+    weight: &[E],
+    bias: Option<&[E]>,
+    out: &mut [E],
+    n: usize,
+) {
+    let k = gather.taps.len() * channels;
+    assert_eq!(weight.len(), panels(n) * k * PANEL, "panels of {n} outputs with {k} inputs");
+    assert_eq!(out.len(), gather.target.len() * n, "rows of {n} outputs");
+    assert!(bias.is_none_or(|bias| bias.len() == n), "a bias of {n}");
+    let zeros = zeros::<E>();
+    let out = Shared(out.as_mut_ptr());
+    let groups = groups(panels(n));
+    let chunks = row_chunks(gather.target.len(), groups.len());
+    let tasks: Vec<_> =
+        groups.iter().flat_map(|group| chunks.iter().map(move |rows| (group, rows))).collect();
+    tasks.into_par_iter().for_each(|(group, rows)| {
+        let columns = group.start * PANEL..n.min(group.end * PANEL);
+        if let Some(bias) = bias {
+            for &target in &gather.target[rows.clone()] {
+                // SAFETY: the row has n columns, and this task alone writes these (invariant 2).
+                let row = unsafe {
+                    std::slice::from_raw_parts_mut(
+                        out.at(target * n + columns.start),
+                        columns.len(),
+                    )
+                };
+                row.copy_from_slice(&bias[columns.clone()]);
+            }
+        }
+        let mut add = bias.is_some();
+        for (i, tap) in gather.taps.iter().enumerate() {
+            for first in (0..channels).step_by(BLOCK) {
+                let block = Block {
+                    b: weight[(group.start * k + tap * channels + first) * PANEL..].as_ptr(),
+                    b_panel: k * PANEL,
+                    tap: i,
+                    channels: first..channels.min(first + BLOCK),
+                };
+                // SAFETY: lengths were checked above; the task owns its rows and columns.
+                unsafe {
+                    let (rows, columns) = (rows.clone(), columns.clone());
+                    run_rows(gather, rows, source, channels, &block, &zeros, &out, n, columns, add);
+                }
+                add = true;
+            }
+        }
+    });
+}
+
+/// Computes the gradient of a layer's input: each input row sums over the output rows that it met.
+///
+/// d_source[i] = Σ_tap W_tapᵀ d_out[the output row that met i at tap]
+///
+/// The weight's panels are transposed 16 × 16 numbers at a time into a block that all rows then use.
+///
+/// # Shapes
+/// - `d_out`: [out rows, n]; `d_source`: [in rows, channels], overwritten
+pub fn input_gradient<E: Element>(
+    d_out: &[E],
+    n: usize,
+    conv: &Conv,
+    weight: &[E],
+    d_source: &mut [E],
+    channels: usize,
+) {
+    let k = conv.taps * channels;
+    assert_eq!(weight.len(), panels(n) * k * PANEL, "panels of {n} outputs with {k} inputs");
+    assert_eq!(d_out.len(), conv.out_rows() * n, "rows of {n} outputs");
+    assert_eq!(d_source.len(), conv.in_rows() * channels, "rows of {channels} inputs");
+    let phases = conv.backward();
+    let zeros = zeros::<E>();
+    let out = Shared(d_source.as_mut_ptr());
+    let groups = groups(panels(channels));
+    let scratch = || Arena::<E>::aligned(MAX_PANELS * BLOCK * PANEL);
+    groups.into_par_iter().for_each_init(scratch, |scratch, group| {
+        let columns = group.start * PANEL..channels.min(group.end * PANEL);
+        let scratch = scratch.as_slice_mut().expect("one run of memory");
+        for gather in &phases {
+            let mut add = false;
+            for (i, tap) in gather.taps.iter().enumerate() {
+                for first in (0..n).step_by(BLOCK) {
+                    let outputs = first..n.min(first + BLOCK);
+                    transpose_block(weight, k, tap * channels, &columns, &outputs, scratch);
+                    let block = Block {
+                        b: scratch.as_ptr(),
+                        b_panel: BLOCK * PANEL,
+                        tap: i,
+                        channels: outputs,
+                    };
+                    let rows = 0..gather.target.len();
+                    // SAFETY: lengths were checked above; the task owns its columns.
+                    unsafe {
+                        let columns = columns.clone();
+                        run_rows(
+                            gather, rows, d_out, n, &block, &zeros, &out, channels, columns, add,
+                        );
+                    }
+                    add = true;
+                }
+            }
+            if !add {
+                for &target in &gather.target {
+                    // SAFETY: the row has its channels, and this task alone writes these.
+                    unsafe {
+                        let at = out.at(target * channels + columns.start);
+                        std::slice::from_raw_parts_mut(at, columns.len()).fill(E::ZERO);
+                    }
+                }
+            }
+        }
+    });
+}
+
+/// Fills `scratch`, panels of [BLOCK][16], with W[output][from + column] at [column / 16][output][lane].
+fn transpose_block<E: Element>(
+    weight: &[E],
+    k: usize,
+    from: usize,
+    columns: &Range<usize>,
+    outputs: &Range<usize>,
+    scratch: &mut [E],
+) {
+    let mut partial = [E::ZERO; PANEL * PANEL];
+    for (j, output) in outputs.clone().step_by(PANEL).enumerate() {
+        let panel = &weight[output / PANEL * k * PANEL..][..k * PANEL];
+        for (p, column) in columns.clone().step_by(PANEL).enumerate() {
+            let n = (columns.end - column).min(PANEL);
+            let rows = &panel[(from + column) * PANEL..][..n * PANEL];
+            let target = &mut scratch[(p * BLOCK + j * PANEL) * PANEL..][..PANEL * PANEL];
+            if n == PANEL {
+                transpose_16(rows, target);
+            } else {
+                partial[..n * PANEL].copy_from_slice(rows);
+                transpose_16(&partial, target);
+            }
+        }
+    }
+}
+
+/// Adds to, or overwrites, the gradients of a layer's weight and bias.
+///
+/// d_W[n][tap, c] = Σ_rows d_out[row][n] source[row's input at tap][c],  d_bias[n] = Σ_rows d_out[row][n]
+///
+/// Both factors are first copied into strips of 16 channels, in which rows of a sample lie together.
+///
+/// # Shapes
+/// - `source`: [in rows, channels]; `d_out`: [out rows, n]; `d_weight`: panels; `d_bias`: [n]
+#[allow(clippy::too_many_arguments, reason = "two factors, two results, their sizes")]
+pub fn weight_gradient<E: Element>(
+    source: &[E],
+    channels: usize,
+    d_out: &[E],
+    n: usize,
+    conv: &Conv,
+    d_weight: &mut [E],
+    d_bias: Option<&mut [E]>,
+    add: [bool; 2],
+    arena: &Arena<E>,
+) {
+    let k = conv.taps * channels;
+    let out_frames = conv.out_frames();
+    let out_rows = conv.out_rows();
+    assert_eq!(d_weight.len(), panels(n) * k * PANEL, "panels of {n} outputs with {k} inputs");
+    assert_eq!(d_out.len(), out_rows * n, "rows of {n} outputs");
+    assert_eq!(source.len(), conv.in_rows() * channels, "rows of {channels} inputs");
+
+    let sample_rows = conv.stride * conv.strip_frames();
+    let strip = conv.batch * sample_rows * PANEL;
+    let mut strips = arena.take(&[panels(channels), strip]);
+    let strips_of = strips.as_slice_mut().expect("one run of memory");
+    strips_of.par_chunks_mut(strip.max(1)).enumerate().for_each(|(s, target)| {
+        if conv.padding > 0 || conv.stride > 1 || (s + 1) * PANEL > channels {
+            target.fill(E::ZERO);
+        }
+        pack_strips(source, channels, s, target.len() / PANEL, target, |row| {
+            Some(conv.strip_row(row))
+        });
+    });
+    let strips_of = &*strips_of;
+    let mut columns = arena.take(&[panels(n), out_rows * PANEL]);
+    let columns_of = columns.as_slice_mut().expect("one run of memory");
+    columns_of.par_chunks_mut((out_rows * PANEL).max(1)).enumerate().for_each(|(p, target)| {
+        if (p + 1) * PANEL > n {
+            target.fill(E::ZERO);
+        }
+        pack_strips(d_out, n, p, out_rows, target, Some);
+    });
+    let columns_of = &*columns_of;
+
+    let mut rest = d_weight;
+    let mut rest_bias = d_bias;
+    let mut tasks = Vec::new();
+    for group in groups(panels(n)) {
+        let (part, others) = rest.split_at_mut(group.len() * k * PANEL);
+        rest = others;
+        let bias = rest_bias.take().map(|all| {
+            let n_here = n.min(group.end * PANEL) - group.start * PANEL;
+            let (part, others) = all.split_at_mut(n_here);
+            rest_bias = Some(others);
+            part
+        });
+        tasks.push((group, part, bias));
+    }
+    // A block of samples at a time, so that the rows stay in the second cache.
+    let samples = (GRADIENT_ROWS / out_frames.max(1)).max(1);
+    tasks.into_par_iter().for_each(|(group, part, bias)| {
+        for first in (0..conv.batch).step_by(samples) {
+            let segments = samples.min(conv.batch - first);
+            for tap in 0..conv.taps {
+                for c in (0..channels).step_by(MAX_ROWS) {
+                    let n_rows = (channels - c).min(MAX_ROWS);
+                    let row = first * sample_rows + conv.strip_start(tap);
+                    let a = &strips_of[c / PANEL * strip + row * PANEL + c % PANEL..];
+                    let b = &columns_of[(group.start * out_rows + first * out_frames) * PANEL..];
+                    let c_at = (tap * channels + c) * PANEL;
+                    let part = part.as_mut_ptr();
+                    let tile = Tile {
+                        rows: std::array::from_fn(|r| a[r.min(n_rows - 1)..].as_ptr()),
+                        n_rows,
+                        step: PANEL,
+                        k: out_frames,
+                        segments,
+                        a_segment: sample_rows * PANEL,
+                        b: b.as_ptr(),
+                        b_panel: out_rows * PANEL,
+                        b_segment: out_frames * PANEL,
+                        n_panels: group.len(),
+                        c: std::array::from_fn(|r| {
+                            part.wrapping_add(c_at + r.min(n_rows - 1) * PANEL)
+                        }),
+                        c_panel: k * PANEL,
+                        n_columns: group.len() * PANEL,
+                        add: add[0] || first > 0,
+                    };
+                    // SAFETY: a tap's frames lie within its phase of the strip, and panels and the
+                    // gradient have the lengths that were checked above (invariant 1); the part is
+                    // this task's own (invariant 2).
+                    unsafe { E::run_tile(&tile) };
+                }
+            }
+        }
+        if let Some(bias) = bias {
+            for (i, lanes) in bias.chunks_mut(PANEL).enumerate() {
+                let rows = &columns_of[(group.start + i) * out_rows * PANEL..][..out_rows * PANEL];
+                let mut sums = [E::ZERO; PANEL];
+                for row in rows.chunks_exact(PANEL) {
+                    for (sum, &x) in sums.iter_mut().zip(row) {
+                        *sum += x;
+                    }
+                }
+                for (d, &sum) in lanes.iter_mut().zip(&sums) {
+                    *d = if add[1] { *d + sum } else { sum };
+                }
+            }
+        }
+    });
+    arena.give(strips);
+    arena.give(columns);
+}

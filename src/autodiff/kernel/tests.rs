@@ -1,0 +1,150 @@
+//! The three products of a layer against their definitions, summed in f64.
+
+use super::*;
+use crate::autodiff::arena::Arena;
+
+/// Numbers in [-1, 1) that look random and are always the same.
+fn numbers(n: usize, seed: u64) -> Vec<f64> {
+    let mut x = seed;
+    let mut next = || {
+        x = x.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (x >> 40) as f64 / f64::from(1 << 23) - 1.0
+    };
+    (0..n).map(|_| next()).collect()
+}
+
+fn single(x: &[f64]) -> Vec<f32> {
+    x.iter().map(|&x| x as f32).collect()
+}
+
+/// The largest difference must be below 2e-6 of the largest value: sums of up to 1,500 products in
+/// f32, whose rounding grows with the root of their number.
+fn assert_near(got: &[f32], wanted: &[f64], what: &str) {
+    let scale = wanted.iter().fold(0.0_f64, |a, x| a.max(x.abs()));
+    for (i, (&got, &wanted)) in got.iter().zip(wanted).enumerate() {
+        let difference = (f64::from(got) - wanted).abs();
+        assert!(difference <= 2e-6 * scale, "{what} at {i}: got {got}, wanted {wanted}");
+    }
+}
+
+#[test]
+fn products_are_those_of_the_definition() {
+    let shape = |batch, frames, taps, stride, padding, dilation| Conv {
+        batch,
+        frames,
+        taps,
+        stride,
+        padding,
+        dilation,
+    };
+    for (conv, channels, n) in [
+        (shape(2, 13, 3, 1, 1, 1), 25, 70),
+        (shape(3, 9, 3, 2, 1, 1), 19, 33),
+        (shape(1, 11, 5, 1, 6, 3), 16, 48),
+        (shape(1, 7, 3, 1, 1, 1), 400, 17),
+        (shape(2, 10, 4, 2, 1, 1), 5, 3),
+        (Conv::linear(37), 21, 65),
+    ] {
+        let what = format!("{conv:?}, {channels} to {n}");
+        let k = conv.taps * channels;
+        let x = numbers(conv.in_rows() * channels, 1);
+        let w = numbers(n * k, 2);
+        let bias = numbers(n, 3);
+        let dy = numbers(conv.out_rows() * n, 4);
+        let mut y = vec![0.0; conv.out_rows() * n];
+        let mut dx = vec![0.0; x.len()];
+        let mut dw = vec![0.0; w.len()];
+        let mut db = vec![0.0; n];
+        for b in 0..conv.batch {
+            for t in 0..conv.out_frames() {
+                let row = b * conv.out_frames() + t;
+                for o in 0..n {
+                    y[row * n + o] += bias[o];
+                    db[o] += dy[row * n + o];
+                    for tap in 0..conv.taps {
+                        let at = (t * conv.stride + tap * conv.dilation).wrapping_sub(conv.padding);
+                        if at >= conv.frames {
+                            continue;
+                        }
+                        for c in 0..channels {
+                            let i = (b * conv.frames + at) * channels + c;
+                            let j = (o * channels + c) * conv.taps + tap;
+                            y[row * n + o] += w[j] * x[i];
+                            dx[i] += w[j] * dy[row * n + o];
+                            dw[j] += x[i] * dy[row * n + o];
+                        }
+                    }
+                }
+            }
+        }
+        let (x, w, bias, dy) = (single(&x), single(&w), single(&bias), single(&dy));
+        let mut packed = vec![0.0; packed_len(n, k)];
+        pack_weight(&w, n, channels, conv.taps, &mut packed);
+
+        let mut got = vec![f32::NAN; y.len()];
+        product(&x, channels, &conv.forward(), &packed, Some(&bias), &mut got, n);
+        assert_near(&got, &y, &format!("output, {what}"));
+
+        let mut got = vec![f32::NAN; dx.len()];
+        input_gradient(&dy, n, &conv, &packed, &mut got, channels);
+        assert_near(&got, &dx, &format!("input's gradient, {what}"));
+
+        // Twice, the second time added: the result doubles.
+        let mut panels = vec![f32::NAN; packed.len()];
+        let mut d_bias = vec![f32::NAN; n];
+        let arena = Arena::default();
+        for add in [false, true] {
+            let (panels, d_bias) = (&mut panels, Some(&mut d_bias[..]));
+            let add = [add, add];
+            weight_gradient(&x, channels, &dy, n, &conv, panels, d_bias, add, &arena);
+        }
+        let mut got = vec![0.0; dw.len()];
+        unpack_weight(&panels, n, channels, conv.taps, &mut got);
+        let doubled = |x: &[f64]| x.iter().map(|x| 2.0 * x).collect::<Vec<_>>();
+        assert_near(&got, &doubled(&dw), &format!("weight's gradient, {what}"));
+        assert_near(&d_bias, &doubled(&db), &format!("bias's gradient, {what}"));
+    }
+}
+
+#[test]
+fn any_number_of_threads_gives_the_same_bits() {
+    let conv = Conv { batch: 2, frames: 31, taps: 3, stride: 1, padding: 1, dilation: 1 };
+    let (channels, n) = (40, 150);
+    let x = single(&numbers(conv.in_rows() * channels, 1));
+    let weight = single(&numbers(packed_len(n, 3 * channels), 2));
+    let run = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
+        let mut y = vec![0.0_f32; conv.out_rows() * n];
+        let mut dx = vec![0.0_f32; x.len()];
+        let mut dw = vec![0.0_f32; weight.len()];
+        pool.install(|| {
+            product(&x, channels, &conv.forward(), &weight, None, &mut y, n);
+            input_gradient(&y, n, &conv, &weight, &mut dx, channels);
+            let arena = Arena::default();
+            weight_gradient(&x, channels, &y, n, &conv, &mut dw, None, [false; 2], &arena);
+        });
+        [y, dx, dw].concat().iter().map(|x| x.to_bits()).collect::<Vec<_>>()
+    };
+    let one = run(1);
+    assert!(run(2) == one, "2 threads");
+    assert!(run(4) == one, "4 threads");
+}
+
+#[test]
+fn small_products_are_those_of_the_definition_with_any_strides() {
+    let [m, k, n] = [13, 7, 53];
+    let (a, b) = (numbers(m * k, 1), numbers(k * n, 2));
+    let mut wanted = vec![0.0; m * n];
+    for i in 0..m {
+        for j in 0..n {
+            wanted[i * n + j] = 0.5 * (0..k).map(|p| a[p * m + i] * b[p * n + j]).sum::<f64>();
+        }
+    }
+    let (a, b) = (single(&a), single(&b));
+    let mut got = vec![f32::NAN; m * n];
+    let a = Matrix { data: &a, strides: [m, 1] }.t();
+    let b = Matrix { data: &b, strides: [n, 1] };
+    let c = MatrixMut { data: &mut got, row_stride: n };
+    matmul([m, k, n], 0.5, a, b, c, false, &mut Vec::new());
+    assert_near(&got, &wanted, "α A B");
+}

@@ -1,0 +1,128 @@
+//! The decoder from a sampled latent to the 25 channels of motion.
+
+use crate::motion::{Channel, ChannelLimits, MOTION_DIM};
+
+use super::graph::{Activation, Graph, Result};
+use super::layers::{LayerNorm, Linear};
+use super::parameter::{ParameterList, Scope};
+
+/// Below this norm a quaternion is divided by it instead (PyTorch's `normalize`).
+const QUATERNION_EPSILON: f64 = 1e-12;
+
+/// The sizes of a [`MotionDecoder`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct DecoderConfig {
+    /// Channels of the latent.
+    pub input_dim: usize,
+    pub hidden_dim: usize,
+    pub n_blocks: usize,
+    /// Width of a block's inner layer, in units of `hidden_dim`.
+    pub expansion: usize,
+    pub dropout: f64,
+    /// The ranges that velocities and accelerations are kept within.
+    pub limits: ChannelLimits,
+}
+
+impl Default for DecoderConfig {
+    /// 2.12 M parameters: the reference's hidden 256 with four blocks.
+    fn default() -> Self {
+        Self {
+            input_dim: MOTION_DIM,
+            hidden_dim: 256,
+            n_blocks: 4,
+            expansion: 4,
+            dropout: 0.1,
+            limits: ChannelLimits::Wide,
+        }
+    }
+}
+
+/// Maps a latent, frame by frame, to motion that keeps its channels' constraints.
+#[derive(Clone, Debug)]
+pub struct MotionDecoder {
+    input_proj: Linear,
+    blocks: Vec<Block>,
+    heads: Vec<(Channel, Linear)>,
+    limits: ChannelLimits,
+}
+
+/// x + W₂ GELU(W₁ LN(x)), dropout after each of the two.
+#[derive(Clone, Debug)]
+struct Block {
+    norm: LayerNorm,
+    inner: Linear,
+    outer: Linear,
+    dropout: f64,
+}
+
+impl Block {
+    fn new(scope: &mut Scope, config: &DecoderConfig) -> Self {
+        let (hidden, inner) = (config.hidden_dim, config.hidden_dim * config.expansion);
+        let mut layers = scope.at("layers");
+        Self {
+            norm: LayerNorm::new(&mut layers.at("0"), hidden),
+            inner: Linear::new(&mut layers.at("1"), hidden, inner),
+            outer: Linear::new(&mut layers.at("4"), inner, hidden),
+            dropout: config.dropout,
+        }
+    }
+
+    fn forward<G: Graph>(&self, g: &mut G, x: &G::Tensor) -> Result<G::Tensor> {
+        let h = self.norm.forward(g, x)?;
+        let h = self.inner.forward(g, &h)?;
+        let h = g.activation(&h, Activation::Gelu)?;
+        let h = g.dropout(&h, self.dropout)?;
+        let h = self.outer.forward(g, &h)?;
+        let h = g.dropout(&h, self.dropout)?;
+        g.add(x, &h)
+    }
+}
+
+impl MotionDecoder {
+    /// Makes the decoder and the list of its parameters.
+    pub fn new(config: &DecoderConfig) -> (Self, ParameterList) {
+        let mut list = ParameterList::default();
+        let mut root = Scope::root(&mut list);
+        let input_proj =
+            Linear::new(&mut root.at("input_proj"), config.input_dim, config.hidden_dim);
+        let blocks = (0..config.n_blocks)
+            .map(|i| Block::new(&mut root.at(format!("blocks.{i}")), config))
+            .collect();
+        let heads = Channel::ALL.map(|channel| {
+            let mut scope = root.at(format!("{}_head", channel.name()));
+            (channel, Linear::new(&mut scope, config.hidden_dim, channel.width()))
+        });
+        let decoder = Self { input_proj, blocks, heads: heads.into(), limits: config.limits };
+        (decoder, list)
+    }
+
+    /// Decodes a latent.
+    ///
+    /// Velocity, acceleration and angular velocity are limit · tanh, the quaternion has unit norm,
+    /// the phase is a sigmoid; position and style are free.
+    ///
+    /// # Shapes
+    /// `latent`: [batch, frames, input_dim] → [batch, frames, 25]
+    pub fn forward<G: Graph>(&self, g: &mut G, latent: &G::Tensor) -> Result<G::Tensor> {
+        let mut h = self.input_proj.forward(g, latent)?;
+        for block in &self.blocks {
+            h = block.forward(g, &h)?;
+        }
+        let mut parts = Vec::with_capacity(self.heads.len());
+        for (channel, head) in &self.heads {
+            let x = head.forward(g, &h)?;
+            parts.push(match channel {
+                Channel::Position | Channel::Style => x,
+                Channel::Velocity | Channel::Acceleration | Channel::AngularVelocity => {
+                    let (_, limit) = self.limits.bounds(*channel);
+                    let bounded = g.activation(&x, Activation::Tanh)?;
+                    g.scale(&bounded, f64::from(limit))?
+                }
+                Channel::Quaternion => g.normalize(&x, QUATERNION_EPSILON)?,
+                Channel::Phase => g.activation(&x, Activation::Sigmoid)?,
+            });
+        }
+        let parts: Vec<_> = parts.iter().collect();
+        g.concat(&parts)
+    }
+}

@@ -1,0 +1,249 @@
+//! The operations that a network may use, whoever carries them out.
+//!
+//! A network is written once over [`Graph`]. One interpreter runs it, one also differentiates it,
+//! one writes it down as ONNX, one counts what it costs. Sizes of batch and frames are the business
+//! of the interpreter: a network never reads them, so that they may stay open in an exported file.
+//!
+//! Tensors are channels-last: [batch, frames, channels] or [batch, channels].
+
+use std::ops::Range;
+use std::sync::Arc;
+
+use ndarray::Array2;
+
+use super::parameter::ParameterId;
+
+/// Why an operation could not be carried out.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum GraphError {
+    /// Sizes do not fit: the operation, and what it has and expects.
+    #[error("{operation}: {problem}")]
+    Shape { operation: &'static str, problem: String },
+    /// The first operation whose result is not finite, in an interpreter that looks.
+    #[error("{operation}: {what} has {value} at {index:?} of {shape:?}")]
+    NonFinite {
+        operation: String,
+        what: &'static str,
+        value: String,
+        index: Vec<usize>,
+        shape: Vec<usize>,
+    },
+}
+
+impl GraphError {
+    /// Returns the error of an operation whose sizes do not fit.
+    pub fn shape(operation: &'static str, problem: impl Into<String>) -> Self {
+        Self::Shape { operation, problem: problem.into() }
+    }
+}
+
+pub type Result<T, E = GraphError> = std::result::Result<T, E>;
+
+/// A function of one number, applied to each.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Activation {
+    Identity,
+    /// x σ(x), σ(x) = 1 / (1 + e^-x).
+    Silu,
+    /// x Φ(x), Φ the normal distribution: the exact form, by the error function.
+    Gelu,
+    /// max(x, 0).
+    Relu,
+    /// x where x > 0, else slope · x.
+    LeakyRelu {
+        slope: f64,
+    },
+    /// x tanh(ln(1 + e^x)).
+    Mish,
+    Tanh,
+    Sigmoid,
+}
+
+/// How a convolution over frames steps.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Convolution {
+    pub taps: usize,
+    pub stride: usize,
+    /// Frames of zeros at either end.
+    pub padding: usize,
+    pub dilation: usize,
+}
+
+/// Normalisation over groups of channels and all frames.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct GroupNormalization {
+    pub groups: usize,
+    pub epsilon: f64,
+    /// Scale γ and shift β, one for each channel.
+    pub weight: ParameterId,
+    pub bias: ParameterId,
+}
+
+/// Some channels of a tensor, from `first` on.
+#[derive(Clone, Copy, Debug)]
+pub struct Channels<'a, T> {
+    pub tensor: &'a T,
+    pub first: usize,
+}
+
+/// Scaled dot-product attention over several heads.
+///
+/// softmax(Q Kᵀ / √d + mask) V, head by head, d the channels of a head
+///
+/// # Shapes
+/// - `query`: [batch, queries, …]; `key`, `value`: [batch, keys, …], `width` channels of each
+/// - `key_mask`: [batch, keys], 1 for keys that count and 0 for those that do not
+pub struct Attention<'a, T> {
+    pub query: Channels<'a, T>,
+    pub key: Channels<'a, T>,
+    pub value: Channels<'a, T>,
+    pub width: usize,
+    pub heads: usize,
+    pub key_mask: Option<&'a T>,
+    /// Whether a query sees only keys up to its own place.
+    pub causal: bool,
+}
+
+/// The operations that a network may use.
+///
+/// Every operation fails if the sizes of its inputs do not fit.
+pub trait Graph: Sized {
+    type Tensor: Clone;
+
+    /// Returns a parameter as a tensor.
+    fn parameter(&mut self, id: ParameterId) -> Result<Self::Tensor>;
+
+    /// x Wᵀ + b over the last axis.
+    ///
+    /// [..., in] → [..., out]
+    fn linear(
+        &mut self,
+        x: &Self::Tensor,
+        weight: ParameterId,
+        bias: Option<ParameterId>,
+    ) -> Result<Self::Tensor>;
+
+    /// y[t] = b + Σ_j W_j x[t · stride + j · dilation − padding], zero beyond either end.
+    ///
+    /// [batch, frames, in] → [batch, ⌊(frames + 2 padding − span) / stride⌋ + 1, out]
+    fn conv1d(
+        &mut self,
+        x: &Self::Tensor,
+        weight: ParameterId,
+        bias: Option<ParameterId>,
+        convolution: Convolution,
+    ) -> Result<Self::Tensor>;
+
+    /// act((γ x̂ + β) (1 + s) + h), x̂ normalised over each group's channels and all frames.
+    ///
+    /// `film`, [batch, 2 channels], holds the scales s and then the shifts h (Perez et al., "FiLM",
+    /// AAAI 2018); without it s = h = 0. Wu and He, "Group Normalization", ECCV 2018.
+    fn group_norm(
+        &mut self,
+        x: &Self::Tensor,
+        norm: GroupNormalization,
+        film: Option<&Self::Tensor>,
+        activation: Activation,
+    ) -> Result<Self::Tensor>;
+
+    /// γ (x − μ) / √(σ² + ε) + β over the last axis; without `affine` γ = 1 and β = 0.
+    ///
+    /// Ba, Kiros and Hinton, "Layer Normalization", arXiv 1607.06450, 2016.
+    fn layer_norm(
+        &mut self,
+        x: &Self::Tensor,
+        affine: Option<[ParameterId; 2]>,
+        epsilon: f64,
+    ) -> Result<Self::Tensor>;
+
+    /// Applies a function to each number.
+    fn activation(&mut self, x: &Self::Tensor, activation: Activation) -> Result<Self::Tensor>;
+
+    /// Attention; see [`Attention`]. → [batch, queries, width]
+    fn attention(&mut self, attention: Attention<Self::Tensor>) -> Result<Self::Tensor>;
+
+    /// a + b, where axes of size 1, and missing leading axes, are repeated.
+    fn add(&mut self, a: &Self::Tensor, b: &Self::Tensor) -> Result<Self::Tensor>;
+
+    /// a b, element by element; axes are repeated as for [`Graph::add`].
+    fn mul(&mut self, a: &Self::Tensor, b: &Self::Tensor) -> Result<Self::Tensor>;
+
+    /// x\[b, t\] + v\[b\]: a vector for each sample, added to all its frames.
+    ///
+    /// `x`: [batch, frames, channels]; `v`: [batch, channels]
+    fn add_to_frames(&mut self, x: &Self::Tensor, v: &Self::Tensor) -> Result<Self::Tensor>;
+
+    /// factor · x.
+    fn scale(&mut self, x: &Self::Tensor, factor: f64) -> Result<Self::Tensor>;
+
+    /// Puts tensors side by side along the last axis.
+    fn concat(&mut self, parts: &[&Self::Tensor]) -> Result<Self::Tensor>;
+
+    /// Takes a range of the last axis.
+    fn channels(&mut self, x: &Self::Tensor, range: Range<usize>) -> Result<Self::Tensor>;
+
+    /// Repeats each frame `factor` times: nearest neighbour.
+    fn upsample(&mut self, x: &Self::Tensor, factor: usize) -> Result<Self::Tensor>;
+
+    /// Takes rows of a fixed table by index; indices are whole numbers in a tensor of any shape.
+    fn gather(&mut self, table: &Arc<Array2<f64>>, index: &Self::Tensor) -> Result<Self::Tensor>;
+
+    /// Takes rows of a learned table, [rows, channels], by index.
+    fn embedding(&mut self, table: ParameterId, index: &Self::Tensor) -> Result<Self::Tensor>;
+
+    /// In training sets each number to zero with the probability, and divides the rest by 1 − it.
+    ///
+    /// Srivastava et al., "Dropout", JMLR 15, 2014.
+    fn dropout(&mut self, x: &Self::Tensor, probability: f64) -> Result<Self::Tensor>;
+
+    /// x where `choice` is 0 and `other` where it is 1, for each sample.
+    ///
+    /// `x`: [batch, frames, channels]; `choice`: [batch]; `other`: [channels]
+    fn select(
+        &mut self,
+        choice: &Self::Tensor,
+        other: &Self::Tensor,
+        x: &Self::Tensor,
+    ) -> Result<Self::Tensor>;
+
+    /// x / max(‖x‖, ε) over the last axis.
+    fn normalize(&mut self, x: &Self::Tensor, epsilon: f64) -> Result<Self::Tensor>;
+
+    /// Turns pairs of channels by angles that grow with the frame: rotary position embedding.
+    ///
+    /// Su et al., "RoFormer", arXiv 2104.09864, 2021, eq. 34; channels 2i and 2i + 1 of each head are
+    /// a pair, turned by frame · 10000^(−2i / d).
+    fn rotary(&mut self, x: &Self::Tensor, heads: usize) -> Result<Self::Tensor>;
+
+    /// Repeats the last frame until their number is a multiple.
+    fn hold_frames(&mut self, x: &Self::Tensor, multiple: usize) -> Result<Self::Tensor>;
+
+    /// Drops frames beyond those that `like` has.
+    fn crop_frames(&mut self, x: &Self::Tensor, like: &Self::Tensor) -> Result<Self::Tensor>;
+
+    /// Says which frames of [`Graph::hold_frames`] count: 1 where `mask`, or all of x, has one, else 0.
+    ///
+    /// `x`: [batch, frames, …]; `mask`: [batch, frames] → [batch, frames held]
+    fn frame_mask(
+        &mut self,
+        x: &Self::Tensor,
+        mask: Option<&Self::Tensor>,
+        multiple: usize,
+    ) -> Result<Self::Tensor>;
+
+    /// Takes every `stride`-th frame of a mask, from the first on.
+    fn stride_mask(&mut self, mask: &Self::Tensor, stride: usize) -> Result<Self::Tensor>;
+
+    /// Runs a part of the network whose inner values need not be kept for its gradient.
+    ///
+    /// An interpreter that differentiates runs the part again when its gradient is due (Chen et al.,
+    /// "Training Deep Nets with Sublinear Memory Cost", arXiv 1604.06174, 2016); others just run it.
+    fn checkpoint<F>(&mut self, inputs: &[&Self::Tensor], part: F) -> Result<Self::Tensor>
+    where
+        F: Fn(&mut Self, &[Self::Tensor]) -> Result<Self::Tensor> + Send + 'static,
+    {
+        let inputs: Vec<_> = inputs.iter().map(|&x| x.clone()).collect();
+        part(self, &inputs)
+    }
+}

@@ -1,0 +1,19 @@
+//! Networks, each written once over the operations that a network may use.
+//!
+//! [`Graph`] is what an interpreter offers; [`UNet1D`] predicts noise from noisy motion, step and
+//! music; [`MotionDecoder`] turns what was sampled into the 25 channels. This room knows shapes and
+//! names, not numbers: values are the interpreter's.
+
+mod decoder;
+mod graph;
+mod layers;
+mod parameter;
+mod unet;
+
+pub use decoder::{DecoderConfig, MotionDecoder};
+pub use graph::{
+    Activation, Attention, Channels, Convolution, Graph, GraphError, GroupNormalization, Result,
+};
+pub use layers::{AttentionBlock, Conv1d, GroupNorm, LayerNorm, Linear, ResBlock};
+pub use parameter::{Init, Parameter, ParameterId, ParameterList, Role, Scope};
+pub use unet::{Preset, UNet1D, UNetConfig, UNetInputs};
