@@ -102,7 +102,7 @@ impl MotionDecoder {
     /// the phase is a sigmoid; position and style are free.
     ///
     /// # Shapes
-    /// `latent`: [batch, frames, input_dim] → [batch, frames, 25]
+    /// `latent`: \[batch, frames, input_dim\] → \[batch, frames, 25\]
     pub fn forward<G: Graph>(&self, g: &mut G, latent: &G::Tensor) -> Result<G::Tensor> {
         let mut h = self.input_proj.forward(g, latent)?;
         for block in &self.blocks {

@@ -4,7 +4,7 @@
 //! one writes it down as ONNX, one counts what it costs. Sizes of batch and frames are the business
 //! of the interpreter: a network never reads them, so that they may stay open in an exported file.
 //!
-//! Tensors are channels-last: [batch, frames, channels] or [batch, channels].
+//! Tensors are channels-last: \[batch, frames, channels\] or \[batch, channels\].
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -92,8 +92,8 @@ pub struct Channels<'a, T> {
 /// softmax(Q Kᵀ / √d + mask) V, head by head, d the channels of a head
 ///
 /// # Shapes
-/// - `query`: [batch, queries, …]; `key`, `value`: [batch, keys, …], `width` channels of each
-/// - `key_mask`: [batch, keys], 1 for keys that count and 0 for those that do not
+/// - `query`: \[batch, queries, …\]; `key`, `value`: \[batch, keys, …\], `width` channels of each
+/// - `key_mask`: \[batch, keys\], 1 for keys that count and 0 for those that do not
 pub struct Attention<'a, T> {
     pub query: Channels<'a, T>,
     pub key: Channels<'a, T>,
@@ -116,7 +116,7 @@ pub trait Graph: Sized {
 
     /// x Wᵀ + b over the last axis.
     ///
-    /// [..., in] → [..., out]
+    /// \[..., in\] → \[..., out\]
     fn linear(
         &mut self,
         x: &Self::Tensor,
@@ -124,9 +124,9 @@ pub trait Graph: Sized {
         bias: Option<ParameterId>,
     ) -> Result<Self::Tensor>;
 
-    /// y[t] = b + Σ_j W_j x[t · stride + j · dilation − padding], zero beyond either end.
+    /// y\[t\] = b + Σ_j W_j x\[t · stride + j · dilation − padding\], zero beyond either end.
     ///
-    /// [batch, frames, in] → [batch, ⌊(frames + 2 padding − span) / stride⌋ + 1, out]
+    /// \[batch, frames, in\] → \[batch, ⌊(frames + 2 padding − span) / stride⌋ + 1, out\]
     fn conv1d(
         &mut self,
         x: &Self::Tensor,
@@ -137,7 +137,7 @@ pub trait Graph: Sized {
 
     /// act((γ x̂ + β) (1 + s) + h), x̂ normalised over each group's channels and all frames.
     ///
-    /// `film`, [batch, 2 channels], holds the scales s and then the shifts h (Perez et al., "FiLM",
+    /// `film`, \[batch, 2 channels\], holds the scales s and then the shifts h (Perez et al., "FiLM",
     /// AAAI 2018); without it s = h = 0. Wu and He, "Group Normalization", ECCV 2018.
     fn group_norm(
         &mut self,
@@ -160,7 +160,7 @@ pub trait Graph: Sized {
     /// Applies a function to each number.
     fn activation(&mut self, x: &Self::Tensor, activation: Activation) -> Result<Self::Tensor>;
 
-    /// Attention; see [`Attention`]. → [batch, queries, width]
+    /// Attention; see [`Attention`]. → \[batch, queries, width\]
     fn attention(&mut self, attention: Attention<Self::Tensor>) -> Result<Self::Tensor>;
 
     /// a + b, where axes of size 1, and missing leading axes, are repeated.
@@ -171,7 +171,7 @@ pub trait Graph: Sized {
 
     /// x\[b, t\] + v\[b\]: a vector for each sample, added to all its frames.
     ///
-    /// `x`: [batch, frames, channels]; `v`: [batch, channels]
+    /// `x`: \[batch, frames, channels\]; `v`: \[batch, channels\]
     fn add_to_frames(&mut self, x: &Self::Tensor, v: &Self::Tensor) -> Result<Self::Tensor>;
 
     /// factor · x.
@@ -189,7 +189,7 @@ pub trait Graph: Sized {
     /// Takes rows of a fixed table by index; indices are whole numbers in a tensor of any shape.
     fn gather(&mut self, table: &Arc<Array2<f64>>, index: &Self::Tensor) -> Result<Self::Tensor>;
 
-    /// Takes rows of a learned table, [rows, channels], by index.
+    /// Takes rows of a learned table, \[rows, channels\], by index.
     fn embedding(&mut self, table: ParameterId, index: &Self::Tensor) -> Result<Self::Tensor>;
 
     /// In training sets each number to zero with the probability, and divides the rest by 1 − it.
@@ -199,7 +199,7 @@ pub trait Graph: Sized {
 
     /// x where `choice` is 0 and `other` where it is 1, for each sample.
     ///
-    /// `x`: [batch, frames, channels]; `choice`: [batch]; `other`: [channels]
+    /// `x`: \[batch, frames, channels\]; `choice`: \[batch\]; `other`: \[channels\]
     fn select(
         &mut self,
         choice: &Self::Tensor,
@@ -224,7 +224,7 @@ pub trait Graph: Sized {
 
     /// Says which frames of [`Graph::hold_frames`] count: 1 where `mask`, or all of x, has one, else 0.
     ///
-    /// `x`: [batch, frames, …]; `mask`: [batch, frames] → [batch, frames held]
+    /// `x`: \[batch, frames, …\]; `mask`: \[batch, frames\] → \[batch, frames held\]
     fn frame_mask(
         &mut self,
         x: &Self::Tensor,

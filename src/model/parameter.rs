@@ -32,9 +32,9 @@ impl Init {
 /// What a parameter is, which decides how it is kept and whether it decays.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Role {
-    /// The weight of a linear layer, [out, in], or a convolution, [out, in, taps]; decays.
+    /// The weight of a linear layer, \[out, in\], or a convolution, \[out, in, taps\]; decays.
     Weight,
-    /// Rows that are looked up by index, [rows, channels]; decays.
+    /// Rows that are looked up by index, \[rows, channels\]; decays.
     Table,
     /// Biases, scales of norms, single vectors; does not decay.
     Vector,

@@ -19,7 +19,7 @@ use super::parameter::{Init, ParameterId, ParameterList, Role, Scope};
 /// Predicts noise; see the module.
 #[derive(Clone, Debug)]
 pub struct UNet1D {
-    /// Sinusoids of each step, [n_steps, time_embed_dim], computed in f64.
+    /// Sinusoids of each step, \[n_steps, time_embed_dim\], computed in f64.
     time_table: Arc<Array2<f64>>,
     time_mlp: [Linear; 2],
     style_proj: Option<Linear>,
@@ -37,17 +37,17 @@ pub struct UNet1D {
 
 /// What a UNet is given.
 pub struct UNetInputs<'a, T> {
-    /// Noisy motion, normalised, [batch, frames, in_channels].
+    /// Noisy motion, normalised, \[batch, frames, in_channels\].
     pub x: &'a T,
-    /// Step of each sample, [batch], whole numbers in 0..n_steps.
+    /// Step of each sample, \[batch\], whole numbers in 0..n_steps.
     pub t: &'a T,
-    /// Features of the music, [batch, frames, audio_cond_dim].
+    /// Features of the music, \[batch, frames, audio_cond_dim\].
     pub audio: &'a T,
-    /// Samples that go without music, [batch], 1 where the null context is used.
+    /// Samples that go without music, \[batch\], 1 where the null context is used.
     pub drop_audio: Option<&'a T>,
-    /// Frames that count, [batch, frames], 1 or 0; all where absent.
+    /// Frames that count, \[batch, frames\], 1 or 0; all where absent.
     pub mask: Option<&'a T>,
-    /// Style of each sample, [batch, style_dim], of a network that takes one.
+    /// Style of each sample, \[batch, style_dim\], of a network that takes one.
     pub style: Option<&'a T>,
 }
 
@@ -181,7 +181,7 @@ impl UNet1D {
     /// Frames beyond a multiple of 2^(levels − 1) are held, masked out of attention, and cropped.
     ///
     /// # Shapes
-    /// See [`UNetInputs`]; returns [batch, frames, out_channels]
+    /// See [`UNetInputs`]; returns \[batch, frames, out_channels\]
     pub fn forward<G: Graph>(&self, g: &mut G, inputs: UNetInputs<G::Tensor>) -> Result<G::Tensor> {
         let multiple = 1 << (self.encoder.len() - 1);
         let conditions = self.conditions(g, &inputs)?;
@@ -264,7 +264,7 @@ impl UNet1D {
 
 /// A part of the network between two changes of the number of frames.
 trait Level: Clone + Send + 'static {
-    /// [batch, frames, inputs] → [batch, frames, outputs]
+    /// \[batch, frames, inputs\] → \[batch, frames, outputs\]
     fn forward<G: Graph>(
         &self,
         g: &mut G,
@@ -335,7 +335,7 @@ fn blocks_then_attention<G: Graph>(
     }
 }
 
-/// Returns the sinusoids of each step: row t is [cos(t ω₀), …, sin(t ω₀), …], ω_i = 10000^(−i / half).
+/// Returns the sinusoids of each step: row t is \[cos(t ω₀), …, sin(t ω₀), …\], ω_i = 10000^(−i / half).
 ///
 /// In f64, since the sine of a large angle in f32 is off by 3e-5 (Vaswani et al., "Attention Is All
 /// You Need", NIPS 2017, sec. 3.5, cosines first as in Dhariwal and Nichol's code).

@@ -3,7 +3,7 @@
 //! Products take rows of A by pointer, so that a convolution needs no copy of its input with shifted
 //! rows (im2col): M. Dukhan, "The Indirect Convolution Algorithm", arXiv 1907.02129, 2019.
 
-/// A 1-D convolution over [batch, frames, channels]; a linear layer is one with a single tap.
+/// A 1-D convolution over \[batch, frames, channels\]; a linear layer is one with a single tap.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Conv {
     pub batch: usize,
@@ -23,7 +23,7 @@ pub struct Gather {
     pub taps: Vec<usize>,
     /// Output rows.
     pub target: Vec<usize>,
-    /// Input rows, [taps][target]; `ZERO_ROW` where the padding is met.
+    /// Input rows, \[taps\]\[target\]; `ZERO_ROW` where the padding is met.
     pub source: Vec<usize>,
 }
 
@@ -111,7 +111,7 @@ impl Conv {
         (self.frames + 2 * self.padding).div_ceil(self.stride)
     }
 
-    /// Where an input row lies in a strip of [batch][stride][strip_frames] rows.
+    /// Where an input row lies in a strip of \[batch\]\[stride\]\[strip_frames\] rows.
     ///
     /// Rows of equal phase lie together, so that the frames that a tap meets do.
     pub fn strip_row(&self, row: usize) -> usize {

@@ -1,7 +1,7 @@
 //! Weights in panels of 16 outputs, the form in which they live.
 //!
-//! A weight W[n][k] (n outputs, k inputs; for a convolution k = tap · channels + channel) is kept as
-//! panels [n / 16][k][16], padded with zeros. Products read panels from front to back; the optimizer,
+//! A weight W\[n\]\[k\] (n outputs, k inputs; for a convolution k = tap · channels + channel) is kept as
+//! panels \[n / 16\]\[k\]\[16\], padded with zeros. Products read panels from front to back; the optimizer,
 //! averages and clipping work on elements and do not care. Only loading and saving unpack.
 
 use crate::autodiff::element::Element;
@@ -19,7 +19,7 @@ pub fn packed_len(n: usize, k: usize) -> usize {
     panels(n) * k * PANEL
 }
 
-/// Packs a weight from PyTorch's order: [outputs, inputs] or [outputs, inputs, taps].
+/// Packs a weight from PyTorch's order: \[outputs, inputs\] or \[outputs, inputs, taps\].
 pub fn pack_weight<E: Element>(
     source: &[E],
     n: usize,
@@ -69,7 +69,7 @@ super::vectorized! {
     }
 }
 
-/// Copies `source`, rows of `channels` numbers, into strips of 16 channels: [channels / 16][rows][16].
+/// Copies `source`, rows of `channels` numbers, into strips of 16 channels: \[channels / 16\]\[rows\]\[16\].
 ///
 /// `place(row)` says where a row goes within each strip of `strip_rows` rows; rows of the strips that
 /// receive nothing keep what they have. `first` and the length of `strips` choose the strips.

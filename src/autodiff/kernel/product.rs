@@ -117,11 +117,11 @@ unsafe fn run_rows<E: Element>(
 
 /// Computes out = rows of `source` times the weight, plus the bias.
 ///
-/// out[target] = bias + Σ_tap W_tap source[tap, target]
+/// out\[target\] = bias + Σ_tap W_tap source\[tap, target\]
 ///
 /// # Shapes
-/// - `source`: [rows, channels]; `weight`: panels of [taps · channels]; `bias`: [n]
-/// - `out`: [target rows, n]
+/// - `source`: \[rows, channels\]; `weight`: panels of \[taps · channels\]; `bias`: \[n\]
+/// - `out`: \[target rows, n\]
 pub fn product<E: Element>(
     source: &[E],
     channels: usize,
@@ -177,12 +177,12 @@ pub fn product<E: Element>(
 
 /// Computes the gradient of a layer's input: each input row sums over the output rows that it met.
 ///
-/// d_source[i] = Σ_tap W_tapᵀ d_out[the output row that met i at tap]
+/// d_source\[i\] = Σ_tap W_tapᵀ d_out\[the output row that met i at tap\]
 ///
 /// The weight's panels are transposed 16 × 16 numbers at a time into a block that all rows then use.
 ///
 /// # Shapes
-/// - `d_out`: [out rows, n]; `d_source`: [in rows, channels], overwritten
+/// - `d_out`: \[out rows, n\]; `d_source`: \[in rows, channels\], overwritten
 pub fn input_gradient<E: Element>(
     d_out: &[E],
     n: usize,
@@ -239,7 +239,7 @@ pub fn input_gradient<E: Element>(
     });
 }
 
-/// Fills `scratch`, panels of [BLOCK][16], with W[output][from + column] at [column / 16][output][lane].
+/// Fills `scratch`, panels of \[BLOCK\]\[16\], with W\[output\]\[from + column\] at \[column / 16\]\[output\]\[lane\].
 fn transpose_block<E: Element>(
     weight: &[E],
     k: usize,
@@ -267,12 +267,12 @@ fn transpose_block<E: Element>(
 
 /// Adds to, or overwrites, the gradients of a layer's weight and bias.
 ///
-/// d_W[n][tap, c] = Σ_rows d_out[row][n] source[row's input at tap][c],  d_bias[n] = Σ_rows d_out[row][n]
+/// d_W\[n\]\[tap, c\] = Σ_rows d_out\[row\]\[n\] source\[row's input at tap\]\[c\],  d_bias\[n\] = Σ_rows d_out\[row\]\[n\]
 ///
 /// Both factors are first copied into strips of 16 channels, in which rows of a sample lie together.
 ///
 /// # Shapes
-/// - `source`: [in rows, channels]; `d_out`: [out rows, n]; `d_weight`: panels; `d_bias`: [n]
+/// - `source`: \[in rows, channels\]; `d_out`: \[out rows, n\]; `d_weight`: panels; `d_bias`: \[n\]
 #[allow(clippy::too_many_arguments, reason = "two factors, two results, their sizes")]
 pub fn weight_gradient<E: Element>(
     source: &[E],

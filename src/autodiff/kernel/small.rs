@@ -29,7 +29,7 @@ impl<E> Matrix<'_, E> {
 /// Computes C = α A B, or C += α A B.
 ///
 /// # Shapes
-/// `[m, k, n]`: A is [m, k], B [k, n], C [m, n]. `scratch` is grown as needed and holds copies of both.
+/// `[m, k, n]`: A is \[m, k\], B \[k, n\], C \[m, n\]. `scratch` is grown as needed and holds copies of both.
 pub fn matmul<E: Element>(
     [m, k, n]: [usize; 3],
     alpha: E,
@@ -79,7 +79,7 @@ pub fn matmul<E: Element>(
     }
 }
 
-/// Copies a matrix of n rows into strips of 16 rows: [n / 16][k][16], times α.
+/// Copies a matrix of n rows into strips of 16 rows: \[n / 16\]\[k\]\[16\], times α.
 fn pack<E: Element>(n: usize, k: usize, a: Matrix<E>, strips: &mut [E], alpha: E) {
     let [row, column] = a.strides;
     for (s, strip) in strips.chunks_exact_mut((k * PANEL).max(1)).enumerate() {

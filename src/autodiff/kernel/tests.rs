@@ -3,7 +3,7 @@
 use super::*;
 use crate::autodiff::arena::Arena;
 
-/// Numbers in [-1, 1) that look random and are always the same.
+/// Numbers in \[-1, 1) that look random and are always the same.
 fn numbers(n: usize, seed: u64) -> Vec<f64> {
     let mut x = seed;
     let mut next = || {

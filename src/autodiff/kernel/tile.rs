@@ -12,8 +12,8 @@ pub const MAX_PANELS: usize = 3;
 
 /// A tile of C += A B, or C = A B.
 ///
-/// c[r][16 p + j] = Σ_s Σ_k a[r](s, k) · b[p](s, k)[j] over `segments` s and `k` steps, where
-/// a[r](s, k) = rows\[r\]\[s a_segment + k step\] and b\[p\](s, k) = the 16 numbers at
+/// c\[r\]\[16 p + j\] = Σ_s Σ_k a\[r\](s, k) · b\[p\](s, k)\[j\] over `segments` s and `k` steps, where
+/// a\[r\](s, k) = rows\[r\]\[s a_segment + k step\] and b\[p\](s, k) = the 16 numbers at
 /// b + p b_panel + s b_segment + 16 k.
 #[derive(Clone, Copy)]
 pub struct Tile<E> {

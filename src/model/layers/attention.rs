@@ -34,9 +34,9 @@ impl AttentionBlock {
     }
 
     /// # Shapes
-    /// - `x`: [batch, frames, width]; `mask`: [batch, frames], frames that count
-    /// - `context`: [batch, context frames, context_dim]; `context_mask`: [batch, context frames]
-    /// - returns [batch, frames, width]
+    /// - `x`: \[batch, frames, width\]; `mask`: \[batch, frames\], frames that count
+    /// - `context`: \[batch, context frames, context_dim\]; `context_mask`: \[batch, context frames\]
+    /// - returns \[batch, frames, width\]
     pub fn forward<G: Graph>(
         &self,
         g: &mut G,

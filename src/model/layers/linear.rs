@@ -11,7 +11,7 @@ pub struct Linear {
 }
 
 impl Linear {
-    /// Makes `weight` [outputs, inputs] and `bias` [outputs].
+    /// Makes `weight` \[outputs, inputs\] and `bias` \[outputs\].
     pub fn new(scope: &mut Scope, inputs: usize, outputs: usize) -> Self {
         let init = Init::fan_in(inputs);
         Self {
@@ -20,7 +20,7 @@ impl Linear {
         }
     }
 
-    /// [..., inputs] → [..., outputs]
+    /// \[..., inputs\] → \[..., outputs\]
     pub fn forward<G: Graph>(&self, g: &mut G, x: &G::Tensor) -> Result<G::Tensor> {
         g.linear(x, self.weight, Some(self.bias))
     }
@@ -70,7 +70,7 @@ impl Conv1d {
         }
     }
 
-    /// [batch, frames, inputs] → [batch, frames / stride, outputs]
+    /// \[batch, frames, inputs\] → \[batch, frames / stride, outputs\]
     pub fn forward<G: Graph>(&self, g: &mut G, x: &G::Tensor) -> Result<G::Tensor> {
         g.conv1d(x, self.weight, Some(self.bias), self.convolution)
     }

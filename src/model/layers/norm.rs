@@ -24,7 +24,7 @@ impl GroupNorm {
         })
     }
 
-    /// act((γ x̂ + β) (1 + s) + h), `film` = [s | h]. [batch, frames, channels], film [batch, 2 channels]
+    /// act((γ x̂ + β) (1 + s) + h), `film` = \[s | h\]. \[batch, frames, channels\], film \[batch, 2 channels\]
     pub fn forward<G: Graph>(
         &self,
         g: &mut G,
@@ -44,7 +44,7 @@ pub struct LayerNorm {
 }
 
 impl LayerNorm {
-    /// Makes `weight` and `bias` [channels].
+    /// Makes `weight` and `bias` \[channels\].
     pub fn new(scope: &mut Scope, channels: usize) -> Self {
         Self {
             weight: scope.parameter("weight", &[channels], Init::Ones, Role::Vector),
@@ -52,7 +52,7 @@ impl LayerNorm {
         }
     }
 
-    /// [..., channels] → [..., channels]
+    /// \[..., channels\] → \[..., channels\]
     pub fn forward<G: Graph>(&self, g: &mut G, x: &G::Tensor) -> Result<G::Tensor> {
         g.layer_norm(x, Some([self.weight, self.bias]), EPSILON)
     }

@@ -45,8 +45,8 @@ impl ResBlock {
     }
 
     /// # Shapes
-    /// - `x`: [batch, frames, inputs]; `time`: [batch, time_embed_dim], after its SiLU
-    /// - returns [batch, frames, outputs]
+    /// - `x`: \[batch, frames, inputs\]; `time`: \[batch, time_embed_dim\], after its SiLU
+    /// - returns \[batch, frames, outputs\]
     pub fn forward<G: Graph>(
         &self,
         g: &mut G,
