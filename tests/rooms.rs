@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 const MAY_USE: [(&str, &[&str]); 9] = [
     ("units", &[]),
     ("audio", &["units"]),
-    ("autodiff", &[]),
+    ("autodiff", &["model"]),
     ("model", &["audio", "motion"]),
     ("motion", &["units"]),
     ("plot", &["units"]),

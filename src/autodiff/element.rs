@@ -58,7 +58,7 @@ pub trait Element:
         if self < other { self } else { other }
     }
 
-    /// Runs one tile of a matrix product; see [`Tile`].
+    /// Runs one tile of a matrix product; see `Tile`.
     ///
     /// # Safety
     /// The pointers of the tile are valid for what it reads and writes.

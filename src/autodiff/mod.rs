@@ -1,8 +1,31 @@
-//! Arrays, and the products that networks are made of, for training and inference on a CPU.
+//! Arrays with gradients, for training and inference on a CPU.
 //!
-//! What is here so far: the numbers ([`element`]), buffers that come back ([`arena`]), and the three
-//! products of a layer ([`kernel`]).
+//! A [`Tape`] runs a network and records it, [`Eager`] only runs it; both are graphs in the sense of
+//! [`model`](crate::model). Operations lie in `op`, each with its forward and its backward; the
+//! products that networks are made of lie in `kernel`, the only code with `unsafe`. The same code runs
+//! in `f32` and in `f64`.
 
-pub mod arena;
-pub mod element;
-pub mod kernel;
+mod arena;
+mod eager;
+mod element;
+mod finite;
+#[cfg(test)]
+mod gradient_tests;
+mod graph;
+mod kernel;
+pub mod op;
+mod operation;
+mod parameters;
+mod random;
+mod tape;
+mod tensor;
+
+pub use arena::{Arena, Usage};
+pub use eager::Eager;
+pub use element::Element;
+pub use kernel::{Level, level};
+pub use operation::{Backward, Interpreter, Operation, Run};
+pub use parameters::{Gradients, Parameters, Plan, WeightShape};
+pub use random::Stream;
+pub use tape::{InputGradients, Tape};
+pub use tensor::Tensor;

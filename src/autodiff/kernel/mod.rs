@@ -24,10 +24,10 @@ mod tile;
 #[cfg(target_arch = "x86_64")]
 mod x86;
 
-pub use gather::{Conv, Gather};
-use level::vectorized;
+pub use gather::Conv;
+pub(super) use level::vectorized;
 pub use level::{Level, level};
-pub use pack::{PANEL, pack_weight, packed_len, panels, unpack_weight};
+pub use pack::{PANEL, pack_weight, packed_len, unpack_weight};
 pub use product::{input_gradient, product, weight_gradient};
 pub use small::{Matrix, MatrixMut, matmul};
 pub use tile::{Tile, run_f32, run_portable};

@@ -1,0 +1,255 @@
+//! Scaled dot-product attention over several heads.
+
+use rayon::prelude::*;
+
+use crate::autodiff::element::Element;
+use crate::autodiff::kernel::{Matrix, MatrixMut, matmul};
+use crate::autodiff::operation::{Backward, Operation, Run, expect_axes, expect_size};
+use crate::autodiff::tensor::Tensor;
+use crate::model::{GraphError, Result};
+
+/// Where queries, keys or values lie: which input, and from which channel on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Place {
+    pub input: usize,
+    pub first: usize,
+}
+
+/// softmax(Q Kᵀ/√d + mask) V, head by head.
+///
+/// Queries, keys and values may be parts of one input, so that nothing is copied out of a joint
+/// projection. A query all of whose keys are masked gets zeros. Vaswani et al., "Attention Is All You
+/// Need", NIPS 2017, eq. 1.
+///
+/// # Shapes
+/// inputs: \[batch, queries, …\], \[batch, keys, …\]; mask: \[batch, keys\] → \[batch, queries, width\]
+pub struct Attend<E: Element> {
+    pub query: Place,
+    pub key: Place,
+    pub value: Place,
+    pub width: usize,
+    pub heads: usize,
+    pub causal: bool,
+    /// Whether the last input is a mask of the keys.
+    pub masked: bool,
+    kept: Option<Kept<E>>,
+}
+
+struct Kept<E: Element> {
+    inputs: Vec<Tensor<E>>,
+    /// Softmax, \[batch, heads, queries, keys\].
+    weights: Tensor<E>,
+}
+
+/// The sizes of one head.
+#[derive(Clone, Copy)]
+struct Head {
+    queries: usize,
+    keys: usize,
+    dim: usize,
+}
+
+impl<E: Element> Attend<E> {
+    /// Returns the operation.
+    pub fn new([query, key, value]: [Place; 3], width: usize, heads: usize, causal: bool) -> Self {
+        Self { query, key, value, width, heads, causal, masked: false, kept: None }
+    }
+
+    /// Says that the last input is a mask of the keys.
+    pub fn masked(mut self) -> Self {
+        self.masked = true;
+        self
+    }
+
+    fn check(&self, x: &[&Tensor<E>]) -> Result<Head> {
+        let label = "attention";
+        for (what, place) in [("query", self.query), ("key", self.key), ("value", self.value)] {
+            let input = x[place.input];
+            expect_axes(label, what, input, 3, "[batch, frames, channels]")?;
+            let end = place.first + self.width;
+            if input.channels() < end {
+                let problem =
+                    format!("{what} has {} channels, expected {end} or more", input.channels());
+                return Err(GraphError::shape(label, problem));
+            }
+            let batch = x[self.query.input].shape()[0];
+            expect_size(label, what, "samples", input.shape()[0], "query", batch)?;
+        }
+        if self.heads == 0 || !self.width.is_multiple_of(self.heads) {
+            let problem =
+                format!("{} channels cannot be split into {} heads", self.width, self.heads);
+            return Err(GraphError::shape(label, problem));
+        }
+        let keys = x[self.key.input].shape()[1];
+        expect_size(label, "value", "frames", x[self.value.input].shape()[1], "key", keys)?;
+        if self.masked {
+            let mask = x[x.len() - 1];
+            let wanted = [x[self.query.input].shape()[0], keys];
+            if mask.shape() != wanted {
+                let problem = format!("mask has shape {:?}, keys expect {wanted:?}", mask.shape());
+                return Err(GraphError::shape(label, problem));
+            }
+        }
+        let queries = x[self.query.input].shape()[1];
+        Ok(Head { queries, keys, dim: self.width / self.heads })
+    }
+
+    /// Returns one head of one sample of an input as a matrix \[frames, dim\].
+    fn head<'a>(&self, x: &'a Tensor<E>, place: Place, b: usize, h: usize) -> Matrix<'a, E> {
+        let (frames, channels) = (x.shape()[1], x.channels());
+        let first = b * frames * channels + place.first + h * self.width / self.heads;
+        Matrix { data: &x.data()[first.min(x.len())..], strides: [channels, 1] }
+    }
+}
+
+/// Turns a row of products into weights; keys from `visible` on, or masked, get none.
+fn softmax_row<E: Element>(row: &mut [E], mask: Option<&[E]>, visible: usize) {
+    let counts = |i: usize| i < visible && mask.is_none_or(|mask| mask[i] > E::ZERO);
+    let mut largest: Option<E> = None;
+    for (i, &x) in row.iter().enumerate() {
+        if counts(i) {
+            largest = Some(largest.map_or(x, |l| l.larger(x)));
+        }
+    }
+    let Some(largest) = largest else { return row.fill(E::ZERO) };
+    let mut sum = E::ZERO;
+    for (i, x) in row.iter_mut().enumerate() {
+        *x = if counts(i) { (*x - largest).exp() } else { E::ZERO };
+        sum += *x;
+    }
+    for x in row {
+        *x /= sum;
+    }
+}
+
+impl<E: Element> Operation<E> for Attend<E> {
+    fn name(&self) -> &'static str {
+        "attention"
+    }
+
+    fn forward(&mut self, x: &[&Tensor<E>], run: &Run<E>) -> Result<Tensor<E>> {
+        let Head { queries, keys, dim } = self.check(x)?;
+        let batch = x[self.query.input].shape()[0];
+        let mask = self.masked.then(|| x[x.len() - 1]);
+        let scale = E::from_f64(1.0 / (dim as f64).sqrt());
+        let [query, key, value] = [self.query, self.key, self.value].map(|p| x[p.input]);
+        let mut weights = run.tensor(&[batch, self.heads, queries, keys], |_| {});
+        // Heads side by side in memory first: [batch, heads, queries, dim].
+        let mut heads = run.tensor(&[batch, self.heads, queries, dim], |_| {});
+        let (w_len, o_len) = ((queries * keys).max(1), (queries * dim).max(1));
+        let parts =
+            weights.data_mut().par_chunks_mut(w_len).zip(heads.data_mut().par_chunks_mut(o_len));
+        parts.enumerate().for_each_init(Vec::new, |scratch, (i, (w, o))| {
+            let (b, h) = (i / self.heads, i % self.heads);
+            let q = self.head(query, self.query, b, h);
+            let k = self.head(key, self.key, b, h);
+            let v = self.head(value, self.value, b, h);
+            let into = MatrixMut { data: &mut *w, row_stride: keys };
+            matmul([queries, dim, keys], scale, q, k.t(), into, false, scratch);
+            let mask = mask.map(|mask| &mask.data()[b * keys..][..keys]);
+            for (t, row) in w.chunks_exact_mut(keys).enumerate() {
+                softmax_row(row, mask, if self.causal { t + 1 } else { keys });
+            }
+            let w = Matrix { data: w, strides: [keys, 1] };
+            let into = MatrixMut { data: o, row_stride: dim };
+            matmul([queries, keys, dim], E::ONE, w, v, into, false, scratch);
+        });
+        let y = run.tensor(&[batch, queries, self.width], |y| {
+            interleave(heads.data(), y, self.heads, queries, dim);
+        });
+        if run.recording {
+            let inputs = x.iter().map(|&x| x.clone()).collect();
+            self.kept = Some(Kept { inputs, weights });
+        }
+        Ok(y)
+    }
+
+    /// With P the weights: dV = Pᵀ dO, dP = dO Vᵀ, dS = P ∘ (dP − Σ_j dP P), dQ = dS K/√d,
+    /// dK = dSᵀ Q/√d.
+    fn backward(&mut self, dy: Tensor<E>, at: &mut Backward<E>) -> Vec<Option<Tensor<E>>> {
+        let Kept { inputs, weights } = self.kept.take().expect("kept by the forward");
+        let [batch, heads, queries, keys] = *weights.shape() else { unreachable!("its own shape") };
+        let dim = self.width / heads;
+        let scale = E::from_f64(1.0 / (dim as f64).sqrt());
+        let [query, key, value] = [self.query, self.key, self.value].map(|p| &inputs[p.input]);
+        let tensor = |frames: usize| at.tensor(&[batch, heads, frames, dim], |_| {});
+        let [mut dq, mut dk, mut dv] = [tensor(queries), tensor(keys), tensor(keys)];
+        let all = Place { input: 0, first: 0 };
+        let parts = (dq.data_mut().par_chunks_mut((queries * dim).max(1)))
+            .zip(dk.data_mut().par_chunks_mut((keys * dim).max(1)))
+            .zip(dv.data_mut().par_chunks_mut((keys * dim).max(1)));
+        let buffers = || (Vec::new(), vec![E::ZERO; queries * keys]);
+        parts.enumerate().for_each_init(buffers, |(scratch, ds), (i, ((dq, dk), dv))| {
+            let (b, h) = (i / heads, i % heads);
+            let q = self.head(query, self.query, b, h);
+            let k = self.head(key, self.key, b, h);
+            let v = self.head(value, self.value, b, h);
+            let d_o = self.head(&dy, all, b, h);
+            let w = &weights.data()[i * queries * keys..][..queries * keys];
+            let p = Matrix { data: w, strides: [keys, 1] };
+            let rows = |data| MatrixMut { data, row_stride: dim };
+            matmul([keys, queries, dim], E::ONE, p.t(), d_o, rows(dv), false, scratch);
+            let into = MatrixMut { data: &mut *ds, row_stride: keys };
+            matmul([queries, dim, keys], E::ONE, d_o, v.t(), into, false, scratch);
+            for (ds, w) in ds.chunks_exact_mut(keys).zip(w.chunks_exact(keys)) {
+                let mean = ds.iter().zip(w).map(|(&d, &w)| d * w).sum::<E>();
+                for (d, &w) in ds.iter_mut().zip(w) {
+                    *d = w * (*d - mean);
+                }
+            }
+            let ds = Matrix { data: &*ds, strides: [keys, 1] };
+            matmul([queries, keys, dim], scale, ds, k, rows(dq), false, scratch);
+            matmul([keys, queries, dim], scale, ds.t(), q, rows(dk), false, scratch);
+        });
+        drop(weights);
+        let mut found = Vec::with_capacity(inputs.len());
+        for (input, (x, &needed)) in inputs.iter().zip(at.needs).enumerate() {
+            let is_mask = self.masked && input + 1 == inputs.len();
+            if !needed || is_mask {
+                found.push(None);
+                continue;
+            }
+            let channels = x.channels();
+            let mine: Vec<_> = [(self.query, &dq), (self.key, &dk), (self.value, &dv)]
+                .into_iter()
+                .filter(|(place, _)| place.input == input)
+                .collect();
+            let apart = mine.len() * self.width == channels
+                && mine.iter().enumerate().all(|(i, (place, _))| {
+                    mine[..i]
+                        .iter()
+                        .all(|(other, _)| other.first.abs_diff(place.first) >= self.width)
+                });
+            found.push(Some(at.tensor(x.shape(), |d| {
+                if !apart {
+                    d.fill(E::ZERO);
+                }
+                for (place, part) in mine {
+                    let frames = x.shape()[1];
+                    for (row, target) in d.chunks_exact_mut(channels).enumerate() {
+                        let (b, t) = (row / frames, row % frames);
+                        for h in 0..heads {
+                            let source =
+                                &part.data()[((b * heads + h) * frames + t) * dim..][..dim];
+                            let target = &mut target[place.first + h * dim..][..dim];
+                            for (d, &x) in target.iter_mut().zip(source) {
+                                *d = if apart { x } else { *d + x };
+                            }
+                        }
+                    }
+                }
+            })));
+        }
+        found
+    }
+}
+
+/// \[batch, heads, frames, dim\] → \[batch, frames, heads · dim\]
+fn interleave<E: Element>(source: &[E], target: &mut [E], heads: usize, frames: usize, dim: usize) {
+    for (row, target) in target.chunks_exact_mut((heads * dim).max(1)).enumerate() {
+        let (b, t) = (row / frames, row % frames);
+        for (h, target) in target.chunks_exact_mut(dim).enumerate() {
+            target.copy_from_slice(&source[((b * heads + h) * frames + t) * dim..][..dim]);
+        }
+    }
+}

@@ -1,0 +1,187 @@
+//! Operations on the number of frames: repeating, holding the last, cropping, masks.
+
+use super::binary::add_assign;
+use crate::autodiff::element::Element;
+use crate::autodiff::operation::{Backward, Operation, Run, expect_axes, expect_size};
+use crate::autodiff::tensor::Tensor;
+use crate::model::{GraphError, Result};
+
+const AXES: &str = "[batch, frames, channels]";
+
+/// Takes frames by index, sample by sample: what repeating, holding and cropping have in common.
+///
+/// y\[b, i\] = x\[b, index\[i\]\]; the gradient of a frame is the sum over those that took it.
+pub struct TakeFrames {
+    name: &'static str,
+    choose: Choice,
+    index: Vec<usize>,
+    frames: usize,
+}
+
+#[derive(Clone, Copy)]
+enum Choice {
+    Repeat {
+        factor: usize,
+    },
+    Hold {
+        multiple: usize,
+    },
+    /// As many as the second input has.
+    Crop,
+}
+
+impl TakeFrames {
+    /// Each frame `factor` times, nearest neighbour: \[batch, frames, c\] → \[batch, factor · frames, c\].
+    pub fn repeat(factor: usize) -> Self {
+        Self::new("upsample", Choice::Repeat { factor })
+    }
+
+    /// The last frame repeated until their number is a multiple.
+    pub fn hold(multiple: usize) -> Self {
+        Self::new("hold_frames", Choice::Hold { multiple })
+    }
+
+    /// The first frames, as many as the second input has.
+    pub fn crop() -> Self {
+        Self::new("crop_frames", Choice::Crop)
+    }
+
+    fn new(name: &'static str, choose: Choice) -> Self {
+        Self { name, choose, index: Vec::new(), frames: 0 }
+    }
+}
+
+impl<E: Element> Operation<E> for TakeFrames {
+    fn name(&self) -> &'static str {
+        self.name
+    }
+
+    fn forward(&mut self, x: &[&Tensor<E>], run: &Run<E>) -> Result<Tensor<E>> {
+        let input = x[0];
+        expect_axes(self.name, "input", input, 3, AXES)?;
+        let (batch, frames, channels) = (input.shape()[0], input.shape()[1], input.channels());
+        if frames == 0 {
+            return Err(GraphError::shape(self.name, "input has no frames"));
+        }
+        self.frames = frames;
+        self.index = match self.choose {
+            Choice::Repeat { factor } => (0..factor * frames).map(|i| i / factor).collect(),
+            Choice::Hold { multiple } => {
+                let n = frames.next_multiple_of(multiple.max(1));
+                (0..n).map(|i| i.min(frames - 1)).collect()
+            }
+            Choice::Crop => {
+                expect_axes(self.name, "the other input", x[1], 3, AXES)?;
+                let wanted = x[1].shape()[1];
+                if wanted > frames {
+                    let problem = format!("input has {frames} frames, {wanted} asked for");
+                    return Err(GraphError::shape(self.name, problem));
+                }
+                (0..wanted).collect()
+            }
+        };
+        let shape = [batch, self.index.len(), channels];
+        Ok(run.tensor(&shape, |y| {
+            let n = (self.index.len() * channels).max(1);
+            let samples = y.chunks_exact_mut(n).zip(input.data().chunks_exact(frames * channels));
+            for (y, x) in samples {
+                for (y, &i) in y.chunks_exact_mut(channels).zip(&self.index) {
+                    y.copy_from_slice(&x[i * channels..][..channels]);
+                }
+            }
+        }))
+    }
+
+    fn backward(&mut self, dy: Tensor<E>, at: &mut Backward<E>) -> Vec<Option<Tensor<E>>> {
+        let (batch, channels) = (dy.shape()[0], dy.channels());
+        let sample = self.frames * channels;
+        let mut found = at.only(|| {
+            at.tensor(&[batch, self.frames, channels], |dx| {
+                dx.fill(E::ZERO);
+                let n = (self.index.len() * channels).max(1);
+                for (dx, dy) in dx.chunks_exact_mut(sample).zip(dy.data().chunks_exact(n)) {
+                    for (dy, &i) in dy.chunks_exact(channels).zip(&self.index) {
+                        add_assign(&mut dx[i * channels..][..channels], dy);
+                    }
+                }
+            })
+        });
+        if matches!(self.choose, Choice::Crop) {
+            found.push(None);
+        }
+        found
+    }
+}
+
+/// Which frames count once the last is held: 1 where the mask, or all of x, has one, else 0.
+///
+/// `x`: \[batch, frames, …\]; mask: \[batch, frames\] → \[batch, frames held\]; it has no gradient.
+pub struct FrameMask {
+    /// Frames are held up to a multiple of this.
+    pub multiple: usize,
+}
+
+impl<E: Element> Operation<E> for FrameMask {
+    fn name(&self) -> &'static str {
+        "frame_mask"
+    }
+
+    fn forward(&mut self, x: &[&Tensor<E>], run: &Run<E>) -> Result<Tensor<E>> {
+        expect_axes("frame_mask", "input", x[0], 3, AXES)?;
+        let (batch, frames) = (x[0].shape()[0], x[0].shape()[1]);
+        let mask = x.get(1);
+        if let Some(mask) = mask
+            && mask.shape() != [batch, frames]
+        {
+            let problem =
+                format!("mask has shape {:?}, input expects {:?}", mask.shape(), [batch, frames]);
+            return Err(GraphError::shape("frame_mask", problem));
+        }
+        let held = frames.next_multiple_of(self.multiple.max(1));
+        Ok(run.tensor(&[batch, held], |y| {
+            for (b, y) in y.chunks_exact_mut(held.max(1)).enumerate() {
+                y.fill(E::ZERO);
+                match mask {
+                    Some(mask) => {
+                        let mask = &mask.data()[b * frames..][..frames];
+                        for (y, &x) in y.iter_mut().zip(mask) {
+                            *y = if x > E::ZERO { E::ONE } else { E::ZERO };
+                        }
+                    }
+                    None => y[..frames].fill(E::ONE),
+                }
+            }
+        }))
+    }
+
+    fn backward(&mut self, _: Tensor<E>, at: &mut Backward<E>) -> Vec<Option<Tensor<E>>> {
+        at.needs.iter().map(|_| None).collect()
+    }
+}
+
+/// Every `stride`-th frame of a mask, from the first on: \[batch, frames\] → \[batch, ⌈frames / stride⌉\].
+pub struct StrideMask {
+    pub stride: usize,
+}
+
+impl<E: Element> Operation<E> for StrideMask {
+    fn name(&self) -> &'static str {
+        "stride_mask"
+    }
+
+    fn forward(&mut self, x: &[&Tensor<E>], run: &Run<E>) -> Result<Tensor<E>> {
+        expect_axes("stride_mask", "mask", x[0], 2, "[batch, frames]")?;
+        expect_size("stride_mask", "stride", "frames", self.stride.min(1), "a step", 1)?;
+        let (batch, frames) = (x[0].shape()[0], x[0].shape()[1]);
+        let kept = frames.div_ceil(self.stride);
+        Ok(run.tensor(&[batch, kept], |y| {
+            for (i, y) in y.iter_mut().enumerate() {
+                *y = x[0].data()[i / kept * frames + i % kept * self.stride];
+            }
+        }))
+    }
+
+    fn backward(&mut self, _: Tensor<E>, _: &mut Backward<E>) -> Vec<Option<Tensor<E>>> {
+        vec![None]
+    }
+}
