@@ -5,6 +5,7 @@
 //! products that networks are made of lie in `kernel`, the only code with `unsafe`. The same code runs
 //! in `f32` and in `f64`.
 
+mod adamw;
 mod arena;
 mod eager;
 mod element;
@@ -19,7 +20,9 @@ mod parameters;
 mod random;
 mod tape;
 mod tensor;
+mod weights_file;
 
+pub use adamw::{AdamW, AdamWConfig};
 pub use arena::{Arena, Usage};
 pub use eager::Eager;
 pub use element::Element;
@@ -29,3 +32,4 @@ pub use parameters::{Gradients, Parameters, Plan, WeightShape};
 pub use random::Stream;
 pub use tape::{InputGradients, Tape};
 pub use tensor::Tensor;
+pub use weights_file::{Precision, WeightsError, load, save};

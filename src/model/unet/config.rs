@@ -64,7 +64,7 @@ impl Preset {
     /// Returns the sizes.
     pub fn config(self) -> UNetConfig {
         let (widths, dim): (&[usize], _) = match self {
-            Self::Tiny => (&[16, 24, 32], 32),
+            Self::Tiny => (&[40, 48, 64], 32),
             Self::Small => (&[48, 96, 160, 192], 128),
             Self::Base => (&[256, 512, 1024, 1152], 256),
             Self::Large => (&[256, 512, 1024, 2048], 256),

@@ -1,0 +1,191 @@
+//! Parameters as safetensors, named and shaped as PyTorch has them.
+//!
+//! A PyTorch state dict of the same network, saved as safetensors, loads unchanged. Bytes in, bytes
+//! out: files are the store's business.
+
+use std::borrow::Cow;
+use std::collections::{BTreeMap, HashMap};
+
+use half::{bf16, f16};
+use safetensors::SafeTensors;
+use safetensors::tensor::{Dtype, SafeTensorError, TensorView, View};
+
+use crate::model::{ParameterId, ParameterList};
+
+use super::element::Element;
+use super::parameters::{Parameters, Plan};
+
+/// Why weights could not be read.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum WeightsError {
+    #[error("{0}; save the state dict as safetensors again")]
+    Format(#[from] SafeTensorError),
+    /// Everything that does not fit, at once.
+    #[error("the weights are not those of this network: {}", .0.join("; "))]
+    Mismatch(Vec<String>),
+}
+
+/// How numbers are written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Precision {
+    F32,
+    F64,
+}
+
+/// One parameter on its way to a file.
+struct Saved<'a, E: Element> {
+    plan: &'a Plan,
+    all: &'a [E],
+    id: ParameterId,
+    precision: Precision,
+}
+
+impl<E: Element> View for Saved<'_, E> {
+    fn dtype(&self) -> Dtype {
+        match self.precision {
+            Precision::F32 => Dtype::F32,
+            Precision::F64 => Dtype::F64,
+        }
+    }
+
+    fn shape(&self) -> &[usize] {
+        &self.plan.list().get(self.id).shape
+    }
+
+    fn data(&self) -> Cow<'_, [u8]> {
+        let values = self.plan.unpack(self.id, self.all);
+        let values = values.into_iter().map(Element::to_f64);
+        Cow::Owned(match self.precision {
+            Precision::F32 => values.flat_map(|x| (x as f32).to_le_bytes()).collect(),
+            Precision::F64 => values.flat_map(f64::to_le_bytes).collect(),
+        })
+    }
+
+    fn data_len(&self) -> usize {
+        self.plan.list().get(self.id).len() * self.dtype().bitsize() / 8
+    }
+}
+
+/// Writes parameters, or what lies as they do, as a safetensors file.
+///
+/// # Errors
+/// If the format cannot hold them.
+pub fn save<E: Element>(
+    plan: &Plan,
+    all: &[E],
+    precision: Precision,
+    metadata: &BTreeMap<String, String>,
+) -> Result<Vec<u8>, WeightsError> {
+    let tensors = plan
+        .list()
+        .iter()
+        .map(|(id, parameter)| (&parameter.name, Saved { plan, all, id, precision }));
+    let metadata: HashMap<_, _> = metadata.clone().into_iter().collect();
+    Ok(safetensors::serialize(tensors, (!metadata.is_empty()).then_some(metadata))?)
+}
+
+/// Reads the parameters of a network; half precision becomes the element's own.
+///
+/// # Errors
+/// If the bytes are no safetensors file, or not the network's: every missing, extra and misshaped
+/// tensor is listed.
+pub fn load<E: Element>(bytes: &[u8], list: ParameterList) -> Result<Parameters<E>, WeightsError> {
+    let file = SafeTensors::deserialize(bytes)?;
+    let found: BTreeMap<_, _> = file.iter().collect();
+    let mut problems = Vec::new();
+    for (_, parameter) in list.iter() {
+        let name = &parameter.name;
+        match found.get(name.as_str()) {
+            None => problems.push(format!("{name} is missing")),
+            Some(tensor) if tensor.shape() != parameter.shape => problems.push(format!(
+                "{name} has shape {:?}, the network expects {:?}",
+                tensor.shape(),
+                parameter.shape
+            )),
+            Some(tensor) if numbers::<E>(tensor).is_none() => {
+                problems
+                    .push(format!("{name} holds {:?}, not floating-point numbers", tensor.dtype()));
+            }
+            Some(_) => {}
+        }
+    }
+    let known = list.by_name();
+    for name in found.keys().filter(|name| !known.contains_key(*name)) {
+        problems.push(format!("{name} is not a parameter of the network"));
+    }
+    if !problems.is_empty() {
+        return Err(WeightsError::Mismatch(problems));
+    }
+    Ok(Parameters::from_fn(list, |parameter| {
+        let tensor = found.get(parameter.name.as_str()).and_then(|tensor| numbers(tensor));
+        tensor.expect("checked above")
+    }))
+}
+
+/// Returns the numbers of a tensor, `None` where they are not floating-point.
+fn numbers<E: Element>(tensor: &TensorView) -> Option<Vec<E>> {
+    fn each<const N: usize, E: Element>(data: &[u8], read: impl Fn([u8; N]) -> f64) -> Vec<E> {
+        data.as_chunks::<N>().0.iter().map(|&bytes| E::from_f64(read(bytes))).collect()
+    }
+    let data = tensor.data();
+    Some(match tensor.dtype() {
+        Dtype::F64 => each(data, f64::from_le_bytes),
+        Dtype::F32 => each(data, |b| f64::from(f32::from_le_bytes(b))),
+        Dtype::F16 => each(data, |b| f16::from_le_bytes(b).to_f64()),
+        Dtype::BF16 => each(data, |b| bf16::from_le_bytes(b).to_f64()),
+        _ => return None,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::{DecoderConfig, MotionDecoder};
+
+    fn small() -> ParameterList {
+        let config = DecoderConfig { hidden_dim: 5, n_blocks: 1, ..DecoderConfig::default() };
+        MotionDecoder::new(&config).1
+    }
+
+    #[test]
+    fn what_is_saved_loads_to_the_same_bits() {
+        let parameters = Parameters::<f32>::new(small(), 3);
+        let metadata = BTreeMap::from([("preset".to_owned(), "tiny".to_owned())]);
+        let bytes = save(parameters.plan(), parameters.all(), Precision::F32, &metadata).unwrap();
+        let back = load::<f32>(&bytes, small()).unwrap();
+        assert_eq!(back.all(), parameters.all());
+        let (_, header) = SafeTensors::read_metadata(&bytes).unwrap();
+        assert_eq!(header.metadata().as_ref().unwrap()["preset"], "tiny");
+    }
+
+    #[test]
+    fn everything_that_does_not_fit_is_listed() {
+        let zeros = vec![0_u8; 4 * 125];
+        let view = |dtype, shape: &[usize], n| {
+            TensorView::new(dtype, shape.to_vec(), &zeros[..n]).unwrap()
+        };
+        let mut tensors: BTreeMap<_, _> = small()
+            .iter()
+            .map(|(_, p)| (p.name.clone(), view(Dtype::F32, &p.shape, 4 * p.len())))
+            .collect();
+        tensors.remove("phase_head.bias");
+        tensors.insert("input_proj.weight".to_owned(), view(Dtype::F32, &[5, 24], 4 * 120));
+        tensors.insert("style_head.bias".to_owned(), view(Dtype::I32, &[8], 32));
+        tensors.insert("extra".to_owned(), view(Dtype::F32, &[2], 8));
+        let bytes = safetensors::serialize(&tensors, None).unwrap();
+        let error = load::<f32>(&bytes, small()).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "the weights are not those of this network: input_proj.weight has shape [5, 24], the \
+             network expects [5, 25]; phase_head.bias is missing; style_head.bias holds I32, not \
+             floating-point numbers; extra is not a parameter of the network"
+        );
+    }
+
+    #[test]
+    fn bytes_of_another_kind_are_refused() {
+        let error = load::<f32>(b"PK\x03\x04", small()).unwrap_err();
+        assert_eq!(error.to_string(), "header too small; save the state dict as safetensors again");
+    }
+}

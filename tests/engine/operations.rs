@@ -1,0 +1,134 @@
+//! Single operations against PyTorch in f64: values and gradients.
+
+use motiongen::autodiff::op::loss::{Cost, Loss};
+use motiongen::autodiff::op::softmax::CrossEntropy;
+use motiongen::autodiff::{Arena, Gradients, Interpreter, Parameters, Tape, Tensor};
+use motiongen::model::{
+    Activation, Attention, Channels, Convolution, Graph, GroupNormalization, Init, ParameterId,
+    ParameterList, Result, Role, Scope,
+};
+
+use super::golden::{Golden, assert_near};
+
+/// In f64 only the order of sums differs.
+const TOLERANCE: f64 = 1e-12;
+
+type T = Tensor<f64>;
+
+/// Runs one case: inputs named in `inputs` go through the tape, those in `weights` are parameters.
+fn check(
+    case: &str,
+    inputs: &[&str],
+    weights: &[(&str, Role)],
+    f: impl Fn(&mut Tape<f64>, &[T], &[ParameterId]) -> Result<T>,
+) {
+    let golden = Golden::open("ops.safetensors");
+    let of = |name: &str| format!("{case}/{name}");
+    let mut list = ParameterList::default();
+    let mut scope = Scope::root(&mut list);
+    let ids: Vec<_> = weights
+        .iter()
+        .map(|(name, role)| scope.parameter(name, golden.shape(&of(name)), Init::Zeros, *role))
+        .collect();
+    let parameters =
+        Parameters::<f64>::from_fn(list, |parameter| golden.values(&of(&parameter.name)).to_vec());
+    let arena = Arena::default();
+    let mut tape = Tape::new(&parameters, &arena, None);
+    let tensors: Vec<_> = inputs
+        .iter()
+        .map(|name| tape.input(golden.shape(&of(name)), golden.values(&of(name))))
+        .collect();
+    let y = f(&mut tape, &tensors, &ids).expect("shapes fit");
+    assert_eq!(y.shape(), golden.shape(&of("output")), "{case}");
+    assert_near(case, y.data(), golden.values(&of("output")), TOLERANCE);
+    let cotangent = tape.constant(y.shape(), golden.values(&of("cotangent")));
+    let mut gradients = Gradients::new(&parameters);
+    let found = tape.backward_from(y, cotangent, &mut gradients).expect("finite");
+    for (name, tensor) in inputs.iter().zip(&tensors) {
+        if let Some(wanted) = golden.get(&of(&format!("grad_{name}"))) {
+            let got = found.of(tensor).expect("a gradient").data();
+            assert_near(&format!("{case}, gradient of {name}"), got, wanted, TOLERANCE);
+        }
+    }
+    for ((name, _), &id) in weights.iter().zip(&ids) {
+        let got = gradients.unpacked(id);
+        let wanted = golden.values(&of(&format!("grad_{name}")));
+        assert_near(&format!("{case}, gradient of {name}"), &got, wanted, TOLERANCE);
+    }
+}
+
+const LAYER: [(&str, Role); 2] = [("weight", Role::Weight), ("bias", Role::Vector)];
+const NORM: [(&str, Role); 2] = [("weight", Role::Vector), ("bias", Role::Vector)];
+
+#[test]
+fn convolutions_are_pytorchs() {
+    for (case, taps, stride, padding, dilation) in
+        [("conv1d_stride2", 3, 2, 1, 1), ("conv1d_dilation3", 5, 1, 6, 3)]
+    {
+        let convolution = Convolution { taps, stride, padding, dilation };
+        check(case, &["x"], &LAYER, |g, x, p| g.conv1d(&x[0], p[0], Some(p[1]), convolution));
+    }
+}
+
+#[test]
+fn norms_are_pytorchs() {
+    let norm = |p: &[ParameterId]| GroupNormalization {
+        groups: 5,
+        epsilon: 1e-5,
+        weight: p[0],
+        bias: p[1],
+    };
+    check("group_norm", &["x"], &NORM, |g, x, p| {
+        g.group_norm(&x[0], norm(p), None, Activation::Identity)
+    });
+    check("group_norm_film_silu", &["x", "film"], &NORM, |g, x, p| {
+        g.group_norm(&x[0], norm(p), Some(&x[1]), Activation::Silu)
+    });
+    check("layer_norm", &["x"], &NORM, |g, x, p| g.layer_norm(&x[0], Some([p[0], p[1]]), 1e-5));
+}
+
+#[test]
+fn attention_is_pytorchs() {
+    fn attention<'a>(x: &'a [T], key_mask: Option<&'a T>) -> Attention<'a, T> {
+        let [query, key, value] = [0, 1, 2].map(|i| Channels { tensor: &x[i], first: 0 });
+        Attention { query, key, value, width: 15, heads: 3, key_mask, causal: key_mask.is_none() }
+    }
+    check("attention_key_mask", &["query", "key", "value", "mask"], &[], |g, x, _| {
+        g.attention(attention(x, Some(&x[3])))
+    });
+    check("attention_causal", &["query", "key", "value"], &[], |g, x, _| {
+        g.attention(attention(x, None))
+    });
+}
+
+#[test]
+fn activations_are_pytorchs() {
+    for (case, activation) in [("gelu", Activation::Gelu), ("mish", Activation::Mish)] {
+        check(case, &["x"], &[], |g, x, _| g.activation(&x[0], activation));
+    }
+}
+
+#[test]
+fn losses_are_pytorchs() {
+    check("cross_entropy", &["x", "label"], &[], |g, x, _| {
+        g.apply(CrossEntropy::default(), &[&x[0], &x[1]])
+    });
+    for (case, cost) in
+        [("smooth_l1", Cost::SmoothL1 { beta: 1.0 }), ("huber", Cost::Huber { delta: 0.5 })]
+    {
+        check(case, &["x", "target"], &[], |g, x, _| g.apply(Loss::new(cost), &[&x[0], &x[1]]));
+    }
+}
+
+#[test]
+fn embedding_is_pytorchs() {
+    check("embedding", &["index"], &[("weight", Role::Table)], |g, x, p| g.embedding(p[0], &x[0]));
+}
+
+#[test]
+fn every_golden_operation_is_checked() {
+    let golden = Golden::open("ops.safetensors");
+    let cases: std::collections::BTreeSet<_> =
+        golden.names().filter_map(|name| name.split('/').next()).collect();
+    assert_eq!(cases.len(), 13, "{cases:?}");
+}
