@@ -2,6 +2,7 @@
 
 mod determinism;
 mod golden;
+mod golden_values;
 mod messages;
 mod networks;
 mod operations;

@@ -26,7 +26,7 @@ pub use adamw::{AdamW, AdamWConfig};
 pub use arena::{Arena, Usage};
 pub use eager::Eager;
 pub use element::Element;
-pub use kernel::{Level, level};
+pub use kernel::{Level, level, peak_gflops};
 pub use operation::{Backward, Interpreter, Operation, Run};
 pub use parameters::{Gradients, Parameters, Plan, WeightShape};
 pub use random::Stream;

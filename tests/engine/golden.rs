@@ -1,11 +1,12 @@
-//! Golden files of `tests/golden/engine`, and the numbers that every language computes alike.
+//! Golden files of `tests/golden/engine`.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use motiongen::autodiff::{Element, Parameters};
-use motiongen::model::ParameterList;
+use motiongen::autodiff::Element;
 use safetensors::SafeTensors;
+
+pub use super::golden_values::{given, parameters, steps, uniform};
 
 /// A golden file.
 pub struct Golden {
@@ -107,47 +108,4 @@ pub fn assert_near<E: Element>(what: &str, got: &[E], wanted: &[f64], tolerance:
     let error = differences.sum::<f64>().sqrt() / norm.max(1e-300);
     assert!(error <= tolerance, "{what}: off by {error:.2e} of its norm {norm:.3e}");
     error
-}
-
-/// The numbers u of a name: see `tests/golden/engine/weights.py`.
-pub fn uniform(name: &str, n: usize) -> Vec<f64> {
-    bits(name, n).map(|z| z as f64 * 2.0_f64.powi(-23) - 1.0).collect()
-}
-
-fn bits(name: &str, n: usize) -> impl Iterator<Item = u64> {
-    let digest = name.bytes().fold(0xCBF2_9CE4_8422_2325_u64, |digest, byte| {
-        (digest ^ u64::from(byte)).wrapping_mul(0x0100_0000_01B3)
-    });
-    (0..n as u64).map(move |i| {
-        let z = i.wrapping_mul(0x9E37_79B9_7F4A_7C15).wrapping_add(digest);
-        let z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        let z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        (z ^ (z >> 31)) >> 40
-    })
-}
-
-/// An input by its name.
-pub fn given<E: Element>(name: &str, n: usize) -> Vec<E> {
-    let scale = if name == "input.x" { 1.5 } else { 1.0 };
-    uniform(name, n).into_iter().map(|u| E::from_f64(f64::from((scale * u) as f32))).collect()
-}
-
-/// A step of the diffusion for each sample.
-pub fn steps<E: Element>(batch: usize) -> Vec<E> {
-    bits("input.t", batch).map(|z| E::from_f64(((z * 1000) >> 24) as f64)).collect()
-}
-
-/// Parameters with the values that the golden files were made with.
-pub fn parameters<E: Element>(list: ParameterList) -> Parameters<E> {
-    Parameters::from_fn(list, |parameter| {
-        let u = uniform(&parameter.name, parameter.len());
-        let value = |u: f64| match parameter.shape.as_slice() {
-            [_, inner @ ..] if !inner.is_empty() => {
-                u / (inner.iter().product::<usize>() as f64).sqrt()
-            }
-            _ if parameter.name.ends_with(".weight") => 1.0 + 0.1 * u,
-            _ => 0.1 * u,
-        };
-        u.into_iter().map(|u| E::from_f64(f64::from(value(u) as f32))).collect()
-    })
 }

@@ -30,4 +30,4 @@ pub use level::{Level, level};
 pub use pack::{PANEL, pack_weight, packed_len, unpack_weight};
 pub use product::{input_gradient, product, weight_gradient};
 pub use small::{Matrix, MatrixMut, matmul};
-pub use tile::{Tile, run_f32, run_portable};
+pub use tile::{Tile, peak_gflops, run_f32, run_portable};

@@ -1,5 +1,6 @@
 //! One tile of a matrix product: up to 8 rows by 3 panels of 16 columns.
 
+use crate::autodiff::arena::Arena;
 use crate::autodiff::element::Element;
 
 use super::level::{Level, level};
@@ -53,6 +54,44 @@ pub unsafe fn run_f32(tile: &Tile<f32>) {
         }
         run_portable(tile);
     }
+}
+
+/// Measures what a thread can do at most: GFLOP/s of a tile whose operands stay in the first cache.
+///
+/// What a product reaches of this, and not of a number on paper, is how well it is written.
+pub fn peak_gflops() -> f64 {
+    const K: usize = 64;
+    const RUNS: usize = 20_000;
+    let a = vec![0.5_f32; MAX_ROWS * K];
+    let b = Arena::<f32>::aligned(MAX_PANELS * K * PANEL);
+    let mut c = Arena::<f32>::aligned(MAX_ROWS * MAX_PANELS * PANEL);
+    let c = c.as_mut_ptr();
+    let tile = Tile {
+        rows: std::array::from_fn(|r| a[r * K..].as_ptr()),
+        n_rows: MAX_ROWS,
+        step: 1,
+        k: K,
+        segments: 1,
+        a_segment: 0,
+        b: b.as_ptr(),
+        b_panel: K * PANEL,
+        b_segment: 0,
+        n_panels: MAX_PANELS,
+        c: std::array::from_fn(|r| c.wrapping_add(r * MAX_PANELS * PANEL)),
+        c_panel: PANEL,
+        n_columns: MAX_PANELS * PANEL,
+        add: false,
+    };
+    let flops = 2.0 * (RUNS * MAX_ROWS * MAX_PANELS * PANEL * K) as f64;
+    let best = (0..5).map(|_| {
+        let started = std::time::Instant::now();
+        for _ in 0..RUNS {
+            // SAFETY: rows, panels and output were made of these sizes just now.
+            unsafe { run_f32(std::hint::black_box(&tile)) };
+        }
+        flops / started.elapsed().as_secs_f64() / 1e9
+    });
+    best.fold(0.0, f64::max)
 }
 
 /// Runs a tile in plain code, which is also what the fast forms are held against.
