@@ -58,6 +58,11 @@ pub trait Element:
         if self < other { self } else { other }
     }
 
+    /// Transposes 16 rows of 16 numbers.
+    fn transpose(source: &[Self; 256], target: &mut [Self; 256]) {
+        super::kernel::transpose_portable(source, target);
+    }
+
     /// Runs one tile of a matrix product; see `Tile`.
     ///
     /// # Safety
@@ -162,6 +167,10 @@ impl Element for f32 {
     fn fused(self, a: Self, b: Self) -> Self {
         // Where the instruction is not part of the target's base, mul_add is a slow call.
         if cfg!(target_arch = "aarch64") { a.mul_add(b, self) } else { a * b + self }
+    }
+
+    fn transpose(source: &[Self; 256], target: &mut [Self; 256]) {
+        super::kernel::transpose_f32(source, target);
     }
 
     #[allow(unsafe_code, reason = "declared here, implemented in the kernel module")]

@@ -6,7 +6,8 @@ use std::path::Path;
 use motiongen::autodiff::Element;
 use safetensors::SafeTensors;
 
-pub use super::golden_values::{given, parameters, steps, uniform};
+use super::golden_values::bits;
+pub use super::golden_values::{given, parameters, uniform};
 
 /// A golden file.
 pub struct Golden {
@@ -108,4 +109,9 @@ pub fn assert_near<E: Element>(what: &str, got: &[E], wanted: &[f64], tolerance:
     let error = differences.sum::<f64>().sqrt() / norm.max(1e-300);
     assert!(error <= tolerance, "{what}: off by {error:.2e} of its norm {norm:.3e}");
     error
+}
+
+/// A step of the diffusion for each sample.
+pub fn steps<E: Element>(batch: usize) -> Vec<E> {
+    bits("input.t", batch).map(|z| E::from_f64(((z * 1000) >> 24) as f64)).collect()
 }

@@ -8,7 +8,7 @@ pub fn uniform(name: &str, n: usize) -> Vec<f64> {
     bits(name, n).map(|z| z as f64 * 2.0_f64.powi(-23) - 1.0).collect()
 }
 
-fn bits(name: &str, n: usize) -> impl Iterator<Item = u64> {
+pub fn bits(name: &str, n: usize) -> impl Iterator<Item = u64> {
     let digest = name.bytes().fold(0xCBF2_9CE4_8422_2325_u64, |digest, byte| {
         (digest ^ u64::from(byte)).wrapping_mul(0x0100_0000_01B3)
     });
@@ -24,11 +24,6 @@ fn bits(name: &str, n: usize) -> impl Iterator<Item = u64> {
 pub fn given<E: Element>(name: &str, n: usize) -> Vec<E> {
     let scale = if name == "input.x" { 1.5 } else { 1.0 };
     uniform(name, n).into_iter().map(|u| E::from_f64(f64::from((scale * u) as f32))).collect()
-}
-
-/// A step of the diffusion for each sample.
-pub fn steps<E: Element>(batch: usize) -> Vec<E> {
-    bits("input.t", batch).map(|z| E::from_f64(((z * 1000) >> 24) as f64)).collect()
 }
 
 /// Parameters with the values that the golden files were made with.

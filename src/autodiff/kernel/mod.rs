@@ -13,6 +13,7 @@
 
 #![allow(unsafe_code, reason = "the one measured kernel module; the invariants are above")]
 
+mod few_rows;
 mod gather;
 mod level;
 mod pack;
@@ -21,13 +22,15 @@ mod small;
 #[cfg(test)]
 mod tests;
 mod tile;
+mod weight_gradient;
 #[cfg(target_arch = "x86_64")]
 mod x86;
 
 pub use gather::Conv;
 pub(super) use level::vectorized;
 pub use level::{Level, level};
-pub use pack::{PANEL, pack_weight, packed_len, unpack_weight};
-pub use product::{input_gradient, product, weight_gradient};
+pub use pack::{PANEL, pack_weight, packed_len, transpose_f32, transpose_portable, unpack_weight};
+pub use product::{input_gradient, product};
 pub use small::{Matrix, MatrixMut, matmul};
 pub use tile::{Tile, peak_gflops, run_f32, run_portable};
+pub use weight_gradient::weight_gradient;

@@ -6,6 +6,9 @@
 
 use crate::autodiff::element::Element;
 
+#[cfg(target_arch = "x86_64")]
+use super::level::{Level, level};
+
 /// Outputs of a panel: one cache line of `f32`.
 pub const PANEL: usize = 16;
 
@@ -56,17 +59,35 @@ fn for_each_element(n: usize, channels: usize, taps: usize, mut f: impl FnMut(us
     }
 }
 
-super::vectorized! {
-    /// Transposes 16 rows of 16 numbers.
-    pub fn transpose_16<E: Element>(source: &[E], target: &mut [E]) {
-        let source: &[E; PANEL * PANEL] = source.try_into().expect("16 × 16 numbers");
-        let target: &mut [E; PANEL * PANEL] = target.try_into().expect("16 × 16 numbers");
-        for (j, row) in target.chunks_exact_mut(PANEL).enumerate() {
-            for (i, x) in row.iter_mut().enumerate() {
-                *x = source[i * PANEL + j];
-            }
+/// Transposes 16 rows of 16 numbers in plain code.
+///
+/// Compiled for the target's base on purpose: with AVX-512 the compiler gathers one number at a time,
+/// half as fast.
+pub fn transpose_portable<E: Element>(
+    source: &[E; PANEL * PANEL],
+    target: &mut [E; PANEL * PANEL],
+) {
+    for (j, row) in target.chunks_exact_mut(PANEL).enumerate() {
+        for (i, x) in row.iter_mut().enumerate() {
+            *x = source[i * PANEL + j];
         }
     }
+}
+
+/// Transposes 16 rows of 16 numbers with the fastest instructions of the machine.
+pub fn transpose_f32(source: &[f32; PANEL * PANEL], target: &mut [f32; PANEL * PANEL]) {
+    #[cfg(target_arch = "x86_64")]
+    if level() == Level::Avx512 {
+        // SAFETY: `level` found the instructions.
+        return unsafe { super::x86::transpose_avx512(source, target) };
+    }
+    transpose_portable(source, target);
+}
+
+/// Transposes 16 rows of 16 numbers.
+pub fn transpose_16<E: Element>(source: &[E], target: &mut [E]) {
+    let source = source.try_into().expect("16 × 16 numbers");
+    E::transpose(source, target.try_into().expect("16 × 16 numbers"));
 }
 
 /// Copies `source`, rows of `channels` numbers, into strips of 16 channels: \[channels / 16\]\[rows\]\[16\].
@@ -119,11 +140,14 @@ mod tests {
     fn transposing_swaps_rows_and_columns() {
         let source: Vec<f32> = (0..256).map(|i| i as f32).collect();
         let mut target = vec![0.0; 256];
+        let mut portable = [0.0; 256];
         transpose_16(&source, &mut target);
+        transpose_portable(source.as_slice().try_into().unwrap(), &mut portable);
         for i in 0..16 {
             for j in 0..16 {
                 assert_eq!(target[j * 16 + i], source[i * 16 + j], "row {i}, column {j}");
             }
         }
+        assert_eq!(target, portable);
     }
 }

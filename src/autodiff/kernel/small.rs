@@ -2,10 +2,10 @@
 
 use crate::autodiff::element::Element;
 
-use super::pack::{PANEL, panels};
+use super::pack::{PANEL, panels, transpose_16};
 use super::tile::{MAX_PANELS, MAX_ROWS, Tile};
 
-/// A matrix in memory: element (i, j) is `data[i rows + j columns]`.
+/// A matrix in memory: element (i, j) is `data[i rows + j columns]`, one of the two being 1.
 #[derive(Clone, Copy)]
 pub struct Matrix<'a, E> {
     pub data: &'a [E],
@@ -72,6 +72,7 @@ pub fn matmul<E: Element>(
                 c_panel: PANEL,
                 n_columns: (n - panel * PANEL).min(MAX_PANELS * PANEL),
                 add,
+                stream: false,
             };
             // SAFETY: strips and columns have k rows each, the result was checked to hold m rows.
             unsafe { E::run_tile(&tile) };
@@ -82,22 +83,30 @@ pub fn matmul<E: Element>(
 /// Copies a matrix of n rows into strips of 16 rows: \[n / 16\]\[k\]\[16\], times α.
 fn pack<E: Element>(n: usize, k: usize, a: Matrix<E>, strips: &mut [E], alpha: E) {
     let [row, column] = a.strides;
+    let mut square = [E::ZERO; PANEL * PANEL];
     for (s, strip) in strips.chunks_exact_mut((k * PANEL).max(1)).enumerate() {
         let first = s * PANEL;
         let n_lanes = (n - first).min(PANEL);
         if row == 1 {
             for (at, lanes) in strip.chunks_exact_mut(PANEL).enumerate() {
                 let source = &a.data[first + at * column..][..n_lanes];
-                for (lane, &x) in lanes.iter_mut().zip(source) {
-                    *lane = alpha * x;
-                }
+                lanes.iter_mut().zip(source).for_each(|(lane, &x)| *lane = alpha * x);
             }
-        } else {
-            for lane in 0..n_lanes {
-                let source = &a.data[(first + lane) * row..];
-                for (at, lanes) in strip.chunks_exact_mut(PANEL).enumerate() {
-                    lanes[lane] = alpha * source[at * column];
-                }
+            continue;
+        }
+        assert_eq!(column, 1, "rows or columns lie side by side");
+        let whole = k / PANEL * PANEL;
+        for at in (0..whole).step_by(PANEL) {
+            for (lane, target) in square.chunks_exact_mut(PANEL).enumerate().take(n_lanes) {
+                let source = &a.data[(first + lane) * row + at..][..PANEL];
+                target.iter_mut().zip(source).for_each(|(x, &y)| *x = alpha * y);
+            }
+            transpose_16(&square, &mut strip[at * PANEL..][..PANEL * PANEL]);
+        }
+        for lane in 0..n_lanes {
+            let source = &a.data[(first + lane) * row..][..k];
+            for at in whole..k {
+                strip[at * PANEL + lane] = alpha * source[at];
             }
         }
     }

@@ -44,6 +44,10 @@ fn products_are_those_of_the_definition() {
         (shape(1, 7, 3, 1, 1, 1), 400, 17),
         (shape(2, 10, 4, 2, 1, 1), 5, 3),
         (Conv::linear(37), 21, 65),
+        // More rows than the turned product takes, and a gradient that is summed in two blocks.
+        (shape(3, 43, 3, 1, 1, 1), 25, 70),
+        (shape(4, 90, 3, 2, 1, 1), 19, 33),
+        (shape(2, 700, 3, 1, 1, 1), 17, 18),
     ] {
         let what = format!("{conv:?}, {channels} to {n}");
         let k = conv.taps * channels;
@@ -86,7 +90,7 @@ fn products_are_those_of_the_definition() {
         assert_near(&got, &y, &format!("output, {what}"));
 
         let mut got = vec![f32::NAN; dx.len()];
-        input_gradient(&dy, n, &conv, &packed, &mut got, channels);
+        input_gradient(&dy, n, &conv, &packed, &mut got, channels, &Arena::default());
         assert_near(&got, &dx, &format!("input's gradient, {what}"));
 
         // Twice, the second time added: the result doubles.
@@ -119,7 +123,7 @@ fn any_number_of_threads_gives_the_same_bits() {
         let mut dw = vec![0.0_f32; weight.len()];
         pool.install(|| {
             product(&x, channels, &conv.forward(), &weight, None, &mut y, n);
-            input_gradient(&y, n, &conv, &weight, &mut dx, channels);
+            input_gradient(&y, n, &conv, &weight, &mut dx, channels, &Arena::default());
             let arena = Arena::default();
             weight_gradient(&x, channels, &y, n, &conv, &mut dw, None, [false; 2], &arena);
         });
@@ -147,4 +151,64 @@ fn small_products_are_those_of_the_definition_with_any_strides() {
     let c = MatrixMut { data: &mut got, row_stride: n };
     matmul([m, k, n], 0.5, a, b, c, false, &mut Vec::new());
     assert_near(&got, &wanted, "α A B");
+}
+
+/// Runs one tile with a form of the kernel, and returns what it wrote.
+#[cfg(target_arch = "x86_64")]
+fn run_form(form: unsafe fn(&Tile<f32>), n_rows: usize, n_panels: usize, add: bool) -> Vec<f32> {
+    let (k, segments, n_columns) = (37, 3, 16 * n_panels - 5);
+    let a = single(&numbers(8 * segments * k, 1));
+    let b = single(&numbers(n_panels * segments * k * PANEL, 2));
+    let mut c = single(&numbers(n_rows * n_columns, 3));
+    let at = c.as_mut_ptr();
+    let row = |r: usize| r.min(n_rows - 1);
+    let tile = Tile {
+        rows: std::array::from_fn(|r| a[row(r) * segments * k..].as_ptr()),
+        n_rows,
+        step: 1,
+        k,
+        segments,
+        a_segment: k,
+        b: b.as_ptr(),
+        b_panel: segments * k * PANEL,
+        b_segment: k * PANEL,
+        n_panels,
+        c: std::array::from_fn(|r| at.wrapping_add(row(r) * n_columns)),
+        c_panel: PANEL,
+        n_columns,
+        add,
+        stream: false,
+    };
+    // SAFETY: rows, panels and output have the sizes that the tile states, and the caller found the
+    // form's instructions.
+    unsafe { form(&tile) };
+    c
+}
+
+#[cfg(target_arch = "x86_64")]
+#[test]
+fn every_form_of_the_tile_gives_what_the_portable_one_gives() {
+    let avx2 = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+    let avx512 = avx2 && is_x86_feature_detected!("avx512f");
+    for n_rows in 1..=8 {
+        for n_panels in 1..=3 {
+            for add in [false, true] {
+                let what = format!("{n_rows} rows, {n_panels} panels, add {add}");
+                let portable = run_form(run_portable, n_rows, n_panels, add);
+                let wanted: Vec<_> = portable.iter().map(|&x| f64::from(x)).collect();
+                if avx2 {
+                    let fused = run_form(x86::run_avx2, n_rows, n_panels, add);
+                    assert_near(&fused, &wanted, &what);
+                    if avx512 {
+                        // Both round once for each product, in the same order.
+                        assert_eq!(
+                            run_form(x86::run_avx512, n_rows, n_panels, add),
+                            fused,
+                            "{what}"
+                        );
+                    }
+                }
+            }
+        }
+    }
 }

@@ -37,6 +37,24 @@ pub struct Tile<E> {
     pub n_columns: usize,
     /// Whether C is added to or overwritten.
     pub add: bool,
+    /// Whether C is large and not read soon, so that it should not pass through the caches; who asks
+    /// for it calls [`fence`] before other threads may read.
+    pub stream: bool,
+}
+
+/// Asks for a cache line that will be read soon; any address will do.
+#[inline(always)]
+pub fn prefetch<E>(address: *const E) {
+    #[cfg(target_arch = "x86_64")]
+    super::x86::prefetch(address.cast());
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = address;
+}
+
+/// Makes what tiles have streamed visible to other threads.
+pub fn fence() {
+    #[cfg(target_arch = "x86_64")]
+    super::x86::fence();
 }
 
 /// Runs a tile with the fastest instructions of the machine.
@@ -81,6 +99,7 @@ pub fn peak_gflops() -> f64 {
         c_panel: PANEL,
         n_columns: MAX_PANELS * PANEL,
         add: false,
+        stream: false,
     };
     let flops = 2.0 * (RUNS * MAX_ROWS * MAX_PANELS * PANEL * K) as f64;
     let best = (0..5).map(|_| {

@@ -7,8 +7,11 @@
 
 use std::arch::asm;
 use std::arch::x86_64::{
-    __m256, __m512, _mm256_add_ps, _mm256_loadu_ps, _mm256_setzero_ps, _mm256_storeu_ps,
-    _mm512_add_ps, _mm512_mask_storeu_ps, _mm512_maskz_loadu_ps, _mm512_setzero_ps,
+    __m256, __m512, __m512d, _MM_HINT_T0, _mm_prefetch, _mm_sfence, _mm256_add_ps, _mm256_loadu_ps,
+    _mm256_setzero_ps, _mm256_storeu_ps, _mm512_add_ps, _mm512_castpd_ps, _mm512_castps_pd,
+    _mm512_loadu_ps, _mm512_mask_storeu_ps, _mm512_maskz_loadu_ps, _mm512_setzero_ps,
+    _mm512_shuffle_f32x4, _mm512_storeu_ps, _mm512_stream_ps, _mm512_unpackhi_pd,
+    _mm512_unpackhi_ps, _mm512_unpacklo_pd, _mm512_unpacklo_ps,
 };
 
 use super::pack::PANEL;
@@ -46,6 +49,64 @@ macro_rules! accumulate {
     }};
 }
 
+/// Transposes 16 rows of 16 numbers: pairs, then pairs of pairs, then quarters of vectors.
+///
+/// # Safety
+/// The machine has AVX-512 F.
+#[target_feature(enable = "avx512f")]
+pub unsafe fn transpose_avx512(source: &[f32; PANEL * PANEL], target: &mut [f32; PANEL * PANEL]) {
+    let rows: [__m512; PANEL] = std::array::from_fn(|i| {
+        // SAFETY: row i lies within the source.
+        unsafe { _mm512_loadu_ps(source.as_ptr().add(i * PANEL)) }
+    });
+    let pairs: [__m512d; PANEL] = std::array::from_fn(|i| {
+        let (a, b) = (rows[i & !1], rows[i | 1]);
+        let half = if i & 1 == 0 { _mm512_unpacklo_ps(a, b) } else { _mm512_unpackhi_ps(a, b) };
+        _mm512_castps_pd(half)
+    });
+    let fours: [__m512; PANEL] = std::array::from_fn(|i| {
+        // Of rows 4 q to 4 q + 3: column 4 l + i % 4 in quarter l.
+        let (a, b) = (pairs[(i & !3) | ((i >> 1) & 1)], pairs[(i & !3) | 2 | ((i >> 1) & 1)]);
+        let half = if i & 1 == 0 { _mm512_unpacklo_pd(a, b) } else { _mm512_unpackhi_pd(a, b) };
+        _mm512_castpd_ps(half)
+    });
+    for column in 0..4 {
+        let [a, b, c, d] = [0, 4, 8, 12].map(|first| fours[first + column]);
+        let (low_even, low_odd) = (quarters::<0x88>(a, b), quarters::<0xdd>(a, b));
+        let (high_even, high_odd) = (quarters::<0x88>(c, d), quarters::<0xdd>(c, d));
+        for (quarter, row) in [
+            (0, quarters::<0x88>(low_even, high_even)),
+            (1, quarters::<0x88>(low_odd, high_odd)),
+            (2, quarters::<0xdd>(low_even, high_even)),
+            (3, quarters::<0xdd>(low_odd, high_odd)),
+        ] {
+            // SAFETY: the row lies within the target.
+            unsafe {
+                _mm512_storeu_ps(target.as_mut_ptr().add((4 * quarter + column) * PANEL), row)
+            };
+        }
+    }
+}
+
+/// Two quarters of a and two of b, by their numbers in `WHICH`.
+#[target_feature(enable = "avx512f")]
+fn quarters<const WHICH: i32>(a: __m512, b: __m512) -> __m512 {
+    _mm512_shuffle_f32x4::<WHICH>(a, b)
+}
+
+/// Makes what was streamed visible to other threads before anything that is written later.
+pub fn fence() {
+    // SAFETY: every x86-64 has this instruction.
+    unsafe { _mm_sfence() }
+}
+
+/// Asks for a cache line.
+#[inline(always)]
+pub fn prefetch(address: *const i8) {
+    // SAFETY: every x86-64 has this instruction, and it does not fault.
+    unsafe { _mm_prefetch(address, _MM_HINT_T0) }
+}
+
 /// Runs a tile with AVX-512.
 ///
 /// # Safety
@@ -68,6 +129,10 @@ pub unsafe fn run_avx512(tile: &Tile<f32>) {
             (false, _) => tile_4_1(tile),
         }
     };
+    if tile.stream && !tile.add && tile.n_columns == tile.n_panels * PANEL {
+        // SAFETY: the caller's promise is passed on.
+        return unsafe { stream(tile, &v) };
+    }
     for p in 0..tile.n_panels {
         let n = tile.n_columns.saturating_sub(p * PANEL).min(PANEL);
         let mask = ((1_u32 << n) - 1) as u16;
@@ -79,6 +144,27 @@ pub unsafe fn run_avx512(tile: &Tile<f32>) {
                     if tile.add { _mm512_maskz_loadu_ps(mask, c) } else { _mm512_setzero_ps() };
                 let sum = if tile.add { _mm512_add_ps(old, v[p]) } else { v[p] };
                 _mm512_mask_storeu_ps(c, mask, sum);
+            }
+        }
+    }
+}
+
+/// Writes full panels past the caches: a line that is not read soon need not be fetched before.
+///
+/// # Safety
+/// As for [`run_avx512`].
+#[target_feature(enable = "avx512f")]
+unsafe fn stream(tile: &Tile<f32>, v: &[[__m512; MAX_PANELS]; MAX_ROWS]) {
+    for p in 0..tile.n_panels {
+        for (r, v) in v.iter().enumerate().take(tile.n_rows) {
+            let c = tile.c[r].wrapping_add(p * tile.c_panel);
+            // SAFETY: an output row has its columns, and no other tile writes them (invariants).
+            unsafe {
+                if c.addr().is_multiple_of(size_of::<__m512>()) {
+                    _mm512_stream_ps(c, v[p]);
+                } else {
+                    _mm512_storeu_ps(c, v[p]);
+                }
             }
         }
     }
@@ -96,7 +182,7 @@ unsafe fn tile_8_3(tile: &Tile<f32>) -> [[__m512; MAX_PANELS]; MAX_ROWS] {
         unsafe {
             accumulate! {
                 tile, s, v,
-                loads ["vmovups zmm24, [{b}]", "vmovups zmm25, [{b} + {panel}]", "vmovups zmm26, [{b} + 2*{panel}]"],
+                loads ["vmovups zmm24, [{b}]", "vmovups zmm25, [{b} + {panel}]", "vmovups zmm26, [{b} + 2*{panel}]", "prefetcht0 [{b} + 2048]", "prefetcht0 [{b} + {panel} + 2048]", "prefetcht0 [{b} + 2*{panel} + 2048]"],
                 broadcast "zmm27", clobbers ["zmm24", "zmm25", "zmm26"],
                 0 a0 ["zmm0" 0 "zmm24", "zmm1" 1 "zmm25", "zmm2" 2 "zmm26"];
                 1 a1 ["zmm3" 0 "zmm24", "zmm4" 1 "zmm25", "zmm5" 2 "zmm26"];
@@ -180,7 +266,7 @@ unsafe fn tile_4_3(tile: &Tile<f32>) -> [[__m512; MAX_PANELS]; MAX_ROWS] {
         unsafe {
             accumulate! {
                 tile, s, v,
-                loads ["vmovups zmm24, [{b}]", "vmovups zmm25, [{b} + {panel}]", "vmovups zmm26, [{b} + 2*{panel}]"],
+                loads ["vmovups zmm24, [{b}]", "vmovups zmm25, [{b} + {panel}]", "vmovups zmm26, [{b} + 2*{panel}]", "prefetcht0 [{b} + 2048]", "prefetcht0 [{b} + {panel} + 2048]", "prefetcht0 [{b} + 2*{panel} + 2048]"],
                 broadcast "zmm27", clobbers ["zmm24", "zmm25", "zmm26"],
                 0 a0 ["zmm0" 0 "zmm24", "zmm1" 1 "zmm25", "zmm2" 2 "zmm26"];
                 1 a1 ["zmm3" 0 "zmm24", "zmm4" 1 "zmm25", "zmm5" 2 "zmm26"];

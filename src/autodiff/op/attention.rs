@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use crate::autodiff::element::Element;
-use crate::autodiff::kernel::{Matrix, MatrixMut, matmul};
+use crate::autodiff::kernel::{Matrix, MatrixMut, matmul, vectorized};
 use crate::autodiff::operation::{Backward, Operation, Run, expect_axes, expect_size};
 use crate::autodiff::tensor::Tensor;
 use crate::model::{GraphError, Result};
@@ -102,23 +102,46 @@ impl<E: Element> Attend<E> {
     }
 }
 
-/// Turns a row of products into weights; keys from `visible` on, or masked, get none.
-fn softmax_row<E: Element>(row: &mut [E], mask: Option<&[E]>, visible: usize) {
-    let counts = |i: usize| i < visible && mask.is_none_or(|mask| mask[i] > E::ZERO);
-    let mut largest: Option<E> = None;
-    for (i, &x) in row.iter().enumerate() {
-        if counts(i) {
-            largest = Some(largest.map_or(x, |l| l.larger(x)));
+vectorized! {
+    /// Turns a row of products into weights; keys that are not kept, 0 rather than 1, get none.
+    fn softmax_row<E: Element>(row: &mut [E], keep: &[E]) {
+        const LANES: usize = 16;
+        let lowest = E::from_f64(f64::NEG_INFINITY);
+        let kept = |x: E, keep: E| if keep > E::ZERO { x } else { lowest };
+        let mut lanes = [lowest; LANES];
+        for (row, keep) in row.chunks(LANES).zip(keep.chunks(LANES)) {
+            for ((lane, &x), &keep) in lanes.iter_mut().zip(row).zip(keep) {
+                *lane = lane.larger(kept(x, keep));
+            }
         }
+        let largest = lanes.into_iter().fold(lowest, E::larger);
+        if largest == lowest {
+            return row.fill(E::ZERO);
+        }
+        let mut lanes = [E::ZERO; LANES];
+        for (row, keep) in row.chunks_mut(LANES).zip(keep.chunks(LANES)) {
+            for ((lane, x), &keep) in lanes.iter_mut().zip(row).zip(keep) {
+                *x = keep * (kept(*x, keep) - largest).exp();
+                *lane += *x;
+            }
+        }
+        let scale = E::ONE / lanes.into_iter().sum::<E>();
+        row.iter_mut().for_each(|x| *x *= scale);
     }
-    let Some(largest) = largest else { return row.fill(E::ZERO) };
-    let mut sum = E::ZERO;
-    for (i, x) in row.iter_mut().enumerate() {
-        *x = if counts(i) { (*x - largest).exp() } else { E::ZERO };
-        sum += *x;
-    }
-    for x in row {
-        *x /= sum;
+
+    /// d = w (d − Σ d w), the gradient of a softmax.
+    fn softmax_slope<E: Element>(d: &mut [E], w: &[E]) {
+        const LANES: usize = 16;
+        let mut lanes = [E::ZERO; LANES];
+        for (d, w) in d.chunks(LANES).zip(w.chunks(LANES)) {
+            for ((lane, &d), &w) in lanes.iter_mut().zip(d).zip(w) {
+                *lane += d * w;
+            }
+        }
+        let mean = lanes.into_iter().sum::<E>();
+        for (d, &w) in d.iter_mut().zip(w) {
+            *d = w * (*d - mean);
+        }
     }
 }
 
@@ -131,6 +154,7 @@ impl<E: Element> Operation<E> for Attend<E> {
         let Head { queries, keys, dim } = self.check(x)?;
         let batch = x[self.query.input].shape()[0];
         let mask = self.masked.then(|| x[x.len() - 1]);
+        let all_kept = vec![E::ONE; keys];
         let scale = E::from_f64(1.0 / (dim as f64).sqrt());
         let [query, key, value] = [self.query, self.key, self.value].map(|p| x[p.input]);
         let mut weights = run.tensor(&[batch, self.heads, queries, keys], |_| {});
@@ -146,9 +170,12 @@ impl<E: Element> Operation<E> for Attend<E> {
             let v = self.head(value, self.value, b, h);
             let into = MatrixMut { data: &mut *w, row_stride: keys };
             matmul([queries, dim, keys], scale, q, k.t(), into, false, scratch);
-            let mask = mask.map(|mask| &mask.data()[b * keys..][..keys]);
+            let keep = mask.map_or(&all_kept[..], |mask| &mask.data()[b * keys..][..keys]);
             for (t, row) in w.chunks_exact_mut(keys).enumerate() {
-                softmax_row(row, mask, if self.causal { t + 1 } else { keys });
+                let (seen, unseen) =
+                    row.split_at_mut(if self.causal { keys.min(t + 1) } else { keys });
+                softmax_row(seen, &keep[..seen.len()]);
+                unseen.fill(E::ZERO);
             }
             let w = Matrix { data: w, strides: [keys, 1] };
             let into = MatrixMut { data: o, row_stride: dim };
@@ -192,10 +219,7 @@ impl<E: Element> Operation<E> for Attend<E> {
             let into = MatrixMut { data: &mut *ds, row_stride: keys };
             matmul([queries, dim, keys], E::ONE, d_o, v.t(), into, false, scratch);
             for (ds, w) in ds.chunks_exact_mut(keys).zip(w.chunks_exact(keys)) {
-                let mean = ds.iter().zip(w).map(|(&d, &w)| d * w).sum::<E>();
-                for (d, &w) in ds.iter_mut().zip(w) {
-                    *d = w * (*d - mean);
-                }
+                softmax_slope(ds, w);
             }
             let ds = Matrix { data: &*ds, strides: [keys, 1] };
             matmul([queries, keys, dim], scale, ds, k, rows(dq), false, scratch);

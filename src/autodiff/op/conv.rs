@@ -119,7 +119,9 @@ impl<E: Element> Operation<E> for Product<E> {
         }
         let weight = at.parameters.get(self.weight);
         at.only(|| {
-            at.tensor(x.shape(), |dx| input_gradient(dy.data(), n, &conv, weight, dx, channels))
+            at.tensor(x.shape(), |dx| {
+                input_gradient(dy.data(), n, &conv, weight, dx, channels, at.arena);
+            })
         })
     }
 }
