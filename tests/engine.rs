@@ -7,4 +7,5 @@ mod messages;
 mod networks;
 mod operations;
 mod optimizer;
+mod outline;
 mod overfit;

@@ -12,7 +12,7 @@ const MAY_USE: [(&str, &[&str]); 9] = [
     ("motion", &["units"]),
     ("plot", &["units"]),
     ("store", &["audio", "motion", "units"]),
-    ("stages", &["audio", "motion", "plot", "store", "units"]),
+    ("stages", &["audio", "model", "motion", "plot", "store", "units"]),
     ("cli", &["stages"]),
 ];
 

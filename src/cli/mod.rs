@@ -16,6 +16,7 @@ use clap::{Arg, ArgAction, ArgMatches, Command, FromArgMatches as _};
 
 use crate::stages::extract::Extract;
 use crate::stages::ingest::Ingest;
+use crate::stages::model::Model;
 use crate::stages::plot::Plot;
 #[cfg(feature = "query")]
 use crate::stages::query::Query;
@@ -41,6 +42,7 @@ fn entries() -> Vec<Entry> {
     vec![
         Entry::of::<Ingest>(),
         Entry::of::<Extract>(),
+        Entry::of::<Model>(),
         Entry::of::<Plot>(),
         #[cfg(feature = "query")]
         Entry::of::<Query>(),

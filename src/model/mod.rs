@@ -7,6 +7,7 @@
 mod decoder;
 mod graph;
 mod layers;
+mod outline;
 mod parameter;
 mod unet;
 
@@ -15,5 +16,6 @@ pub use graph::{
     Activation, Attention, Channels, Convolution, Graph, GraphError, GroupNormalization, Result,
 };
 pub use layers::{AttentionBlock, Conv1d, GroupNorm, LayerNorm, Linear, ResBlock};
+pub use outline::{Kept, Layer, Outline};
 pub use parameter::{Init, Parameter, ParameterId, ParameterList, Role, Scope};
 pub use unet::{Preset, UNet1D, UNetConfig, UNetInputs};

@@ -4,6 +4,7 @@ pub mod extract;
 pub mod failure;
 pub mod feature_file;
 pub mod ingest;
+pub mod model;
 pub mod plot;
 #[cfg(feature = "query")]
 pub mod query;

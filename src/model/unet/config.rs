@@ -35,7 +35,7 @@ pub struct UNetConfig {
 }
 
 /// A size with a name.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Preset {
     /// For tests.
     Tiny,

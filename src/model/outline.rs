@@ -1,0 +1,372 @@
+//! What a network costs: an interpreter that follows shapes and counts, and computes nothing.
+
+use std::ops::Range;
+use std::sync::Arc;
+
+use ndarray::Array2;
+
+use super::graph::{
+    Activation, Attention, Convolution, Graph, GraphError, GroupNormalization, Result,
+};
+use super::parameter::{ParameterId, ParameterList};
+
+/// A layer with parameters, or an attention, as it was met.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Layer {
+    /// The name of its parameters without the last part; of an attention, the operation's.
+    pub name: String,
+    pub operation: &'static str,
+    /// Shape of its result.
+    pub shape: Vec<usize>,
+    pub n_parameters: usize,
+    /// Multiplications and additions of its products; those of single numbers are not counted.
+    pub flops: u64,
+}
+
+/// Follows shapes through a network.
+#[derive(Debug)]
+pub struct Outline<'p> {
+    list: &'p ParameterList,
+    layers: Vec<Layer>,
+    /// Numbers that a tape would keep for the backward.
+    kept: usize,
+    /// The most numbers within one part that is run again for its gradient.
+    within_part: usize,
+    /// How many parts are open.
+    depth: usize,
+}
+
+/// Numbers of the activations that training keeps.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Kept {
+    /// Over the whole network.
+    pub numbers: usize,
+    /// At most within a part that is run again, on top of the others; 0 without checkpoints.
+    pub within_part: usize,
+}
+
+impl<'p> Outline<'p> {
+    /// Begins with a network's parameters.
+    pub fn new(list: &'p ParameterList) -> Self {
+        Self { list, layers: Vec::new(), kept: 0, within_part: 0, depth: 0 }
+    }
+
+    /// Returns the layers in the order in which they run.
+    pub fn layers(&self) -> &[Layer] {
+        &self.layers
+    }
+
+    /// Returns the multiplications and additions of all products.
+    pub fn flops(&self) -> u64 {
+        self.layers.iter().map(|layer| layer.flops).sum()
+    }
+
+    /// Returns what training keeps of activations.
+    pub fn kept(&self) -> Kept {
+        Kept { numbers: self.kept, within_part: self.within_part }
+    }
+
+    /// An input of a shape.
+    pub fn input(&self, shape: &[usize]) -> Vec<usize> {
+        shape.to_vec()
+    }
+
+    /// Notes the result of an operation.
+    fn result(&mut self, shape: Vec<usize>) -> Vec<usize> {
+        self.kept += shape.iter().product::<usize>();
+        shape
+    }
+
+    fn layer(
+        &mut self,
+        operation: &'static str,
+        parameters: &[ParameterId],
+        shape: &[usize],
+        flops: u64,
+    ) {
+        let name = parameters.first().map_or(operation.to_owned(), |&id| {
+            let name = &self.list.get(id).name;
+            name.rsplit_once('.').map_or(name.as_str(), |(layer, _)| layer).to_owned()
+        });
+        let n_parameters = parameters.iter().map(|&id| self.list.get(id).len()).sum();
+        self.layers.push(Layer { name, operation, shape: shape.to_vec(), n_parameters, flops });
+    }
+
+    /// A product with a weight, whose result has `rows` rows.
+    fn product(
+        &mut self,
+        operation: &'static str,
+        weight: ParameterId,
+        bias: Option<ParameterId>,
+        shape: Vec<usize>,
+    ) -> Result<Vec<usize>> {
+        let size = self.list.get(weight).len() as u64;
+        let rows: usize = shape[..shape.len() - 1].iter().product();
+        let parameters: Vec<_> = [weight].into_iter().chain(bias).collect();
+        self.layer(operation, &parameters, &shape, 2 * rows as u64 * size);
+        Ok(self.result(shape))
+    }
+
+    /// Returns the outputs of a weight, and checks its inputs.
+    fn outputs(&self, operation: &'static str, x: &[usize], weight: ParameterId) -> Result<usize> {
+        let parameter = self.list.get(weight);
+        match (parameter.shape.as_slice(), x.last()) {
+            (&[outputs, inputs, ..], Some(&channels)) if inputs == channels => Ok(outputs),
+            (shape, _) => Err(GraphError::shape(
+                operation,
+                format!("input has shape {x:?}, {} has {shape:?}", parameter.name),
+            )),
+        }
+    }
+}
+
+/// Returns the axes of [batch, frames, channels].
+fn three(operation: &'static str, x: &[usize]) -> Result<[usize; 3]> {
+    let problem = || format!("input has shape {x:?}, expected [batch, frames, channels]");
+    x.try_into().map_err(|_| GraphError::shape(operation, problem()))
+}
+
+impl Graph for Outline<'_> {
+    type Tensor = Vec<usize>;
+
+    fn parameter(&mut self, id: ParameterId) -> Result<Vec<usize>> {
+        let shape = self.list.get(id).shape.clone();
+        self.layer("parameter", &[id], &shape, 0);
+        Ok(self.result(shape))
+    }
+
+    fn linear(
+        &mut self,
+        x: &Vec<usize>,
+        weight: ParameterId,
+        bias: Option<ParameterId>,
+    ) -> Result<Vec<usize>> {
+        let outputs = self.outputs("linear", x, weight)?;
+        let mut shape = x.clone();
+        shape.pop();
+        shape.push(outputs);
+        self.product("linear", weight, bias, shape)
+    }
+
+    fn conv1d(
+        &mut self,
+        x: &Vec<usize>,
+        weight: ParameterId,
+        bias: Option<ParameterId>,
+        convolution: Convolution,
+    ) -> Result<Vec<usize>> {
+        let [batch, frames, _] = three("conv1d", x)?;
+        let outputs = self.outputs("conv1d", x, weight)?;
+        let Convolution { taps, stride, padding, dilation } = convolution;
+        let span = dilation * (taps - 1) + 1;
+        let room = (frames + 2 * padding).checked_sub(span).ok_or_else(|| {
+            GraphError::shape("conv1d", format!("input has {frames} frames, weight spans {span}"))
+        })?;
+        self.product("conv1d", weight, bias, vec![batch, room / stride + 1, outputs])
+    }
+
+    fn group_norm(
+        &mut self,
+        x: &Vec<usize>,
+        norm: GroupNormalization,
+        _film: Option<&Vec<usize>>,
+        _activation: Activation,
+    ) -> Result<Vec<usize>> {
+        self.layer("group_norm", &[norm.weight, norm.bias], x, 0);
+        Ok(self.result(x.clone()))
+    }
+
+    fn layer_norm(
+        &mut self,
+        x: &Vec<usize>,
+        affine: Option<[ParameterId; 2]>,
+        _epsilon: f64,
+    ) -> Result<Vec<usize>> {
+        if let Some(affine) = affine {
+            self.layer("layer_norm", &affine, x, 0);
+        }
+        Ok(self.result(x.clone()))
+    }
+
+    fn activation(&mut self, x: &Vec<usize>, _activation: Activation) -> Result<Vec<usize>> {
+        Ok(self.result(x.clone()))
+    }
+
+    fn attention(&mut self, attention: Attention<Vec<usize>>) -> Result<Vec<usize>> {
+        let [batch, queries, _] = three("attention", attention.query.tensor)?;
+        let [_, keys, _] = three("attention", attention.key.tensor)?;
+        let shape = vec![batch, queries, attention.width];
+        // Q Kᵀ and its softmax times V.
+        let flops = 4 * (batch * queries * keys * attention.width) as u64;
+        self.layer("attention", &[], &shape, flops);
+        self.kept += batch * attention.heads * queries * keys;
+        Ok(self.result(shape))
+    }
+
+    fn add(&mut self, a: &Vec<usize>, b: &Vec<usize>) -> Result<Vec<usize>> {
+        Ok(self.result(if a.len() >= b.len() { a } else { b }.clone()))
+    }
+
+    fn mul(&mut self, a: &Vec<usize>, b: &Vec<usize>) -> Result<Vec<usize>> {
+        self.add(a, b)
+    }
+
+    fn add_to_frames(&mut self, x: &Vec<usize>, _v: &Vec<usize>) -> Result<Vec<usize>> {
+        Ok(self.result(x.clone()))
+    }
+
+    fn scale(&mut self, x: &Vec<usize>, _factor: f64) -> Result<Vec<usize>> {
+        Ok(self.result(x.clone()))
+    }
+
+    fn concat(&mut self, parts: &[&Vec<usize>]) -> Result<Vec<usize>> {
+        let mut shape = parts.first().map(|x| x.to_vec()).unwrap_or_default();
+        if let Some(last) = shape.last_mut() {
+            *last = parts.iter().filter_map(|x| x.last()).sum();
+        }
+        Ok(self.result(shape))
+    }
+
+    fn channels(&mut self, x: &Vec<usize>, range: Range<usize>) -> Result<Vec<usize>> {
+        let mut shape = x.clone();
+        shape.pop();
+        shape.push(range.len());
+        Ok(self.result(shape))
+    }
+
+    fn upsample(&mut self, x: &Vec<usize>, factor: usize) -> Result<Vec<usize>> {
+        let [batch, frames, channels] = three("upsample", x)?;
+        Ok(self.result(vec![batch, factor * frames, channels]))
+    }
+
+    fn gather(&mut self, table: &Arc<Array2<f64>>, index: &Vec<usize>) -> Result<Vec<usize>> {
+        let mut shape = index.clone();
+        shape.push(table.ncols());
+        Ok(self.result(shape))
+    }
+
+    fn embedding(&mut self, table: ParameterId, index: &Vec<usize>) -> Result<Vec<usize>> {
+        let mut shape = index.clone();
+        shape.extend(self.list.get(table).shape.last());
+        self.layer("embedding", &[table], &shape, 0);
+        Ok(self.result(shape))
+    }
+
+    fn dropout(&mut self, x: &Vec<usize>, probability: f64) -> Result<Vec<usize>> {
+        Ok(if probability > 0.0 { self.result(x.clone()) } else { x.clone() })
+    }
+
+    fn select(
+        &mut self,
+        _choice: &Vec<usize>,
+        _other: &Vec<usize>,
+        x: &Vec<usize>,
+    ) -> Result<Vec<usize>> {
+        Ok(self.result(x.clone()))
+    }
+
+    fn normalize(&mut self, x: &Vec<usize>, _epsilon: f64) -> Result<Vec<usize>> {
+        Ok(self.result(x.clone()))
+    }
+
+    fn rotary(&mut self, x: &Vec<usize>, _heads: usize) -> Result<Vec<usize>> {
+        Ok(self.result(x.clone()))
+    }
+
+    fn hold_frames(&mut self, x: &Vec<usize>, multiple: usize) -> Result<Vec<usize>> {
+        let [batch, frames, channels] = three("hold_frames", x)?;
+        Ok(vec![batch, frames.next_multiple_of(multiple), channels])
+    }
+
+    fn crop_frames(&mut self, x: &Vec<usize>, like: &Vec<usize>) -> Result<Vec<usize>> {
+        let [batch, _, channels] = three("crop_frames", x)?;
+        let [_, frames, _] = three("crop_frames", like)?;
+        Ok(vec![batch, frames, channels])
+    }
+
+    fn frame_mask(
+        &mut self,
+        x: &Vec<usize>,
+        _mask: Option<&Vec<usize>>,
+        multiple: usize,
+    ) -> Result<Vec<usize>> {
+        let [batch, frames, _] = three("frame_mask", x)?;
+        Ok(vec![batch, frames.next_multiple_of(multiple)])
+    }
+
+    fn stride_mask(&mut self, mask: &Vec<usize>, stride: usize) -> Result<Vec<usize>> {
+        Ok(mask
+            .iter()
+            .enumerate()
+            .map(|(i, n)| if i == 1 { n.div_ceil(stride) } else { *n })
+            .collect())
+    }
+
+    fn checkpoint<F>(&mut self, inputs: &[&Vec<usize>], part: F) -> Result<Vec<usize>>
+    where
+        F: Fn(&mut Self, &[Vec<usize>]) -> Result<Vec<usize>> + Send + 'static,
+    {
+        let inputs: Vec<_> = inputs.iter().map(|&x| x.clone()).collect();
+        let before = self.kept;
+        self.depth += 1;
+        let y = part(self, &inputs)?;
+        self.depth -= 1;
+        if self.depth == 0 {
+            self.within_part = self.within_part.max(self.kept - before);
+            self.kept = before;
+            return Ok(self.result(y));
+        }
+        Ok(y)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::{DecoderConfig, MotionDecoder, Preset, UNet1D, UNetInputs};
+
+    #[test]
+    fn base_costs_what_was_counted_by_hand() {
+        let (unet, list) = UNet1D::new(&Preset::Base.config());
+        let mut outline = Outline::new(&list);
+        let [x, t, audio] =
+            [&[1, 120, 25][..], &[1], &[1, 120, 163]].map(|shape| outline.input(shape));
+        let (drop_audio, mask, style) = (None, None, None);
+        let inputs = UNetInputs { x: &x, t: &t, audio: &audio, drop_audio, mask, style };
+        let y = unet.forward(&mut outline, inputs).unwrap();
+        assert_eq!(y, [1, 120, 25]);
+        // 5.84 GFLOP, the specification's figure.
+        assert!((5.8e9..5.9e9).contains(&(outline.flops() as f64)), "{}", outline.flops());
+        let conv = outline.layers().iter().find(|l| l.name == "encoder.1.res.0.conv1").unwrap();
+        assert_eq!(conv.shape, [1, 60, 512]);
+        assert_eq!(conv.n_parameters, 512 * 256 * 3 + 512);
+        assert_eq!(conv.flops, 2 * 60 * 512 * 256 * 3);
+        // Everything but the null context, which only dropped music uses.
+        let met: usize = outline.layers().iter().map(|layer| layer.n_parameters).sum();
+        assert_eq!(met, list.n_elements() - 256);
+    }
+
+    #[test]
+    fn the_decoder_is_followed_too() {
+        let (decoder, list) = MotionDecoder::new(&DecoderConfig::default());
+        let mut outline = Outline::new(&list);
+        let x = outline.input(&[2, 7, 25]);
+        assert_eq!(decoder.forward(&mut outline, &x).unwrap(), [2, 7, 25]);
+        let met: usize = outline.layers().iter().map(|layer| layer.n_parameters).sum();
+        assert_eq!(met, list.n_elements());
+    }
+
+    #[test]
+    fn a_wrong_number_of_features_is_refused() {
+        let (unet, list) = UNet1D::new(&Preset::Tiny.config());
+        let mut outline = Outline::new(&list);
+        let [x, t, audio] = [&[1, 8, 25][..], &[1], &[1, 8, 162]].map(|shape| outline.input(shape));
+        let (drop_audio, mask, style) = (None, None, None);
+        let inputs = UNetInputs { x: &x, t: &t, audio: &audio, drop_audio, mask, style };
+        let error = unet.forward(&mut outline, inputs).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "linear: input has shape [1, 8, 162], audio_proj.weight has [32, 163]"
+        );
+    }
+}
