@@ -76,6 +76,17 @@ bench-parity: build/bench-venv/ready ## compare the audio features with those of
 	$(CARGO) build --locked --profile $(BENCH_PROFILE) --bin motiongen
 	build/bench-venv/bin/python benches/parity.py --bin $(BENCH_BIN) $(BENCH_ARGS)
 
+# The engine is measured as it is shipped; without `query` a release build takes minutes, not an hour.
+.PHONY: bench-engine
+bench-engine: build/engine-venv/ready ## measure the engine beside PyTorch and onnxruntime [BENCH_ARGS=--parity]
+	$(CARGO) build --locked --release --no-default-features --example engine-bench
+	build/engine-venv/bin/python benches/engine.py --profile release \
+	  --bin $(TARGET)/release/examples/engine-bench $(BENCH_ARGS)
+
+.PHONY: bench-room
+bench-room: ## build the room autodiff alone, from nothing
+	$(PYTHON) benches/room.py
+
 FUZZ_SECONDS ?= 60
 .PHONY: fuzz
 fuzz: ## fuzz the readers of untrusted files, each for a minute [FUZZ_SECONDS=600]
@@ -94,7 +105,8 @@ clean-demo: ## remove what the demo made
 # Python environments; made once, and again when their requirements change.
 build/venv/ready: tests/requirements.txt
 build/bench-venv/ready: benches/requirements.txt
-build/venv/ready build/bench-venv/ready:
+build/engine-venv/ready: benches/requirements-engine.txt
+build/venv/ready build/bench-venv/ready build/engine-venv/ready:
 	rm -rf $(@D)
 	$(PYTHON) -m venv $(@D)
 	$(@D)/bin/pip install --quiet --disable-pip-version-check --requirement $<

@@ -11,12 +11,12 @@ use std::time::Instant;
 use anyhow::{Context as _, bail};
 use motiongen::autodiff::op::loss::{Cost, Loss};
 use motiongen::autodiff::{
-    AdamW, AdamWConfig, Arena, Eager, Gradients, Interpreter as _, Parameters, Precision, Stream,
-    Tape, Tensor, save,
+    AdamW, AdamWConfig, Arena, Eager, Gradients, Interpreter as _, Parameters, Stream, Tape, Tensor,
 };
 use motiongen::model::{
     Graph as _, Init, ParameterList, Preset, Role, Scope, UNet1D, UNetConfig, UNetInputs,
 };
+use motiongen::weights::{Precision, save};
 use serde_json::{Value, json};
 
 #[path = "../tests/engine/golden_values.rs"]

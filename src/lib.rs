@@ -11,3 +11,4 @@ pub mod plot;
 pub mod stages;
 pub mod store;
 pub mod units;
+pub mod weights;

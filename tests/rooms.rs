@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Which rooms a room may use.
-const MAY_USE: [(&str, &[&str]); 9] = [
+const MAY_USE: [(&str, &[&str]); 10] = [
     ("units", &[]),
     ("audio", &["units"]),
     ("autodiff", &["model"]),
@@ -12,12 +12,13 @@ const MAY_USE: [(&str, &[&str]); 9] = [
     ("motion", &["units"]),
     ("plot", &["units"]),
     ("store", &["audio", "motion", "units"]),
+    ("weights", &["autodiff", "model"]),
     ("stages", &["audio", "model", "motion", "plot", "store", "units"]),
     ("cli", &["stages"]),
 ];
 
 /// Crates that only one place may name: crate, where.
-const KEPT_TO: [(&str, &str); 9] = [
+const KEPT_TO: [(&str, &str); 11] = [
     ("polars", "store/query.rs"),
     ("object_store", "store/"),
     ("parquet", "store/"),
@@ -27,6 +28,8 @@ const KEPT_TO: [(&str, &str); 9] = [
     ("tiny_skia", "plot/"),
     ("ab_glyph", "plot/"),
     ("indicatif", "cli/"),
+    ("rayon", "autodiff/"),
+    ("safetensors", "weights.rs"),
 ];
 
 fn sources() -> BTreeMap<PathBuf, String> {

@@ -20,7 +20,6 @@ mod parameters;
 mod random;
 mod tape;
 mod tensor;
-mod weights_file;
 
 pub use adamw::{AdamW, AdamWConfig};
 pub use arena::{Arena, Usage};
@@ -32,4 +31,3 @@ pub use parameters::{Gradients, Parameters, Plan, WeightShape};
 pub use random::Stream;
 pub use tape::{InputGradients, Tape};
 pub use tensor::Tensor;
-pub use weights_file::{Precision, WeightsError, load, save};

@@ -10,10 +10,8 @@ use half::{bf16, f16};
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, SafeTensorError, TensorView, View};
 
+use crate::autodiff::{Element, Parameters, Plan};
 use crate::model::{ParameterId, ParameterList};
-
-use super::element::Element;
-use super::parameters::{Parameters, Plan};
 
 /// Why weights could not be read.
 #[derive(Debug, thiserror::Error)]
