@@ -11,7 +11,8 @@ use std::time::Instant;
 use anyhow::{Context as _, bail};
 use motiongen::autodiff::op::loss::{Cost, Loss};
 use motiongen::autodiff::{
-    AdamW, AdamWConfig, Arena, Eager, Gradients, Interpreter as _, Parameters, Stream, Tape, Tensor,
+    AdamW, AdamWConfig, Arena, Eager, Gradients, Interpreter as _, Parameters, Stream, Tape,
+    Tensor, keep_awake,
 };
 use motiongen::model::{
     Graph as _, Init, ParameterList, Preset, Role, Scope, UNet1D, UNetConfig, UNetInputs,
@@ -123,7 +124,7 @@ impl Network {
     fn forward(&self) -> anyhow::Result<Value> {
         let mut eager = Eager::new(&self.parameters, &self.arena);
         let inputs = Inputs::new(self, 0, |shape, values| eager.input(shape, values));
-        self.pool.install(|| self.unet.forward(&mut eager, inputs.of()))?;
+        self.pool.install(|| keep_awake(|| self.unet.forward(&mut eager, inputs.of())))?;
         Ok(json!({}))
     }
 
@@ -144,13 +145,15 @@ impl Network {
             let mut tape = Tape::new(&self.parameters, &self.arena, Some(self.n_steps));
             let inputs = Inputs::new(self, self.n_steps, |s, values| tape.constant(s, values));
             let loss = self.pool.install(|| {
-                let y = self.unet.forward(&mut tape, inputs.of())?;
-                tape.apply(Loss::new(Cost::Squared), &[&y, &inputs.noise])
+                keep_awake(|| {
+                    let y = self.unet.forward(&mut tape, inputs.of())?;
+                    tape.apply(Loss::new(Cost::Squared), &[&y, &inputs.noise])
+                })
             })?;
             total += loss.scalar();
             times[0] += started.elapsed().as_secs_f64();
             let started = Instant::now();
-            self.pool.install(|| tape.backward(loss, &mut gradients))?;
+            self.pool.install(|| keep_awake(|| tape.backward(loss, &mut gradients)))?;
             times[1] += started.elapsed().as_secs_f64();
         }
         let started = Instant::now();

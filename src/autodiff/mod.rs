@@ -20,6 +20,7 @@ mod parameters;
 mod random;
 mod tape;
 mod tensor;
+mod threads;
 
 pub use adamw::{AdamW, AdamWConfig};
 pub use arena::{Arena, Usage};
@@ -31,3 +32,4 @@ pub use parameters::{Gradients, Parameters, Plan, WeightShape};
 pub use random::Stream;
 pub use tape::{InputGradients, Tape};
 pub use tensor::Tensor;
+pub use threads::keep_awake;

@@ -1,0 +1,97 @@
+//! Threads that stay awake between operations.
+
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
+
+/// How long to wait for the other threads to take part; those that are busy elsewhere are left alone.
+const PATIENCE: Duration = Duration::from_micros(200);
+
+/// Runs work whose parallel parts follow each other within microseconds.
+///
+/// Between two operations of a network a thread of the pool finds nothing to do and goes to sleep; to
+/// wake it takes longer than many an operation, on a virtual machine up to 50 µs. Here the other threads
+/// of the pool look for work until all of it is done. The result is the same with or without.
+///
+/// Call it inside the pool (`pool.install(|| keep_awake(|| …))`), around a forward or a whole step.
+pub fn keep_awake<R: Send>(work: impl FnOnce() -> R + Send) -> R {
+    let others = rayon::current_num_threads().saturating_sub(1);
+    if others == 0 || rayon::current_thread_index().is_none() {
+        return work();
+    }
+    let (open, done, n_started) =
+        (AtomicBool::new(true), AtomicBool::new(false), AtomicUsize::new(0));
+    rayon::scope(|scope| {
+        for _ in 0..others {
+            scope.spawn(|_| {
+                // Counted first: whoever closes afterwards has seen this thread, which is not its own.
+                n_started.fetch_add(1, Ordering::SeqCst);
+                if !open.load(Ordering::SeqCst) {
+                    return;
+                }
+                while !done.load(Ordering::Acquire) {
+                    if rayon::yield_now() == Some(rayon::Yield::Idle) {
+                        std::hint::spin_loop();
+                    }
+                }
+            });
+        }
+        // This thread takes up no task before the others have, or it would wait for itself.
+        let started = Instant::now();
+        while n_started.load(Ordering::SeqCst) < others && started.elapsed() < PATIENCE {
+            std::hint::spin_loop();
+        }
+        open.store(false, Ordering::SeqCst);
+        // Also when the work panics.
+        let _finish = Finish(&done);
+        work()
+    })
+}
+
+/// Says that the work is done when it is dropped.
+struct Finish<'a>(&'a AtomicBool);
+
+impl Drop for Finish<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Release);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rayon::prelude::*;
+
+    use super::*;
+
+    fn pool(threads: usize) -> rayon::ThreadPool {
+        rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads")
+    }
+
+    #[test]
+    fn work_gives_its_result_with_any_number_of_threads() {
+        for threads in [1, 2, 5] {
+            let sum = pool(threads).install(|| {
+                keep_awake(|| {
+                    (0..100).map(|_| (0..64_u64).into_par_iter().sum::<u64>()).sum::<u64>()
+                })
+            });
+            assert_eq!(sum, 100 * 2016, "{threads} threads");
+        }
+        assert_eq!(keep_awake(|| 7), 7, "outside of any pool");
+    }
+
+    #[test]
+    fn two_at_once_in_one_pool_do_not_wait_for_each_other() {
+        let work =
+            |i: u64| keep_awake(move || (0..1000_u64).into_par_iter().map(|x| x + i).sum::<u64>());
+        let sums = pool(2).install(|| rayon::join(|| work(1), || work(2)));
+        assert_eq!(sums, (500_500, 501_500));
+    }
+
+    #[test]
+    fn a_panic_in_the_work_ends_the_waiting() {
+        let result = std::panic::catch_unwind(|| {
+            pool(2).install(|| keep_awake(|| panic!("as intended")));
+        });
+        assert!(result.is_err());
+    }
+}
