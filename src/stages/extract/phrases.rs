@@ -198,7 +198,9 @@ fn work_off(
 
 /// The files of the tasks, read in the tasks' order.
 struct Inputs {
-    sources: HashMap<String, Result<(Source, InOrder), String>>,
+    /// `None` for a source that cannot be opened.
+    sources: HashMap<String, Option<(Source, InOrder)>>,
+    options: ClientOptions,
 }
 
 struct Input {
@@ -215,13 +217,19 @@ impl Inputs {
             files.entry(&task.row.source).or_default().push(task);
         }
         let open = |url: &str, tasks: Vec<&Task>| {
-            let source = Source::open(url, options, None).map_err(|e| e.to_string())?;
+            let source = Source::open(url, options, None).ok()?;
             let wanted = tasks.iter().filter_map(|task| Self::file(&source, task)).collect();
             let reader = source.read_in_order(wanted);
-            Ok((source, reader))
+            Some((source, reader))
         };
         let sources = files.into_iter().map(|(url, tasks)| (url.to_owned(), open(url, tasks)));
-        Self { sources: sources.collect() }
+        Self { sources: sources.collect(), options: options.clone() }
+    }
+
+    /// Returns why a task has no input.
+    fn error(&self, task: &Task) -> StoreError {
+        let source = Source::open(&task.row.source, &self.options, None);
+        source.err().unwrap_or_else(|| StoreError::NotFound { place: task.url.clone(), hint: "" })
     }
 
     fn file(source: &Source, task: &Task) -> Option<SourceFile> {
@@ -229,24 +237,23 @@ impl Inputs {
     }
 
     fn next(&mut self, task: &Task) -> Input {
-        let missing = |hint| StoreError::NotFound { place: task.url.clone(), hint };
         let unknown = SourceFile {
             path: task.url.clone(),
             size_bytes: task.size_bytes,
             fingerprint: String::new(),
         };
         let found = match self.sources.get_mut(&task.row.source) {
-            Some(Ok((source, reader))) => {
+            Some(Some((source, reader))) => {
                 Self::file(source, task).and_then(|file| Some((file, reader.next()?)))
             }
-            Some(Err(_)) | None => None,
+            Some(None) | None => None,
         };
         match found {
             Some((file, (content, permit))) => {
                 let permit = permit.map(|permit| Box::new(permit) as Box<dyn Send>);
                 Input { file, content, _permit: permit }
             }
-            None => Input { file: unknown, content: Err(missing("")), _permit: None },
+            None => Input { file: unknown, content: Err(self.error(task)), _permit: None },
         }
     }
 }
