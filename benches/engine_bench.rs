@@ -2,6 +2,8 @@
 //!
 //!     engine-bench serve               one request per line on standard input, one answer per line
 //!     engine-bench gemm --threads 2    GFLOP/s of products of the network's shapes, and of FMA alone
+//!     engine-bench elementwise         time of functions of one number, one thread; with
+//!                                      MOTIONGEN_SIMD=avx2 or portable, whether vectors gain
 
 #![allow(clippy::print_stdout, reason = "answers go to standard output")]
 
@@ -15,7 +17,8 @@ use motiongen::autodiff::{
     Tensor, keep_awake,
 };
 use motiongen::model::{
-    Graph as _, Init, ParameterList, Preset, Role, Scope, UNet1D, UNetConfig, UNetInputs,
+    Activation, Graph as _, GroupNormalization, Init, ParameterList, Preset, Role, Scope, UNet1D,
+    UNetConfig, UNetInputs,
 };
 use motiongen::weights::{Precision, save};
 use serde_json::{Value, json};
@@ -28,7 +31,8 @@ fn main() -> anyhow::Result<()> {
     match arguments.iter().map(String::as_str).collect::<Vec<_>>().as_slice() {
         ["serve"] => serve(),
         ["gemm", "--threads", threads] => gemm(threads.parse()?),
-        _ => bail!("usage: engine-bench serve | gemm --threads N"),
+        ["elementwise"] => elementwise(),
+        _ => bail!("usage: engine-bench serve | gemm --threads N | elementwise"),
     }
 }
 
@@ -264,6 +268,39 @@ fn gemm(threads: usize) -> anyhow::Result<()> {
     let peak: f64 = pool.broadcast(|_| motiongen::autodiff::peak_gflops()).into_iter().sum();
     println!("{}", json!({ "peak_fma_gflops": peak }));
     Ok(())
+}
+
+/// Times functions of one number over as many as a cache holds.
+fn elementwise() -> anyhow::Result<()> {
+    let (frames, channels) = (120, 256);
+    let mut list = ParameterList::default();
+    let mut scope = Scope::root(&mut list);
+    let [weight, bias] =
+        ["weight", "bias"].map(|name| scope.parameter(name, &[channels], Init::Ones, Role::Vector));
+    let parameters = Parameters::<f32>::new(list, 1);
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build()?;
+    let mut eager = Eager::new(&parameters, &Arena::default());
+    let mut values = vec![0.0; frames * channels];
+    Stream::new(1, 1).normal(0, &mut values);
+    let x = eager.input(&[1, frames, channels], &values);
+    let norm = GroupNormalization { groups: 32, epsilon: 1e-5, weight, bias };
+    type Run<'a> = dyn FnMut(&mut Eager<f32>) -> motiongen::model::Result<Tensor<f32>> + Send + 'a;
+    let mut time = |name: &str, run: &mut Run| -> anyhow::Result<()> {
+        let best = pool.install(|| {
+            (0..2000).try_fold(f64::INFINITY, |best: f64, _| {
+                let started = Instant::now();
+                run(&mut eager)?;
+                anyhow::Ok(best.min(started.elapsed().as_secs_f64()))
+            })
+        })?;
+        let ns = best * 1e9 / values.len() as f64;
+        println!("{}", json!({ "function": name, "ns_per_number": ns }));
+        Ok(())
+    };
+    time("add", &mut |g| g.add(&x, &x))?;
+    time("silu", &mut |g| g.activation(&x, Activation::Silu))?;
+    time("gelu", &mut |g| g.activation(&x, Activation::Gelu))?;
+    time("group_norm + silu", &mut |g| g.group_norm(&x, norm, None, Activation::Silu))
 }
 
 /// Reads a line of this process's status, in MB.

@@ -9,3 +9,4 @@ mod operations;
 mod optimizer;
 mod outline;
 mod overfit;
+mod state_dict;

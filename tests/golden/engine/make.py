@@ -21,6 +21,7 @@ import ops
 import torch
 import weights
 from safetensors.numpy import save as to_bytes
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
 HERE = pathlib.Path(__file__).resolve().parent
@@ -219,6 +220,12 @@ def main() -> None:
     case = unet_case(tiny, 24, [3, 500, 999], [0, 1, 0])
     save("adamw_tiny", trained(case), case.network)
     save("ops", ops.goldens())
+    # As a user would save it: the names and shapes of a state dict, in PyTorch's own float32.
+    minimal = network.UNet1D(
+        network.UNetConfig((8, 16), (1,), num_heads=2, time_embed_dim=8, context_dim=8)
+    )
+    weights.fill(minimal)
+    save_file(minimal.state_dict(), HERE / "state_dict.safetensors")
     n_bytes = sum(path.stat().st_size for path in HERE.glob("*.safetensors"))
     print(f"{n_bytes:,} bytes in all")
     if n_bytes > MAX_BYTES:
