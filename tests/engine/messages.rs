@@ -5,7 +5,7 @@ use motiongen::autodiff::op::elementwise::{Function, Map};
 use motiongen::autodiff::op::loss::{Cost, Loss};
 use motiongen::autodiff::op::matmul::BatchProduct;
 use motiongen::autodiff::op::shape::{Reshape, Transpose};
-use motiongen::autodiff::op::softmax::CrossEntropy;
+use motiongen::autodiff::op::softmax::{CrossEntropy, Softmax};
 use motiongen::autodiff::{Arena, Eager, Gradients, Interpreter, Parameters, Tape, Tensor};
 use motiongen::model::{
     Activation, Attention, Channels, Convolution, Graph, GroupNormalization, Init, ParameterId,
@@ -185,4 +185,42 @@ fn the_first_operation_with_a_number_that_is_not_finite_is_named() {
         panic!("an infinite gradient was not seen");
     };
     assert_eq!(error.to_string(), "sqrt: gradient has inf at [] of []");
+}
+
+#[test]
+fn no_function_hides_what_is_not_a_number() {
+    let (parameters, _) = network();
+    let arena = Arena::default();
+    let mut g = Eager::new(&parameters, &arena);
+    let x = g.input(&[2, 2], &[1.0, f32::NAN, 0.5, -0.5]);
+    for activation in [
+        Activation::Identity,
+        Activation::Silu,
+        Activation::Gelu,
+        Activation::Relu,
+        Activation::LeakyRelu { slope: 0.2 },
+        Activation::Mish,
+        Activation::Tanh,
+        Activation::Sigmoid,
+    ] {
+        let y = g.activation(&x, activation).expect("shapes fit");
+        assert!(y.data()[1].is_nan(), "{activation:?}: {y:?}");
+    }
+    for function in [
+        Function::Affine { scale: 2.0, shift: 1.0 },
+        Function::Exp,
+        Function::Ln,
+        Function::Sqrt,
+        Function::Square,
+        Function::Abs,
+        Function::Clamp { low: -1.0, high: 1.0 },
+    ] {
+        let y = g.apply(Map::new(function), &[&x]).expect("shapes fit");
+        assert!(y.data()[1].is_nan(), "{function:?}: {y:?}");
+    }
+    let y = g.normalize(&x, 1e-12).expect("shapes fit");
+    assert!(y.data()[..2].iter().all(|y| y.is_nan()), "normalize: {y:?}");
+    assert!(y.data()[2..].iter().all(|y| y.is_finite()), "normalize: {y:?}");
+    let y = g.apply(Softmax::default(), &[&x]).expect("shapes fit");
+    assert!(y.data()[..2].iter().all(|y| y.is_nan()), "softmax: {y:?}");
 }

@@ -74,7 +74,8 @@ pub fn apply<E: Element>(activation: Activation, x: &[E], y: &mut [E]) {
         Activation::Identity => y.copy_from_slice(x),
         Activation::Silu => map(x, y, silu),
         Activation::Gelu => map(x, y, gelu),
-        Activation::Relu => map(x, y, |x| x.larger(E::ZERO)),
+        // Written so that NaN stays NaN.
+        Activation::Relu => map(x, y, |x| if x < E::ZERO { E::ZERO } else { x }),
         Activation::LeakyRelu { slope } => {
             let slope = E::from_f64(slope);
             map(x, y, move |x| if x > E::ZERO { x } else { slope * x });

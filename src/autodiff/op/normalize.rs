@@ -34,7 +34,8 @@ impl<E: Element> Operation<E> for Normalize<E> {
         self.x = run.keep(x);
         Ok(run.tensor(x.shape(), |y| {
             for (y, x) in y.chunks_exact_mut(channels).zip(x.data().chunks_exact(channels)) {
-                let n = norm(x).larger(epsilon);
+                let n = norm(x);
+                let n = if n < epsilon { epsilon } else { n };
                 for (y, &x) in y.iter_mut().zip(x) {
                     *y = x / n;
                 }
