@@ -7,11 +7,10 @@ use libfuzzer_sys::fuzz_target;
 #[path = "../../src/autodiff/mod.rs"]
 #[allow(dead_code, reason = "this target reaches a part of the modules")]
 mod autodiff;
+#[path = "../../src/model"]
 #[allow(unused_imports, dead_code, reason = "this target reaches a part of the modules")]
 mod model {
-    #[path = "../../../src/model/graph.rs"]
     mod graph;
-    #[path = "../../../src/model/parameter.rs"]
     mod parameter;
     pub use graph::*;
     pub use parameter::*;
