@@ -53,11 +53,6 @@ pub trait Element:
         if self > other { self } else { other }
     }
 
-    #[inline(always)]
-    fn smaller(self, other: Self) -> Self {
-        if self < other { self } else { other }
-    }
-
     /// Transposes 16 rows of 16 numbers.
     fn transpose(source: &[Self; 256], target: &mut [Self; 256]) {
         super::kernel::transpose_portable(source, target);
@@ -136,29 +131,56 @@ pub fn erf_f32(x: f32) -> f32 {
     x * polynomial(&P) / polynomial(&Q)
 }
 
+/// What both types take from the standard library.
+macro_rules! standard {
+    () => {
+        const ZERO: Self = 0.0;
+        const ONE: Self = 1.0;
+
+        #[inline(always)]
+        fn from_f64(x: f64) -> Self {
+            x as Self
+        }
+
+        #[inline(always)]
+        fn to_f64(self) -> f64 {
+            f64::from(self)
+        }
+
+        #[inline(always)]
+        fn abs(self) -> Self {
+            self.abs()
+        }
+
+        #[inline(always)]
+        fn sqrt(self) -> Self {
+            self.sqrt()
+        }
+
+        #[inline(always)]
+        fn ln(self) -> Self {
+            self.ln()
+        }
+
+        #[inline(always)]
+        fn ln_1p(self) -> Self {
+            self.ln_1p()
+        }
+
+        #[inline(always)]
+        fn tanh(self) -> Self {
+            self.tanh()
+        }
+
+        #[inline(always)]
+        fn is_finite(self) -> bool {
+            self.is_finite()
+        }
+    };
+}
+
 impl Element for f32 {
-    const ZERO: Self = 0.0;
-    const ONE: Self = 1.0;
-
-    #[inline(always)]
-    fn from_f64(x: f64) -> Self {
-        x as Self
-    }
-
-    #[inline(always)]
-    fn to_f64(self) -> f64 {
-        f64::from(self)
-    }
-
-    #[inline(always)]
-    fn abs(self) -> Self {
-        self.abs()
-    }
-
-    #[inline(always)]
-    fn sqrt(self) -> Self {
-        self.sqrt()
-    }
+    standard!();
 
     #[inline(always)]
     fn exp(self) -> Self {
@@ -166,28 +188,8 @@ impl Element for f32 {
     }
 
     #[inline(always)]
-    fn ln(self) -> Self {
-        self.ln()
-    }
-
-    #[inline(always)]
-    fn ln_1p(self) -> Self {
-        self.ln_1p()
-    }
-
-    #[inline(always)]
-    fn tanh(self) -> Self {
-        self.tanh()
-    }
-
-    #[inline(always)]
     fn erf(self) -> Self {
         erf_f32(self)
-    }
-
-    #[inline(always)]
-    fn is_finite(self) -> bool {
-        self.is_finite()
     }
 
     #[inline(always)]
@@ -208,28 +210,7 @@ impl Element for f32 {
 }
 
 impl Element for f64 {
-    const ZERO: Self = 0.0;
-    const ONE: Self = 1.0;
-
-    #[inline(always)]
-    fn from_f64(x: f64) -> Self {
-        x
-    }
-
-    #[inline(always)]
-    fn to_f64(self) -> f64 {
-        self
-    }
-
-    #[inline(always)]
-    fn abs(self) -> Self {
-        self.abs()
-    }
-
-    #[inline(always)]
-    fn sqrt(self) -> Self {
-        self.sqrt()
-    }
+    standard!();
 
     #[inline(always)]
     fn exp(self) -> Self {
@@ -237,28 +218,8 @@ impl Element for f64 {
     }
 
     #[inline(always)]
-    fn ln(self) -> Self {
-        self.ln()
-    }
-
-    #[inline(always)]
-    fn ln_1p(self) -> Self {
-        self.ln_1p()
-    }
-
-    #[inline(always)]
-    fn tanh(self) -> Self {
-        self.tanh()
-    }
-
-    #[inline(always)]
     fn erf(self) -> Self {
         libm::erf(self)
-    }
-
-    #[inline(always)]
-    fn is_finite(self) -> bool {
-        self.is_finite()
     }
 
     #[inline(always)]
