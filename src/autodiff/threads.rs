@@ -23,11 +23,12 @@ pub fn keep_awake<R: Send>(work: impl FnOnce() -> R + Send) -> R {
     rayon::scope(|scope| {
         for _ in 0..others {
             scope.spawn(|_| {
-                // Counted first: whoever closes afterwards has seen this thread, which is not its own.
-                n_started.fetch_add(1, Ordering::SeqCst);
+                // Closed before the work begins: a task that the working thread itself takes up while
+                // it waits for others finds that, and does not wait for its own end.
                 if !open.load(Ordering::SeqCst) {
                     return;
                 }
+                n_started.fetch_add(1, Ordering::SeqCst);
                 while !done.load(Ordering::Acquire) {
                     if rayon::yield_now() == Some(rayon::Yield::Idle) {
                         std::hint::spin_loop();
@@ -35,7 +36,7 @@ pub fn keep_awake<R: Send>(work: impl FnOnce() -> R + Send) -> R {
                 }
             });
         }
-        // This thread takes up no task before the others have, or it would wait for itself.
+        // Until then this thread takes up no task.
         let started = Instant::now();
         while n_started.load(Ordering::SeqCst) < others && started.elapsed() < PATIENCE {
             std::hint::spin_loop();

@@ -347,6 +347,31 @@ mod tests {
     }
 
     #[test]
+    fn any_number_of_blocks_and_levels_fits_together() {
+        for num_res_blocks in [1, 2, 3] {
+            for widths in [vec![8], vec![8, 12], vec![16, 8, 24, 12]] {
+                let attention_levels = (0..widths.len()).collect();
+                let config = crate::model::UNetConfig {
+                    widths,
+                    num_res_blocks,
+                    attention_levels,
+                    ..Preset::Tiny.config()
+                };
+                let (unet, list) = UNet1D::new(&config);
+                let mut outline = Outline::new(&list);
+                let [x, t, audio] =
+                    [&[2, 9, 25][..], &[2], &[2, 9, 163]].map(|shape| outline.input(shape));
+                let (drop_audio, mask, style) = (Some(&t), None, None);
+                let inputs = UNetInputs { x: &x, t: &t, audio: &audio, drop_audio, mask, style };
+                let y = unet.forward(&mut outline, inputs);
+                assert_eq!(y.as_deref(), Ok(&[2, 9, 25][..]), "{config:?}");
+                let met: usize = outline.layers().iter().map(|layer| layer.n_parameters).sum();
+                assert_eq!(met, list.n_elements(), "{config:?}");
+            }
+        }
+    }
+
+    #[test]
     fn the_decoder_is_followed_too() {
         let (decoder, list) = MotionDecoder::new(&DecoderConfig::default());
         let mut outline = Outline::new(&list);

@@ -137,13 +137,13 @@ impl UNet1D {
         };
 
         // Attention takes the place of the last block where a level attends and is neither the lowest
-        // nor the highest, as the diagram has it.
+        // nor the highest, as the diagram has it; one block stays, which takes in the skip.
         let mut decoder = Vec::new();
         for level in (0..=last).rev() {
             let mut scope = root.at(format!("decoder.{level}"));
             let outputs = c.widths[level.saturating_sub(1)];
             let attends = c.attention_levels.contains(&level) && level != last && level != 0;
-            let n_blocks = c.num_res_blocks - usize::from(attends);
+            let n_blocks = (c.num_res_blocks - usize::from(attends)).max(1);
             let mut blocks = Vec::new();
             let mut inputs = width + c.widths[level];
             for i in 0..n_blocks {

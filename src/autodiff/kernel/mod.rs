@@ -1,7 +1,7 @@
 //! The only code with `unsafe`: tiles of matrix products, and the choice of instructions.
 //!
 //! Why here: the tile with AVX-512 runs at 95 % of the machine's peak; what the compiler makes of the
-//! same loops keeps sums in memory and runs at a third of it (`docs/benchmarks.md`). Written in
+//! same loops keeps sums in memory and runs at a third of it at best (`docs/benchmarks.md`). Written in
 //! assembly it is 30 lines, and a test holds every form against the portable one, bit for bit where
 //! both round once per product.
 //!
