@@ -4,19 +4,18 @@
 //! height; zero-phase low-pass; cubic-spline resampling; centre on the floor; forward differences
 //! from two extra frames, which are then dropped, so that every kept frame obeys the identities.
 
-use ndarray::Array2;
 use thiserror::Error;
 
 use crate::units::FPS;
 
 use super::bvh::{Bvh, JointChannel};
-use super::channels::{Channel, MOTION_DIM};
+use super::channels::Channel;
+use super::kinematics::{Poses, forward_differences, frames_of};
 use super::lowpass::lowpass;
 use super::phase::{Beats, bar_phase};
 use super::quantile::{median, percentile};
 use super::quaternion::{
-    IDENTITY, Quaternion, angular_velocity, from_axis_angle, make_sign_continuous, mul, normalize,
-    rotate,
+    IDENTITY, Quaternion, from_axis_angle, make_sign_continuous, mul, normalize, rotate,
 };
 use super::spline::{CubicSpline, SplineError};
 use super::style::{BodyMotion, style_channels};
@@ -128,20 +127,12 @@ pub fn convert_bvh(bvh: &Bvh, beats: Option<&Beats>) -> Result<Trajectory, Captu
         Some(beats) => bar_phase(&grid_s[..t_kept], beats),
         None => vec![0.0; t_kept],
     };
-    let mut frames = Array2::zeros((t_kept, MOTION_DIM));
+    let mut frames = frames_of(&Poses { position_m: p, orientation: q }, t_kept);
     for (t, mut row) in frames.rows_mut().into_iter().enumerate() {
-        let mut write = |channel: Channel, values: &[f64]| {
-            for (i, &x) in channel.range().zip(values) {
-                row[i] = x as f32;
-            }
-        };
-        write(Channel::Position, &p[t]);
-        write(Channel::Velocity, &v[t]);
-        write(Channel::Acceleration, &a[t]);
-        write(Channel::Quaternion, &q[t]);
-        write(Channel::AngularVelocity, &angular_velocity(q[t], q[t + 1], FPS));
-        write(Channel::Phase, &[phase[t]]);
-        write(Channel::Style, &style[t]);
+        row[Channel::Phase.range().start] = phase[t] as f32;
+        for (i, &x) in Channel::Style.range().zip(&style[t]) {
+            row[i] = x as f32;
+        }
     }
     let trajectory = Trajectory::new(frames)?;
     trajectory.check_finite()?;
@@ -302,11 +293,6 @@ fn first_frame_after_pop(nodes: &[Vec<f64>], frame_time_s: f64) -> usize {
 
 fn resample(times_s: &[f64], signal: &[f64], grid_s: &[f64]) -> Result<Vec<f64>, SplineError> {
     Ok(CubicSpline::fit(times_s, signal)?.evaluate(grid_s))
-}
-
-/// `(x[t+1] - x[t]) FPS`, one frame fewer.
-fn forward_differences(x: &[[f64; 3]]) -> Vec<[f64; 3]> {
-    x.windows(2).map(|w| std::array::from_fn(|axis| (w[1][axis] - w[0][axis]) * FPS)).collect()
 }
 
 fn check_size(what: &'static str, count: usize, limit: usize) -> Result<(), CaptureError> {

@@ -15,6 +15,7 @@
 pub mod bvh;
 pub mod capture;
 pub mod channels;
+pub mod kinematics;
 pub mod lowpass;
 pub mod npy;
 pub mod npz;
@@ -28,5 +29,6 @@ pub mod trajectory;
 pub use bvh::{Bvh, BvhError};
 pub use capture::{CaptureError, convert_bvh};
 pub use channels::{CHANNEL_NAMES, Channel, MOTION_DIM, channel_unit};
+pub use kinematics::Poses;
 pub use phase::{Beats, BeatsError, BeatsPerBarSource, bar_phase};
 pub use trajectory::{ChannelLimits, Trajectory, TrajectoryError};
