@@ -1,5 +1,6 @@
 //! What can go wrong between the program and its storage.
 
+use parquet::errors::ParquetError;
 use thiserror::Error;
 
 /// A failure of the store: it names the place as the user typed it; causes are in `source`.
@@ -79,6 +80,32 @@ impl StoreError {
             _ => "",
         };
         StoreError::Remote { action, place: place.to_owned(), hint, source: Box::new(source) }
+    }
+
+    /// Returns whether the same may succeed later: the place is out of reach, not wrong, full or closed
+    /// to us.
+    pub fn may_pass(&self) -> bool {
+        use std::io::ErrorKind::{
+            PermissionDenied, QuotaExceeded, ReadOnlyFilesystem, StorageFull,
+        };
+        let is_passing = |e: &std::io::Error| {
+            ![PermissionDenied, StorageFull, QuotaExceeded, ReadOnlyFilesystem].contains(&e.kind())
+        };
+        match self {
+            // Parts are never removed: one that is not there lies on a disk that is not there.
+            StoreError::NotFound { .. } => true,
+            StoreError::Io { source, .. } => is_passing(source),
+            StoreError::Remote { source, .. } => !is_refusal(source),
+            StoreError::Parquet { source, .. } => match source.as_ref() {
+                ParquetError::External(cause) => {
+                    let remote = cause.downcast_ref::<object_store::Error>();
+                    let local = cause.downcast_ref::<std::io::Error>();
+                    remote.is_some_and(|e| !is_refusal(e)) || local.is_some_and(is_passing)
+                }
+                _ => false,
+            },
+            _ => false,
+        }
     }
 
     pub(crate) fn io(action: &'static str, place: &str, source: std::io::Error) -> Self {

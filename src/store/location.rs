@@ -257,6 +257,24 @@ impl Location {
         .map_err(|e| StoreError::io("make a temporary file beside it", &self.url_of(path), e))
     }
 
+    /// Removes an object; one that is gone already is no error.
+    ///
+    /// # Errors
+    /// What the storage says.
+    pub fn remove(&self, path: &str) -> Result<(), StoreError> {
+        let place = || self.url_of(path);
+        let removed = match &self.kind {
+            Kind::Local(root) => std::fs::remove_file(root.join(path))
+                .map_err(|e| StoreError::io("remove", &place(), e)),
+            Kind::Remote { store, prefix } => block_on(store.delete(&remote::join(prefix, path)))
+                .map_err(|e| StoreError::remote("remove", &place(), e)),
+        };
+        match removed {
+            Err(StoreError::NotFound { .. }) => Ok(()),
+            removed => removed,
+        }
+    }
+
     /// Publishes a finished temporary file at `path`: whole or absent, and durable on return.
     ///
     /// Object stores cannot refuse to overwrite at the end of a multipart upload; there a racing

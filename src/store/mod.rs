@@ -8,10 +8,12 @@ mod client;
 mod commit;
 mod digest;
 mod error;
+mod frames;
 mod item;
 mod local;
 mod location;
 mod part;
+mod patience;
 #[cfg(feature = "query")]
 mod query;
 mod reader;
@@ -26,10 +28,12 @@ pub use client::ClientOptions;
 pub use commit::{Commit, Committed, Item, Ledger, LivePart, Manifest, Part, Settled, live_parts};
 pub use digest::{digest, digest_of};
 pub use error::StoreError;
+pub use frames::FrameSpool;
 pub use item::ItemTables;
 pub use local::{replace_file, temporary_beside, write_file};
 pub use location::{Listed, Location, Put};
 pub use part::{FinishedPart, PartWriter};
+pub use patience::Patience;
 #[cfg(feature = "query")]
 pub use query::{Answer, Format, TableInfo, query, table_infos};
 pub use reader::Snapshot;

@@ -15,7 +15,6 @@ use tempfile::NamedTempFile;
 
 use super::StoreError;
 use super::schema::{Row, TableSchema};
-use super::tables::ITEM_COLUMN;
 
 /// Rows of a row group: large enough to compress, small enough to hold in memory.
 const ROW_GROUP_ROWS: usize = 64 << 10;
@@ -69,7 +68,7 @@ impl PartWriter {
             .set_data_page_row_count_limit(PAGE_ROWS)
             .set_sorting_columns(Some(sorting));
         if table.sorted_by.len() > 1 {
-            let item = ColumnPath::from(ITEM_COLUMN);
+            let item = ColumnPath::from(table.item_column());
             properties = properties
                 .set_column_dictionary_enabled(item.clone(), true)
                 .set_column_bloom_filter_enabled(item.clone(), true)

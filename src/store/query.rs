@@ -13,7 +13,7 @@ use super::commit::{LivePart, live_parts};
 use super::location::{Kind, Location};
 use super::reader::check_version;
 use super::schema::{ColumnType, TableSchema};
-use super::tables::{self, ITEM_COLUMN};
+use super::tables;
 use super::{ClientOptions, StoreError};
 
 /// Names offered when a name is not found.
@@ -206,8 +206,9 @@ fn scan(
         frames.push(scan_parts(store, &whole, options)?);
     }
     for part in partial {
-        let superseded = Series::new(ITEM_COLUMN.into(), part.superseded.as_slice());
-        let dead = col(ITEM_COLUMN).is_in(lit(superseded).implode(false), false);
+        let item = schema.item_column();
+        let superseded = Series::new(item.into(), part.superseded.as_slice());
+        let dead = col(item).is_in(lit(superseded).implode(false), false);
         frames.push(scan_parts(store, &[part], options)?.filter(dead.not()));
     }
     match frames.len() {

@@ -1,5 +1,6 @@
 //! Reading tables: the live rows of a store, one row group in memory at a time.
 
+use std::collections::BTreeSet;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -26,7 +27,6 @@ use super::commit::{LivePart, live_parts};
 use super::location::{Kind, Location};
 use super::remote::join;
 use super::schema::{Row, TableSchema};
-use super::tables::ITEM_COLUMN;
 
 /// The batches of a part, in order.
 type Batches = Box<dyn Iterator<Item = Result<RecordBatch, ParquetError>>>;
@@ -34,11 +34,11 @@ type Batches = Box<dyn Iterator<Item = Result<RecordBatch, ParquetError>>>;
 /// The live rows of one table, as they were when the snapshot was taken.
 #[derive(Clone, Debug)]
 pub struct Snapshot {
-    store: Location,
-    schema: TableSchema,
-    parts: Vec<LivePart>,
+    pub(super) store: Location,
+    pub(super) schema: TableSchema,
+    pub(super) parts: Vec<LivePart>,
     /// The one item whose rows are wanted; `None` for all.
-    item: Option<String>,
+    pub(super) item: Option<String>,
 }
 
 impl Snapshot {
@@ -71,20 +71,40 @@ impl Snapshot {
 
     /// Returns the live rows, part by part; within a part they are sorted as the schema says.
     pub fn batches(&self) -> impl Iterator<Item = Result<RecordBatch, StoreError>> + '_ {
+        let wanted = match &self.item {
+            Some(item) => Wanted::One(item),
+            None => Wanted::All,
+        };
+        self.wanted(wanted)
+    }
+
+    /// Returns the live rows of the row groups that may hold some of the items.
+    pub(super) fn batches_of<'a>(
+        &'a self,
+        items: &'a BTreeSet<String>,
+    ) -> impl Iterator<Item = Result<RecordBatch, StoreError>> + 'a {
+        self.wanted(Wanted::Near(items))
+    }
+
+    fn wanted<'a>(
+        &'a self,
+        wanted: Wanted<'a>,
+    ) -> impl Iterator<Item = Result<RecordBatch, StoreError>> + 'a {
         self.parts.iter().flat_map(move |live| {
             let failed = move |source| StoreError::Parquet {
                 table: self.schema.name.to_owned(),
                 place: self.store.url_of(&live.part.path),
                 source: Box::new(source),
             };
-            let batches: Batches = match open(&self.store, &live.part.path, self.item.as_deref()) {
+            let column = self.schema.item_column();
+            let batches: Batches = match open(&self.store, &live.part.path, column, wanted) {
                 Ok(batches) => batches,
                 Err(e) => Box::new(std::iter::once(Err(e))),
             };
             batches.map(move |batch| {
                 let batch = batch.map_err(failed)?;
                 self.check_columns(&batch, &live.part.path)?;
-                without(&batch, &live.superseded).map_err(failed)
+                without(&batch, column, &live.superseded).map_err(failed)
             })
         })
     }
@@ -160,55 +180,95 @@ pub(super) fn check_version(
 }
 
 /// Returns the rows whose item is not among `superseded`.
-fn without(batch: &RecordBatch, superseded: &[String]) -> Result<RecordBatch, ParquetError> {
+fn without(
+    batch: &RecordBatch,
+    column: &str,
+    superseded: &[String],
+) -> Result<RecordBatch, ParquetError> {
     if superseded.is_empty() {
         return Ok(batch.clone());
     }
-    let items = items(batch)
-        .ok_or_else(|| ParquetError::General(format!("no text column {ITEM_COLUMN}")))?;
+    let items = items(batch, column)
+        .ok_or_else(|| ParquetError::General(format!("no text column {column}")))?;
     let dead: std::collections::HashSet<&str> = superseded.iter().map(String::as_str).collect();
     let keep: BooleanArray =
         items.iter().map(|item| Some(item.is_some_and(|i| !dead.contains(i)))).collect();
     Ok(arrow_select::filter::filter_record_batch(batch, &keep)?)
 }
 
-fn items(batch: &RecordBatch) -> Option<&StringArray> {
-    batch.column_by_name(ITEM_COLUMN)?.as_any().downcast_ref::<StringArray>()
+fn items<'a>(batch: &'a RecordBatch, column: &str) -> Option<&'a StringArray> {
+    batch.column_by_name(column)?.as_any().downcast_ref::<StringArray>()
 }
 
-/// Narrows a reader to the rows of `item`: row groups that cannot hold it are not read, and of the
-/// others only its rows are decoded.
-fn narrow<T>(builder: ArrowReaderBuilder<T>, item: Option<&str>) -> ArrowReaderBuilder<T> {
-    let Some(item) = item else { return builder };
+/// Which rows are wanted.
+#[derive(Clone, Copy)]
+enum Wanted<'a> {
+    All,
+    /// Those of one item.
+    One(&'a str),
+    /// Those of the items, and what lies in one row group with them.
+    Near(&'a BTreeSet<String>),
+}
+
+impl Wanted<'_> {
+    /// Returns whether a row group that holds names from `min` to `max` may hold what is wanted.
+    fn may_lie_within(self, min: Option<&[u8]>, max: Option<&[u8]>) -> bool {
+        let within =
+            |item: &[u8]| min.is_none_or(|min| min <= item) && max.is_none_or(|max| max >= item);
+        match self {
+            Wanted::All => true,
+            Wanted::One(item) => within(item.as_bytes()),
+            Wanted::Near(items) => items.iter().any(|item| within(item.as_bytes())),
+        }
+    }
+}
+
+/// Narrows a reader to what is wanted: row groups that cannot hold it are not read, and where one item
+/// is wanted only its rows are decoded.
+fn narrow<T>(
+    builder: ArrowReaderBuilder<T>,
+    column: &'static str,
+    wanted: Wanted,
+) -> ArrowReaderBuilder<T> {
     let groups = builder.metadata().row_groups().iter().enumerate();
-    let groups = groups.filter(|(_, group)| may_hold(group, item)).map(|(i, _)| i).collect();
-    let mask = ProjectionMask::columns(builder.parquet_schema(), [ITEM_COLUMN]);
+    let groups =
+        groups.filter(|(_, group)| may_hold(group, column, wanted)).map(|(i, _)| i).collect();
+    let builder = builder.with_row_groups(groups);
+    let Wanted::One(item) = wanted else { return builder };
+    let mask = ProjectionMask::columns(builder.parquet_schema(), [column]);
     let item = item.to_owned();
     let is_wanted = ArrowPredicateFn::new(mask, move |batch| {
-        let found = items(&batch)
-            .ok_or_else(|| ArrowError::SchemaError(format!("no text column {ITEM_COLUMN}")))?;
+        let found = items(&batch, column)
+            .ok_or_else(|| ArrowError::SchemaError(format!("no text column {column}")))?;
         Ok(found.iter().map(|found| Some(found == Some(item.as_str()))).collect())
     });
-    builder.with_row_groups(groups).with_row_filter(RowFilter::new(vec![Box::new(is_wanted)]))
+    builder.with_row_filter(RowFilter::new(vec![Box::new(is_wanted)]))
 }
 
-/// Returns whether the statistics of a row group leave room for `item`.
-fn may_hold(group: &RowGroupMetaData, item: &str) -> bool {
-    let column = group.columns().iter().find(|c| c.column_path().string() == ITEM_COLUMN);
+/// Returns whether the statistics of a row group leave room for what is wanted.
+fn may_hold(group: &RowGroupMetaData, column: &str, wanted: Wanted) -> bool {
+    let column = group.columns().iter().find(|c| c.column_path().string() == column);
     let Some(Statistics::ByteArray(names)) = column.and_then(|c| c.statistics()) else {
         return true;
     };
     // Both ends may be cut short, the least downwards and the greatest upwards.
-    names.min_opt().is_none_or(|min| min.data() <= item.as_bytes())
-        && names.max_opt().is_none_or(|max| max.data() >= item.as_bytes())
+    wanted.may_lie_within(
+        names.min_opt().map(|min| min.data()),
+        names.max_opt().map(|max| max.data()),
+    )
 }
 
-fn open(store: &Location, path: &str, item: Option<&str>) -> ParquetResult<Batches> {
+fn open(
+    store: &Location,
+    path: &str,
+    column: &'static str,
+    wanted: Wanted,
+) -> ParquetResult<Batches> {
     match store.kind() {
         Kind::Local(root) => {
             let file = std::fs::File::open(root.join(path))?;
             Ok(Box::new(
-                narrow(ParquetRecordBatchReaderBuilder::try_new(file)?, item)
+                narrow(ParquetRecordBatchReaderBuilder::try_new(file)?, column, wanted)
                     .build()?
                     .map(|batch| batch.map_err(ParquetError::from)),
             ))
@@ -218,7 +278,7 @@ fn open(store: &Location, path: &str, item: Option<&str>) -> ParquetResult<Batch
             let stream = block_on(async {
                 let size = store.head(&path).await.map_err(external)?.size;
                 let object = RemotePart { store: Arc::clone(store), path, size };
-                narrow(ParquetRecordBatchStreamBuilder::new(object).await?, item).build()
+                narrow(ParquetRecordBatchStreamBuilder::new(object).await?, column, wanted).build()
             })?;
             let mut stream = Box::pin(stream);
             Ok(Box::new(std::iter::from_fn(move || block_on(stream.next()))))

@@ -75,6 +75,11 @@ impl ColumnType {
 }
 
 impl TableSchema {
+    /// Returns the column that names the item which a row belongs to: the first that rows are sorted by.
+    pub fn item_column(&self) -> &'static str {
+        self.sorted_by[0]
+    }
+
     /// Returns the Arrow schema of the table's parts.
     pub fn arrow(&self) -> SchemaRef {
         let field = |c: &Column| Field::new(c.name.as_ref(), c.column_type.data_type(), c.nullable);

@@ -6,8 +6,8 @@ use super::schema::{Column, ColumnType, Row, TableSchema, TimestampUs, rows};
 use crate::audio::feature_names;
 use crate::motion::{CHANNEL_NAMES, channel_unit};
 
-/// The column that names the item a row belongs to, in every table.
-pub const ITEM_COLUMN: &str = "phrase_id";
+/// The column that names the phrase a row belongs to.
+const ITEM_COLUMN: &str = "phrase_id";
 
 rows! {
     "One row per phrase that ingest accepted."
@@ -209,7 +209,8 @@ mod tests {
             for sort in table.sorted_by {
                 assert!(names.contains(sort), "{}: {sort}", table.name);
             }
-            assert!(names.contains(&ITEM_COLUMN), "{}", table.name);
+            let item = table.columns.iter().find(|c| c.name == table.item_column());
+            assert_eq!(item.map(|c| c.column_type), Some(ColumnType::Utf8), "{}", table.name);
             let n = names.len();
             names.sort_unstable();
             names.dedup();

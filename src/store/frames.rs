@@ -1,0 +1,270 @@
+//! Frame tables item by item, and frames kept at hand on this machine.
+
+use std::collections::BTreeSet;
+use std::fs::File;
+use std::sync::{Mutex, PoisonError};
+
+use arrow_array::{Array as _, Float32Array, Int32Array, RecordBatch, StringArray};
+use ndarray::Array2;
+use parquet::errors::ParquetError;
+
+use super::StoreError;
+use super::reader::Snapshot;
+
+/// Channels begin behind the item's name and the frame's number.
+const FIRST_CHANNEL: usize = 2;
+
+impl Snapshot {
+    /// Returns a snapshot of one part alone.
+    pub fn part(&self, i: usize) -> Self {
+        Self { parts: vec![self.parts[i].clone()], ..self.clone() }
+    }
+
+    /// Calls `visit` with the frames of each item of a frame table that is among `wanted`, in the order
+    /// in which they lie; row groups without any are not read.
+    ///
+    /// # Shapes
+    /// - frames: `[n_frames, n_channels]`
+    ///
+    /// # Errors
+    /// [`StoreError`] when a part cannot be read, has other columns, or an item's frames are not 0, 1, 2
+    /// and so on; and whatever `visit` returns.
+    pub fn visit_items<E: From<StoreError>>(
+        &self,
+        wanted: &BTreeSet<String>,
+        mut visit: impl FnMut(&str, Array2<f32>) -> Result<(), E>,
+    ) -> Result<(), E> {
+        let n_channels = self.schema.columns.len().saturating_sub(FIRST_CHANNEL);
+        let mut item = String::new();
+        let mut values: Vec<f32> = Vec::new();
+        let mut finish = |item: &str, values: Vec<f32>| {
+            if values.is_empty() {
+                return Ok(());
+            }
+            let frames = Array2::from_shape_vec((values.len() / n_channels, n_channels), values)
+                .expect("invariant: whole rows were gathered");
+            visit(item, frames)
+        };
+        for batch in self.batches_of(wanted) {
+            let batch = batch?;
+            let columns = Columns::of(&batch, self)?;
+            let mut row = 0;
+            while row < batch.num_rows() {
+                let name = columns.items.value(row);
+                let end = (row + 1..batch.num_rows())
+                    .find(|&i| columns.items.value(i) != name)
+                    .unwrap_or(batch.num_rows());
+                if name != item {
+                    finish(&item, std::mem::take(&mut values))?;
+                    item = name.to_owned();
+                }
+                if wanted.contains(name) {
+                    columns.copy(row..end, &mut values).map_err(|what| self.broken(name, what))?;
+                }
+                row = end;
+            }
+        }
+        finish(&item, values)
+    }
+
+    fn broken(&self, item: &str, what: String) -> StoreError {
+        let places: Vec<_> =
+            self.parts.iter().map(|live| self.store.url_of(&live.part.path)).collect();
+        StoreError::Parquet {
+            table: self.schema.name.to_owned(),
+            place: places.join(" and "),
+            source: Box::new(ParquetError::General(format!("{item} {what}"))),
+        }
+    }
+}
+
+/// The columns of a batch of a frame table.
+struct Columns<'a> {
+    items: &'a StringArray,
+    numbers: &'a Int32Array,
+    channels: Vec<&'a Float32Array>,
+}
+
+impl<'a> Columns<'a> {
+    fn of(batch: &'a RecordBatch, table: &Snapshot) -> Result<Self, StoreError> {
+        let column = |i: usize| batch.column_by_name(&table.schema.columns[i].name);
+        let missing = || table.broken("a batch", "has no columns of frames".to_owned());
+        let items = column(0).and_then(|c| c.as_any().downcast_ref()).ok_or_else(missing)?;
+        let numbers = column(1).and_then(|c| c.as_any().downcast_ref()).ok_or_else(missing)?;
+        let channels = (FIRST_CHANNEL..table.schema.columns.len())
+            .map(|i| column(i).and_then(|c| c.as_any().downcast_ref()).ok_or_else(missing))
+            .collect::<Result<_, _>>()?;
+        Ok(Self { items, numbers, channels })
+    }
+
+    /// Appends rows to those of the same item that came before.
+    fn copy(&self, rows: std::ops::Range<usize>, values: &mut Vec<f32>) -> Result<(), String> {
+        let (n_channels, n_rows) = (self.channels.len(), rows.len());
+        let first = values.len() / n_channels;
+        for (number, expected) in self.numbers.values()[rows.clone()].iter().zip(first..) {
+            if usize::try_from(*number) != Ok(expected) {
+                return Err(format!("has frame {number} where frame {expected} should be"));
+            }
+        }
+        let start = values.len();
+        values.resize(start + n_rows * n_channels, 0.0);
+        for (channel, column) in self.channels.iter().enumerate() {
+            let targets = values[start + channel..].iter_mut().step_by(n_channels);
+            for (target, value) in targets.zip(&column.values()[rows.clone()]) {
+                *target = *value;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Rows of numbers of one width, appended in any order and read at random: in memory, or in a file of
+/// this machine that nobody else sees and that goes with the program.
+#[derive(Debug)]
+pub struct FrameSpool {
+    width: usize,
+    kept: Kept,
+}
+
+#[derive(Debug)]
+enum Kept {
+    Memory(Mutex<Vec<f32>>),
+    File { file: File, n_rows: Mutex<u64> },
+}
+
+impl FrameSpool {
+    /// Makes an empty spool in memory.
+    pub fn in_memory(width: usize) -> Self {
+        Self { width, kept: Kept::Memory(Mutex::default()) }
+    }
+
+    /// Makes an empty spool in a nameless file of the folder for temporary files (`TMPDIR`).
+    ///
+    /// # Errors
+    /// [`StoreError::Io`] when no file can be made.
+    pub fn in_file(width: usize) -> Result<Self, StoreError> {
+        let file = tempfile::tempfile().map_err(|e| failed("make", e))?;
+        Ok(Self { width, kept: Kept::File { file, n_rows: Mutex::new(0) } })
+    }
+
+    /// Appends rows, and returns the place of the first.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`] when the disk is full.
+    ///
+    /// # Panics
+    /// When `rows` has another width.
+    pub fn append(&self, rows: ndarray::ArrayView2<f32>) -> Result<u64, StoreError> {
+        assert_eq!(rows.ncols(), self.width, "width of the spool");
+        let values = rows.iter().copied();
+        match &self.kept {
+            Kept::Memory(kept) => {
+                let mut kept = kept.lock().unwrap_or_else(PoisonError::into_inner);
+                let first = kept.len() / self.width.max(1);
+                kept.extend(values);
+                Ok(first as u64)
+            }
+            Kept::File { file, n_rows } => {
+                let bytes: Vec<u8> = values.flat_map(f32::to_le_bytes).collect();
+                let first = {
+                    let mut n_rows = n_rows.lock().unwrap_or_else(PoisonError::into_inner);
+                    let first = *n_rows;
+                    *n_rows += rows.nrows() as u64;
+                    first
+                };
+                write_at(file, &bytes, first * self.row_bytes()).map_err(|e| failed("write", e))?;
+                Ok(first)
+            }
+        }
+    }
+
+    /// Reads rows from `first` on until `target` is full.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`] when the file cannot be read, or ends before.
+    pub fn read(&self, first: u64, target: &mut [f32]) -> Result<(), StoreError> {
+        match &self.kept {
+            Kept::Memory(kept) => {
+                let kept = kept.lock().unwrap_or_else(PoisonError::into_inner);
+                let start = first as usize * self.width;
+                let source = kept.get(start..start + target.len()).ok_or_else(|| {
+                    failed("read", std::io::Error::from(std::io::ErrorKind::UnexpectedEof))
+                })?;
+                target.copy_from_slice(source);
+            }
+            Kept::File { file, .. } => {
+                let mut bytes = vec![0; size_of_val(target)];
+                read_at(file, &mut bytes, first * self.row_bytes())
+                    .map_err(|e| failed("read", e))?;
+                for (target, bytes) in target.iter_mut().zip(bytes.as_chunks::<4>().0) {
+                    *target = f32::from_le_bytes(*bytes);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn row_bytes(&self) -> u64 {
+        (self.width * size_of::<f32>()) as u64
+    }
+}
+
+fn failed(action: &'static str, source: std::io::Error) -> StoreError {
+    let place = format!("the frames at hand in {}", std::env::temp_dir().display());
+    StoreError::Io { action, place, source }
+}
+
+#[cfg(unix)]
+fn write_at(file: &File, bytes: &[u8], offset: u64) -> std::io::Result<()> {
+    std::os::unix::fs::FileExt::write_all_at(file, bytes, offset)
+}
+
+#[cfg(unix)]
+fn read_at(file: &File, bytes: &mut [u8], offset: u64) -> std::io::Result<()> {
+    std::os::unix::fs::FileExt::read_exact_at(file, bytes, offset)
+}
+
+#[cfg(windows)]
+fn write_at(file: &File, mut bytes: &[u8], mut offset: u64) -> std::io::Result<()> {
+    while !bytes.is_empty() {
+        let n = std::os::windows::fs::FileExt::seek_write(file, bytes, offset)?;
+        bytes = &bytes[n..];
+        offset += n as u64;
+    }
+    Ok(())
+}
+
+#[cfg(windows)]
+fn read_at(file: &File, bytes: &mut [u8], offset: u64) -> std::io::Result<()> {
+    let mut done = 0;
+    while done < bytes.len() {
+        let at = offset + done as u64;
+        match std::os::windows::fs::FileExt::seek_read(file, &mut bytes[done..], at)? {
+            0 => return Err(std::io::ErrorKind::UnexpectedEof.into()),
+            n => done += n,
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ndarray::array;
+
+    #[test]
+    fn rows_come_back_from_where_they_were_put() {
+        let file = FrameSpool::in_file(3).expect("a temporary file");
+        for spool in [FrameSpool::in_memory(3), file] {
+            let first = spool.append(array![[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]].view());
+            let second = spool.append(array![[7.0, 8.0, 9.0]].view());
+            assert_eq!((first.ok(), second.ok()), (Some(0), Some(2)));
+            let mut rows = [0.0; 6];
+            spool.read(1, &mut rows).expect("two rows are there");
+            assert_eq!(rows, [4.0, 5.0, 6.0, 7.0, 8.0, 9.0]);
+            let error = spool.read(2, &mut rows).expect_err("one row is there");
+            let place = format!("the frames at hand in {}", std::env::temp_dir().display());
+            assert_eq!(error.to_string(), format!("{place}: could not read"));
+        }
+    }
+}
