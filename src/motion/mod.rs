@@ -12,6 +12,7 @@
 //!
 //! Everything here is pure: text and numbers in, numbers or a named error out.
 
+pub mod augment;
 pub mod bvh;
 pub mod capture;
 pub mod channels;
