@@ -1,7 +1,7 @@
 //! Parameters as safetensors, named and shaped as PyTorch has them.
 //!
 //! A PyTorch state dict of the same network, saved as safetensors, loads unchanged. Bytes in, bytes
-//! out: files are the store's business.
+//! out; what is too large for that goes into a file that the store made.
 
 use std::borrow::Cow;
 use std::collections::{BTreeMap, HashMap};
@@ -31,10 +31,18 @@ pub enum Precision {
     F64,
 }
 
+/// Parameters, or what lies as they do, under a common beginning of their names.
+#[derive(Clone, Copy, Debug)]
+pub struct Section<'a, E: Element> {
+    /// What stands before each name, `ema.` for example; may be empty.
+    pub prefix: &'a str,
+    pub plan: &'a Plan,
+    pub values: &'a [E],
+}
+
 /// One parameter on its way to a file.
 struct Saved<'a, E: Element> {
-    plan: &'a Plan,
-    all: &'a [E],
+    section: Section<'a, E>,
     id: ParameterId,
     precision: Precision,
 }
@@ -48,11 +56,11 @@ impl<E: Element> View for Saved<'_, E> {
     }
 
     fn shape(&self) -> &[usize] {
-        &self.plan.list().get(self.id).shape
+        &self.section.plan.list().get(self.id).shape
     }
 
     fn data(&self) -> Cow<'_, [u8]> {
-        let values = self.plan.unpack(self.id, self.all);
+        let values = self.section.plan.unpack(self.id, self.section.values);
         let values = values.into_iter().map(Element::to_f64);
         Cow::Owned(match self.precision {
             Precision::F32 => values.flat_map(|x| (x as f32).to_le_bytes()).collect(),
@@ -61,8 +69,24 @@ impl<E: Element> View for Saved<'_, E> {
     }
 
     fn data_len(&self) -> usize {
-        self.plan.list().get(self.id).len() * self.dtype().bitsize() / 8
+        self.section.plan.list().get(self.id).len() * self.dtype().bitsize() / 8
     }
+}
+
+fn tensors<'a, E: Element>(
+    sections: &[Section<'a, E>],
+    precision: Precision,
+) -> Vec<(String, Saved<'a, E>)> {
+    let of = |&section: &Section<'a, E>| {
+        section.plan.list().iter().map(move |(id, parameter)| {
+            (format!("{}{}", section.prefix, parameter.name), Saved { section, id, precision })
+        })
+    };
+    sections.iter().flat_map(of).collect()
+}
+
+fn header(metadata: &BTreeMap<String, String>) -> Option<HashMap<String, String>> {
+    (!metadata.is_empty()).then(|| metadata.clone().into_iter().collect())
 }
 
 /// Writes parameters, or what lies as they do, as a safetensors file.
@@ -71,54 +95,102 @@ impl<E: Element> View for Saved<'_, E> {
 /// If the format cannot hold them.
 pub fn save<E: Element>(
     plan: &Plan,
-    all: &[E],
+    values: &[E],
     precision: Precision,
     metadata: &BTreeMap<String, String>,
 ) -> Result<Vec<u8>, WeightsError> {
-    let tensors = plan
-        .list()
-        .iter()
-        .map(|(id, parameter)| (&parameter.name, Saved { plan, all, id, precision }));
-    let metadata: HashMap<_, _> = metadata.clone().into_iter().collect();
-    Ok(safetensors::serialize(tensors, (!metadata.is_empty()).then_some(metadata))?)
+    let section = Section { prefix: "", plan, values };
+    Ok(safetensors::serialize(tensors(&[section], precision), header(metadata))?)
+}
+
+/// Writes several sections into a file that the caller made, one tensor in memory at a time.
+///
+/// # Errors
+/// If the format cannot hold them, or the disk is full.
+pub fn save_to_file<E: Element>(
+    sections: &[Section<E>],
+    precision: Precision,
+    metadata: &BTreeMap<String, String>,
+    file: &tempfile::NamedTempFile,
+) -> Result<(), WeightsError> {
+    let tensors = tensors(sections, precision);
+    Ok(safetensors::serialize_to_file(tensors, header(metadata), file.path())?)
+}
+
+/// A safetensors file that was read.
+pub struct Archive<'a> {
+    file: SafeTensors<'a>,
+    metadata: BTreeMap<String, String>,
+}
+
+impl<'a> Archive<'a> {
+    /// Reads the header.
+    ///
+    /// # Errors
+    /// If the bytes are no safetensors file.
+    pub fn open(bytes: &'a [u8]) -> Result<Self, WeightsError> {
+        let file = SafeTensors::deserialize(bytes)?;
+        let (_, header) = SafeTensors::read_metadata(bytes)?;
+        let metadata = header.metadata().clone().unwrap_or_default().into_iter().collect();
+        Ok(Self { file, metadata })
+    }
+
+    /// Returns what was written beside the tensors.
+    pub fn metadata(&self) -> &BTreeMap<String, String> {
+        &self.metadata
+    }
+
+    /// Reads the parameters whose names begin with `prefix`; half precision becomes the element's own.
+    ///
+    /// # Errors
+    /// If they are not those of the list: every missing, extra and misshaped tensor is listed.
+    pub fn section<E: Element>(
+        &self,
+        prefix: &str,
+        list: ParameterList,
+    ) -> Result<Parameters<E>, WeightsError> {
+        let within = |name: &'_ str| name.strip_prefix(prefix).map(str::to_owned);
+        let found: BTreeMap<_, _> =
+            self.file.iter().filter_map(|(name, tensor)| Some((within(name)?, tensor))).collect();
+        let mut problems = Vec::new();
+        for (_, parameter) in list.iter() {
+            let name = &parameter.name;
+            match found.get(name.as_str()) {
+                None => problems.push(format!("{name} is missing")),
+                Some(tensor) if tensor.shape() != parameter.shape => problems.push(format!(
+                    "{name} has shape {:?}, the network expects {:?}",
+                    tensor.shape(),
+                    parameter.shape
+                )),
+                Some(tensor) if !is_float(tensor.dtype()) => problems
+                    .push(format!("{name} holds {:?}, not floating-point numbers", tensor.dtype())),
+                Some(_) => {}
+            }
+        }
+        let known = list.by_name();
+        for name in found.keys().filter(|name| !known.contains_key(name.as_str())) {
+            problems.push(format!("{name} is not a parameter of the network"));
+        }
+        if !problems.is_empty() {
+            return Err(WeightsError::Mismatch(problems));
+        }
+        Ok(Parameters::from_fn(list, |parameter| {
+            let tensor = found.get(parameter.name.as_str()).and_then(numbers);
+            tensor.expect("checked above")
+        }))
+    }
 }
 
 /// Reads the parameters of a network; half precision becomes the element's own.
 ///
 /// # Errors
-/// If the bytes are no safetensors file, or not the network's: every missing, extra and misshaped
-/// tensor is listed.
+/// As [`Archive::open`] and [`Archive::section`].
 pub fn load<E: Element>(bytes: &[u8], list: ParameterList) -> Result<Parameters<E>, WeightsError> {
-    let file = SafeTensors::deserialize(bytes)?;
-    let found: BTreeMap<_, _> = file.iter().collect();
-    let mut problems = Vec::new();
-    for (_, parameter) in list.iter() {
-        let name = &parameter.name;
-        match found.get(name.as_str()) {
-            None => problems.push(format!("{name} is missing")),
-            Some(tensor) if tensor.shape() != parameter.shape => problems.push(format!(
-                "{name} has shape {:?}, the network expects {:?}",
-                tensor.shape(),
-                parameter.shape
-            )),
-            Some(tensor) if numbers::<E>(tensor).is_none() => {
-                problems
-                    .push(format!("{name} holds {:?}, not floating-point numbers", tensor.dtype()));
-            }
-            Some(_) => {}
-        }
-    }
-    let known = list.by_name();
-    for name in found.keys().filter(|name| !known.contains_key(*name)) {
-        problems.push(format!("{name} is not a parameter of the network"));
-    }
-    if !problems.is_empty() {
-        return Err(WeightsError::Mismatch(problems));
-    }
-    Ok(Parameters::from_fn(list, |parameter| {
-        let tensor = found.get(parameter.name.as_str()).and_then(|tensor| numbers(tensor));
-        tensor.expect("checked above")
-    }))
+    Archive::open(bytes)?.section("", list)
+}
+
+fn is_float(dtype: Dtype) -> bool {
+    matches!(dtype, Dtype::F64 | Dtype::F32 | Dtype::F16 | Dtype::BF16)
 }
 
 /// Returns the numbers of a tensor, `None` where they are not floating-point.
@@ -179,6 +251,25 @@ mod tests {
              network expects [5, 25]; phase_head.bias is missing; style_head.bias holds I32, not \
              floating-point numbers; extra is not a parameter of the network"
         );
+    }
+
+    #[test]
+    fn sections_are_told_apart_by_their_prefix() {
+        let weights = Parameters::<f32>::new(small(), 3);
+        let average = Parameters::<f32>::new(small(), 4);
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let sections = [("model.", &weights), ("ema.", &average)].map(|(prefix, parameters)| {
+            Section { prefix, plan: parameters.plan(), values: parameters.all() }
+        });
+        let metadata = BTreeMap::from([("step".to_owned(), "7".to_owned())]);
+        save_to_file(&sections, Precision::F32, &metadata, &file).unwrap();
+        let bytes = std::fs::read(file.path()).unwrap();
+        let archive = Archive::open(&bytes).unwrap();
+        assert_eq!(archive.metadata(), &metadata);
+        assert_eq!(archive.section::<f32>("ema.", small()).unwrap().all(), average.all());
+        assert_eq!(archive.section::<f32>("model.", small()).unwrap().all(), weights.all());
+        let error = archive.section::<f32>("moments.", small()).unwrap_err().to_string();
+        assert!(error.contains("input_proj.weight is missing"), "{error}");
     }
 
     #[test]

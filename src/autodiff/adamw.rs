@@ -3,7 +3,7 @@
 use ndarray::Array1;
 use rayon::prelude::*;
 
-use crate::model::Role;
+use crate::model::{Parameter, Role};
 
 use super::arena::Arena;
 use super::element::Element;
@@ -125,6 +125,16 @@ impl<E: Element> AdamW<E> {
         gradients: &mut Gradients<E>,
         learning_rate: f64,
     ) -> f64 {
+        self.step_by(parameters, gradients, |_| learning_rate)
+    }
+
+    /// Takes one step with a learning rate for each parameter; otherwise as [`AdamW::step`].
+    pub fn step_by(
+        &mut self,
+        parameters: &mut Parameters<E>,
+        gradients: &mut Gradients<E>,
+        learning_rate: impl Fn(&Parameter) -> f64,
+    ) -> f64 {
         let gradients = &*gradients.all();
         let norm = norm(gradients);
         if !norm.is_finite() {
@@ -134,7 +144,7 @@ impl<E: Element> AdamW<E> {
         let AdamWConfig { betas, epsilon, weight_decay, max_norm } = self.config;
         let n = self.n_steps as f64;
         let clip = max_norm.map_or(1.0, |limit| (limit / (norm + CLIP_EPSILON)).min(1.0));
-        let update = |decay: f64| Update {
+        let update = |learning_rate: f64, decay: f64| Update {
             clip: E::from_f64(clip),
             keep: E::from_f64(1.0 - learning_rate * decay),
             betas: betas.map(E::from_f64),
@@ -143,7 +153,6 @@ impl<E: Element> AdamW<E> {
             correction: E::from_f64(1.0 / (1.0 - betas[1].powf(n)).sqrt()),
             epsilon: E::from_f64(epsilon),
         };
-        let (decaying, free) = (update(weight_decay), update(0.0));
 
         let plan = std::sync::Arc::clone(parameters.plan());
         let [m, v] = self.moments.each_mut().map(|x| x.as_slice_mut().expect("one run of memory"));
@@ -152,17 +161,19 @@ impl<E: Element> AdamW<E> {
         let mut chunks = Vec::new();
         for (id, parameter) in plan.list().iter() {
             let decays = matches!(parameter.role, Role::Weight | Role::Table);
+            let decay = if decays { weight_decay } else { 0.0 };
+            let by = update(learning_rate(parameter), decay);
             let range = plan.range(id);
             skip(&mut rest, range.start - done);
             let mut left = range.len();
             while left > 0 {
                 let n = left.min(CHUNK);
-                chunks.push((skip(&mut rest, n), if decays { &decaying } else { &free }));
+                chunks.push((skip(&mut rest, n), by));
                 left -= n;
             }
             done = range.end;
         }
-        chunks.into_par_iter().for_each(|((p, g, m, v), by)| update_chunk(p, g, m, v, by));
+        chunks.into_par_iter().for_each(|((p, g, m, v), by)| update_chunk(p, g, m, v, &by));
         norm
     }
 }

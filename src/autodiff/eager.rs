@@ -30,12 +30,16 @@ impl<'p, E: Element> Eager<'p, E> {
 
     /// Returns an input.
     pub fn input(&self, shape: &[usize], values: &[E]) -> Tensor<E> {
-        Tensor::new(self.arena.copy(shape, values), &self.arena)
+        self.constant(shape, values)
     }
 }
 
 impl<E: Element> Interpreter for Eager<'_, E> {
     type Element = E;
+
+    fn constant(&self, shape: &[usize], values: &[E]) -> Tensor<E> {
+        Tensor::new(self.arena.copy(shape, values), &self.arena)
+    }
 
     fn apply<O: Operation<E>>(&mut self, mut operation: O, x: &[&Tensor<E>]) -> Result<Tensor<E>> {
         let (parameters, arena) = (self.parameters, &self.arena);

@@ -88,6 +88,9 @@ fn filled<E: Element>(arena: &Arena<E>, shape: &[usize], fill: impl FnOnce(&mut 
 pub trait Interpreter: Sized {
     type Element: Element;
 
+    /// Returns a value that needs no gradient.
+    fn constant(&self, shape: &[usize], values: &[Self::Element]) -> Tensor<Self::Element>;
+
     /// Runs an operation.
     fn apply<O: Operation<Self::Element>>(
         &mut self,

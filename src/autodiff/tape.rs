@@ -82,11 +82,6 @@ impl<'p, E: Element> Tape<'p, E> {
         self
     }
 
-    /// Returns a value that needs no gradient.
-    pub fn constant(&self, shape: &[usize], values: &[E]) -> Tensor<E> {
-        Tensor::new(self.arena.copy(shape, values), &self.arena)
-    }
-
     /// Returns an input whose gradient [`Tape::backward`] gives.
     pub fn input(&mut self, shape: &[usize], values: &[E]) -> Tensor<E> {
         let x = self.constant(shape, values);
@@ -219,6 +214,10 @@ fn accumulate<E: Element>(slot: &mut Option<Tensor<E>>, dx: Tensor<E>) {
 
 impl<'p, E: Element> Interpreter for Tape<'p, E> {
     type Element = E;
+
+    fn constant(&self, shape: &[usize], values: &[E]) -> Tensor<E> {
+        Tensor::new(self.arena.copy(shape, values), &self.arena)
+    }
 
     fn apply<O: Operation<E>>(&mut self, mut operation: O, x: &[&Tensor<E>]) -> Result<Tensor<E>> {
         let inputs: Vec<_> = x.iter().map(|x| x.node).collect();

@@ -1,5 +1,7 @@
 //! The decoder from a sampled latent to the 25 channels of motion.
 
+use serde::{Deserialize, Serialize};
+
 use crate::motion::{Channel, ChannelLimits, MOTION_DIM};
 
 use super::graph::{Activation, Graph, Result};
@@ -10,7 +12,7 @@ use super::parameter::{ParameterList, Scope};
 const QUATERNION_EPSILON: f64 = 1e-12;
 
 /// The sizes of a [`MotionDecoder`].
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DecoderConfig {
     /// Channels of the latent.
     pub input_dim: usize,
@@ -82,7 +84,12 @@ impl MotionDecoder {
     /// Makes the decoder and the list of its parameters.
     pub fn new(config: &DecoderConfig) -> (Self, ParameterList) {
         let mut list = ParameterList::default();
-        let mut root = Scope::root(&mut list);
+        let decoder = Self::within(&mut Scope::root(&mut list), config);
+        (decoder, list)
+    }
+
+    /// Makes the decoder as a part of another network.
+    pub fn within(root: &mut Scope, config: &DecoderConfig) -> Self {
         let input_proj =
             Linear::new(&mut root.at("input_proj"), config.input_dim, config.hidden_dim);
         let blocks = (0..config.n_blocks)
@@ -92,8 +99,7 @@ impl MotionDecoder {
             let mut scope = root.at(format!("{}_head", channel.name()));
             (channel, Linear::new(&mut scope, config.hidden_dim, channel.width()))
         });
-        let decoder = Self { input_proj, blocks, heads: heads.into(), limits: config.limits };
-        (decoder, list)
+        Self { input_proj, blocks, heads: heads.into(), limits: config.limits }
     }
 
     /// Decodes a latent.

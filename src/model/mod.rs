@@ -18,4 +18,4 @@ pub use graph::{
 pub use layers::{AttentionBlock, Conv1d, GroupNorm, LayerNorm, Linear, ResBlock};
 pub use outline::{Kept, Layer, Outline};
 pub use parameter::{Init, Parameter, ParameterId, ParameterList, Role, Scope};
-pub use unet::{Preset, UNet1D, UNetConfig, UNetInputs};
+pub use unet::{ConfigError, Preset, UNet1D, UNetConfig, UNetInputs};

@@ -10,7 +10,7 @@ use std::sync::Arc;
 
 use ndarray::Array2;
 
-pub use config::{Preset, UNetConfig};
+pub use config::{ConfigError, Preset, UNetConfig};
 
 use super::graph::{Activation, Graph, Result};
 use super::layers::{AttentionBlock, Conv1d, GroupNorm, Linear, ResBlock};
@@ -91,7 +91,15 @@ impl UNet1D {
     /// Makes the network and the list of its parameters.
     pub fn new(config: &UNetConfig) -> (Self, ParameterList) {
         let mut list = ParameterList::default();
-        let mut root = Scope::root(&mut list);
+        let unet = Self::within(&mut Scope::root(&mut list), config);
+        (unet, list)
+    }
+
+    /// Makes the network as a part of another.
+    ///
+    /// # Panics
+    /// When the configuration is none that [`UNetConfig::check`] lets through.
+    pub fn within(root: &mut Scope, config: &UNetConfig) -> Self {
         let c = config;
         let time_dim = c.time_embed_dim;
         let res = |scope: &mut Scope, inputs, outputs| {
@@ -159,7 +167,7 @@ impl UNet1D {
         }
         let out_norm = GroupNorm::new(&mut root.at("out.norm"), width);
         let out_conv = Conv1d::zeros(&mut root.at("out.conv"), width, c.out_channels, 3);
-        let unet = Self {
+        Self {
             time_table: Arc::new(time_table(c.n_steps, time_dim)),
             time_mlp,
             style_proj,
@@ -172,8 +180,7 @@ impl UNet1D {
             out_norm,
             out_conv,
             checkpoint: c.use_checkpoint,
-        };
-        (unet, list)
+        }
     }
 
     /// Predicts the noise in `x`.

@@ -61,7 +61,18 @@ impl TrajectoryError {
 /// Which values a channel may take; the presets differ in angular velocity alone.
 ///
 /// Position ±100 m, velocity ±50 m/s, acceleration ±100 m/s², phase 0 to 1 bar, style unbounded.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Default, clap::ValueEnum, serde::Serialize)]
+#[derive(
+    Clone,
+    Copy,
+    Debug,
+    PartialEq,
+    Eq,
+    Hash,
+    Default,
+    clap::ValueEnum,
+    serde::Serialize,
+    serde::Deserialize,
+)]
 #[serde(rename_all = "snake_case")]
 pub enum ChannelLimits {
     /// Angular velocity within ±20 rad/s: fast spins of captured dance reach 19.4.

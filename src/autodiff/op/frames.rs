@@ -28,6 +28,11 @@ enum Choice {
     },
     /// As many as the second input has.
     Crop,
+    /// All but some at either end.
+    Inner {
+        skip: usize,
+        drop: usize,
+    },
 }
 
 impl TakeFrames {
@@ -44,6 +49,11 @@ impl TakeFrames {
     /// The first frames, as many as the second input has.
     pub fn crop() -> Self {
         Self::new("crop_frames", Choice::Crop)
+    }
+
+    /// All frames but the first `skip` and the last `drop`.
+    pub fn inner(skip: usize, drop: usize) -> Self {
+        Self::new("inner_frames", Choice::Inner { skip, drop })
     }
 
     fn new(name: &'static str, choose: Choice) -> Self {
@@ -78,6 +88,11 @@ impl<E: Element> Operation<E> for TakeFrames {
                     return Err(GraphError::shape(self.name, problem));
                 }
                 (0..wanted).collect()
+            }
+            Choice::Inner { skip, drop } if skip + drop < frames => (skip..frames - drop).collect(),
+            Choice::Inner { skip, drop } => {
+                let problem = format!("input has {frames} frames, all but {} asked for", skip + drop);
+                return Err(GraphError::shape(self.name, problem));
             }
         };
         let shape = [batch, self.index.len(), channels];

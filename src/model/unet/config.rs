@@ -1,10 +1,12 @@
 //! The sizes of a UNet, and the sizes with names.
 
+use serde::{Deserialize, Serialize};
+
 use crate::audio::FEATURE_DIM;
 use crate::motion::MOTION_DIM;
 
 /// The sizes of a [`UNet1D`](super::UNet1D).
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct UNetConfig {
     /// Channels of the noisy motion.
     pub in_channels: usize,
@@ -35,7 +37,8 @@ pub struct UNetConfig {
 }
 
 /// A size with a name.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Preset {
     /// For tests.
     Tiny,
@@ -93,5 +96,133 @@ impl UNetConfig {
     /// Returns the heads of attention at a width.
     pub fn heads(&self, width: usize) -> usize {
         self.num_head_channels.map_or(self.num_heads, |channels| width / channels)
+    }
+
+    /// Refuses sizes of which no network can be made.
+    ///
+    /// # Errors
+    /// One sentence: the number, what it must be, and why.
+    pub fn check(&self) -> Result<(), ConfigError> {
+        let refuse = |what: String| Err(ConfigError(what));
+        if self.widths.is_empty() || self.widths.contains(&0) {
+            return refuse(format!(
+                "widths {:?}: a network has at least one level, and each at least one channel",
+                self.widths
+            ));
+        }
+        if self.widths.len() > MAX_LEVELS {
+            let n = self.widths.len();
+            return refuse(format!(
+                "widths: {n} levels halve the frames {} times; use at most {MAX_LEVELS}",
+                n - 1
+            ));
+        }
+        for (name, value) in [
+            ("in_channels", self.in_channels),
+            ("out_channels", self.out_channels),
+            ("num_res_blocks", self.num_res_blocks),
+            ("num_heads", self.num_heads),
+            ("audio_cond_dim", self.audio_cond_dim),
+            ("context_dim", self.context_dim),
+            ("n_steps", self.n_steps),
+        ] {
+            if value == 0 {
+                return refuse(format!("{name} is 0; it must be at least 1"));
+            }
+        }
+        if self.time_embed_dim == 0 || !self.time_embed_dim.is_multiple_of(2) {
+            return refuse(format!(
+                "time_embed_dim is {}; it must be even and positive: half sines, half cosines",
+                self.time_embed_dim
+            ));
+        }
+        if !(0.0..1.0).contains(&self.dropout) {
+            return refuse(format!("dropout is {}; it must lie in [0, 1)", self.dropout));
+        }
+        if let Some(level) = self.attention_levels.iter().find(|&&l| l >= self.widths.len()) {
+            return refuse(format!(
+                "attention_levels has level {level}, the network levels 0 to {}; leave it out",
+                self.widths.len() - 1
+            ));
+        }
+        // The bottleneck attends whatever the levels do.
+        let last = self.widths.len() - 1;
+        let decoder = (1..last).filter(|level| self.attention_levels.contains(level));
+        let outputs = decoder.map(|level| self.widths[level - 1]);
+        let levels = self.attention_levels.iter().map(|&level| self.widths[level]);
+        for width in levels.chain(outputs).chain([self.widths[last]]) {
+            let heads = self.heads(width);
+            if heads == 0 || !width.is_multiple_of(heads) {
+                return refuse(format!(
+                    "a width of {width} does not divide into {heads} heads of attention; change \
+                     num_heads, num_head_channels or the width"
+                ));
+            }
+            if self.num_head_channels.is_some_and(|channels| channels * heads != width) {
+                return refuse(format!(
+                    "a width of {width} does not divide into heads of {} channels; change \
+                     num_head_channels or the width",
+                    width / heads
+                ));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// More levels would need phrases of thousands of frames.
+const MAX_LEVELS: usize = 10;
+
+/// Sizes of which no network can be made.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct ConfigError(pub String);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn presets_are_sound() {
+        for preset in Preset::ALL {
+            assert_eq!(preset.config().check(), Ok(()), "{}", preset.name());
+        }
+    }
+
+    #[test]
+    fn what_no_network_can_be_made_of_is_refused_in_a_sentence() {
+        let refusal = |change: fn(&mut UNetConfig)| {
+            let mut config = Preset::Tiny.config();
+            change(&mut config);
+            config.check().expect_err("unsound").to_string()
+        };
+        assert_eq!(
+            refusal(|c| c.widths = vec![]),
+            "widths []: a network has at least one level, and each at least one channel"
+        );
+        assert_eq!(
+            refusal(|c| c.widths = vec![8; 11]),
+            "widths: 11 levels halve the frames 10 times; use at most 10"
+        );
+        assert_eq!(refusal(|c| c.num_res_blocks = 0), "num_res_blocks is 0; it must be at least 1");
+        assert_eq!(
+            refusal(|c| c.time_embed_dim = 33),
+            "time_embed_dim is 33; it must be even and positive: half sines, half cosines"
+        );
+        assert_eq!(refusal(|c| c.dropout = 1.0), "dropout is 1; it must lie in [0, 1)");
+        assert_eq!(
+            refusal(|c| c.attention_levels = vec![1, 3]),
+            "attention_levels has level 3, the network levels 0 to 2; leave it out"
+        );
+        assert_eq!(
+            refusal(|c| c.num_heads = 5),
+            "a width of 48 does not divide into 5 heads of attention; change num_heads, \
+             num_head_channels or the width"
+        );
+        assert_eq!(
+            refusal(|c| c.num_head_channels = Some(20)),
+            "a width of 48 does not divide into heads of 24 channels; change num_head_channels or \
+             the width"
+        );
     }
 }

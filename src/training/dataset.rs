@@ -1,0 +1,393 @@
+//! Phrases to learn from: read once from the tables of a store, then at hand in any order.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::num::NonZeroUsize;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use ndarray::Array2;
+
+use crate::audio::FEATURE_DIM;
+use crate::motion::{MOTION_DIM, Trajectory, TrajectoryError};
+use crate::store::tables::{self, PhraseRow};
+use crate::store::{
+    FrameSpool, Location, Patience, Row as _, Snapshot, StoreError, TableSchema, digest,
+};
+
+/// Motion and features of one phrase may differ by this much: ingest lets a frame pass, the last frame of
+/// features is centred on the end of the audio, and both lengths are rounded.
+const LENGTH_TOLERANCE_FRAMES: usize = 3;
+
+/// What a phrase is used for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Split {
+    Train,
+    Validation,
+    Test,
+}
+
+impl Split {
+    /// Returns the split that the table of phrases calls `name`.
+    pub fn of_name(name: &str) -> Option<Self> {
+        [Self::Train, Self::Validation, Self::Test].into_iter().find(|split| split.name() == name)
+    }
+
+    /// Returns the name that the table of phrases uses.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Train => "train",
+            Self::Validation => "validation",
+            Self::Test => "test",
+        }
+    }
+}
+
+/// A phrase that is at hand.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Phrase {
+    pub id: Arc<str>,
+    pub split: Split,
+    pub n_frames: usize,
+    motion_row: u64,
+    feature_row: u64,
+}
+
+/// A phrase that cannot be learned from, and why.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LeftOut {
+    pub phrase_id: String,
+    pub kind: &'static str,
+    pub message: String,
+}
+
+/// How phrases are read.
+#[derive(Clone, Debug)]
+pub struct Reading {
+    /// Whether frames are kept in memory rather than in a temporary file.
+    pub in_memory: bool,
+    pub n_threads: NonZeroUsize,
+    /// How long a store that does not answer is waited for.
+    pub patience: Patience,
+    /// Most training phrases; the same ones whatever else the store holds.
+    pub max_train_phrases: Option<usize>,
+}
+
+/// Phrases with their motion and features, in order of name.
+#[derive(Debug)]
+pub struct Dataset {
+    phrases: Vec<Phrase>,
+    motion: FrameSpool,
+    features: FrameSpool,
+    fingerprint: String,
+}
+
+/// Why there is nothing to learn from.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum DatasetError {
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    #[error(
+        "store {store} has no phrases with both motion and features; run ingest and extract (or library) \
+         on it first"
+    )]
+    Empty { store: String },
+    #[error(
+        "store {store}: split {split} is empty ({n_train} train, {n_validation} validation phrases); {way_out}"
+    )]
+    EmptySplit {
+        store: String,
+        split: &'static str,
+        n_train: usize,
+        n_validation: usize,
+        way_out: &'static str,
+    },
+}
+
+/// What one table gave of a phrase.
+struct Found {
+    row: u64,
+    n_frames: usize,
+    digest: String,
+}
+
+/// Frames of one table by phrase, or why they are of no use.
+type Gathered = BTreeMap<String, Result<Found, LeftOut>>;
+
+impl Dataset {
+    /// Reads all phrases with motion and features.
+    ///
+    /// Phrases that should have both but do not, or whose frames are not sound, are returned as left
+    /// out; phrases that never had music (captures) or never had motion (songs) are none of either.
+    /// `notice` hears of every failure of the store that is waited out; `progress` of each part read.
+    ///
+    /// # Errors
+    /// [`DatasetError`] when the store cannot be read or has no such phrases.
+    pub fn read(
+        store: &Location,
+        reading: &Reading,
+        notice: &(dyn Fn(&StoreError, Duration) + Sync),
+        progress: &(dyn Fn(usize, usize) + Sync),
+    ) -> Result<(Self, Vec<LeftOut>), DatasetError> {
+        let wait = |error: &StoreError, pause| notice(error, pause);
+        let take = |schema: fn() -> TableSchema| {
+            reading.patience.wait_out(wait, || Snapshot::take(store, schema()))
+        };
+        let rows: Vec<PhraseRow> = {
+            let snapshot = take(PhraseRow::schema)?;
+            reading.patience.wait_out(wait, || snapshot.rows())?
+        };
+        let rows: BTreeMap<String, PhraseRow> = rows
+            .into_iter()
+            .filter(|row| row.has_motion)
+            .map(|row| (row.phrase_id.clone(), row))
+            .collect();
+        let wanted: BTreeSet<String> = rows.keys().cloned().collect();
+        let spool = |width| match reading.in_memory {
+            true => Ok(FrameSpool::in_memory(width)),
+            false => FrameSpool::in_file(width),
+        };
+        let (motion, features) = (spool(MOTION_DIM)?, spool(FEATURE_DIM)?);
+        let tables = [take(tables::motion)?, take(tables::features)?];
+        let n_parts = tables.iter().map(|table| table.parts().len()).sum();
+        let n_read = AtomicUsize::new(0);
+        let count = || progress(n_read.fetch_add(1, Ordering::Relaxed) + 1, n_parts);
+        let [with_motion, with_features] = [(&tables[0], &motion), (&tables[1], &features)]
+            .map(|(table, spool)| gather(table, spool, &wanted, reading, notice, &count));
+        let (mut with_motion, mut with_features) = (with_motion?, with_features?);
+
+        let (mut phrases, mut left_out, mut digests) = (Vec::new(), Vec::new(), Vec::new());
+        for (id, row) in rows {
+            let pair = (with_motion.remove(&id), with_features.remove(&id));
+            let found = match pair {
+                (Some(Ok(motion)), Some(Ok(features))) => (motion, features),
+                (Some(Err(why)), _) | (_, Some(Err(why))) => {
+                    left_out.push(why);
+                    continue;
+                }
+                (Some(Ok(_)), None) if !row.has_audio && !row.has_features => continue,
+                (motion, _) => {
+                    let (kind, message) = match motion {
+                        None => ("no_motion", "has no motion in the table; ingest it again"),
+                        Some(_) => ("no_features", "has motion but no features; run extract"),
+                    };
+                    let message = format!("phrase {id} {message}");
+                    left_out.push(LeftOut { phrase_id: id, kind, message });
+                    continue;
+                }
+            };
+            let (motion, features) = found;
+            if motion.n_frames.abs_diff(features.n_frames) > LENGTH_TOLERANCE_FRAMES {
+                let message = format!(
+                    "phrase {id}: motion has {} frames but features have {}; they may differ by \
+                     {LENGTH_TOLERANCE_FRAMES}",
+                    motion.n_frames, features.n_frames
+                );
+                left_out.push(LeftOut { phrase_id: id, kind: "length_mismatch", message });
+                continue;
+            }
+            let Some(split) = Split::of_name(&row.split) else {
+                let message = format!(
+                    "phrase {id} is in split {:?}; known are train, validation and test",
+                    row.split
+                );
+                left_out.push(LeftOut { phrase_id: id, kind: "split", message });
+                continue;
+            };
+            digests.push(format!("{id}\n{}\n{}\n{}", row.split, motion.digest, features.digest));
+            phrases.push(Phrase {
+                id: id.into(),
+                split,
+                n_frames: motion.n_frames.min(features.n_frames),
+                motion_row: motion.row,
+                feature_row: features.row,
+            });
+        }
+        if let Some(most) = reading.max_train_phrases {
+            keep_train(&mut phrases, &mut digests, most);
+        }
+        if phrases.is_empty() {
+            return Err(DatasetError::Empty { store: store.to_string() });
+        }
+        let fingerprint = digest(digests.join("\n").as_bytes());
+        Ok((Self { phrases, motion, features, fingerprint }, left_out))
+    }
+
+    /// Refuses a dataset without training or validation phrases.
+    ///
+    /// # Errors
+    /// [`DatasetError::EmptySplit`].
+    pub fn check_splits(&self, store: &str) -> Result<(), DatasetError> {
+        let [n_train, n_validation] = [Split::Train, Split::Validation].map(|s| self.n_in(s));
+        let (split, way_out) = match (n_train, n_validation) {
+            (0, _) => ("train", "a store of a handful of phrases may have none: ingest more"),
+            (_, 0) => (
+                "validation",
+                "without it nobody can tell what was learned: ingest more phrases, or build a library \
+                 from at least three songs",
+            ),
+            _ => return Ok(()),
+        };
+        let store = store.to_owned();
+        Err(DatasetError::EmptySplit { store, split, n_train, n_validation, way_out })
+    }
+
+    /// Returns all phrases, in order of name.
+    pub fn phrases(&self) -> &[Phrase] {
+        &self.phrases
+    }
+
+    /// Returns how many phrases a split has.
+    pub fn n_in(&self, split: Split) -> usize {
+        self.phrases.iter().filter(|phrase| phrase.split == split).count()
+    }
+
+    /// Returns a digest of everything there is to learn from: names, splits, motion and features.
+    pub fn fingerprint(&self) -> &str {
+        &self.fingerprint
+    }
+
+    /// Returns frames of motion of a phrase, `[n_frames, 25]`.
+    ///
+    /// # Errors
+    /// [`StoreError`] when the frames at hand cannot be read.
+    pub fn motion(
+        &self,
+        phrase: &Phrase,
+        first: usize,
+        n_frames: usize,
+    ) -> Result<Array2<f32>, StoreError> {
+        read(&self.motion, phrase.motion_row + first as u64, [n_frames, MOTION_DIM])
+    }
+
+    /// Returns frames of features of a phrase, `[n_frames, 163]`.
+    ///
+    /// # Errors
+    /// [`StoreError`] when the frames at hand cannot be read.
+    pub fn features(
+        &self,
+        phrase: &Phrase,
+        first: usize,
+        n_frames: usize,
+    ) -> Result<Array2<f32>, StoreError> {
+        read(&self.features, phrase.feature_row + first as u64, [n_frames, FEATURE_DIM])
+    }
+}
+
+fn read(spool: &FrameSpool, first: u64, shape: [usize; 2]) -> Result<Array2<f32>, StoreError> {
+    let mut frames = Array2::zeros(shape);
+    spool.read(first, frames.as_slice_mut().expect("new arrays lie in order"))?;
+    Ok(frames)
+}
+
+/// Keeps the `most` training phrases whose names have the smallest digests, which is no order that
+/// names or sources have.
+fn keep_train(phrases: &mut Vec<Phrase>, digests: &mut Vec<String>, most: usize) {
+    let mut order: Vec<_> = phrases
+        .iter()
+        .filter(|phrase| phrase.split == Split::Train)
+        .map(|phrase| (digest(phrase.id.as_bytes()), Arc::clone(&phrase.id)))
+        .collect();
+    order.sort();
+    let kept: BTreeSet<_> = order.into_iter().take(most).map(|(_, id)| id).collect();
+    let keeps: Vec<bool> = phrases
+        .iter()
+        .map(|phrase| phrase.split != Split::Train || kept.contains(&phrase.id))
+        .collect();
+    let mut keep = keeps.iter();
+    phrases.retain(|_| keep.next() == Some(&true));
+    let mut keep = keeps.iter();
+    digests.retain(|_| keep.next() == Some(&true));
+}
+
+/// Reads the wanted phrases of a frame table into a spool, parts side by side.
+fn gather(
+    table: &Snapshot,
+    spool: &FrameSpool,
+    wanted: &BTreeSet<String>,
+    reading: &Reading,
+    notice: &(dyn Fn(&StoreError, Duration) + Sync),
+    count: &(dyn Fn() + Sync),
+) -> Result<Gathered, StoreError> {
+    let next = AtomicUsize::new(0);
+    let all = Mutex::new(Gathered::new());
+    let failed: Mutex<Option<StoreError>> = Mutex::new(None);
+    let lock = |all: &Mutex<Gathered>, found: Gathered| {
+        all.lock().unwrap_or_else(PoisonError::into_inner).extend(found);
+    };
+    let work = || {
+        loop {
+            let i = next.fetch_add(1, Ordering::Relaxed);
+            if i >= table.parts().len() {
+                return;
+            }
+            let part = table.part(i);
+            // A part that breaks off is read again from its beginning: what it left in the spool is
+            // never looked at.
+            let outcome = reading.patience.wait_out(notice, || {
+                let mut found = Gathered::new();
+                part.visit_items(wanted, |id, frames| {
+                    let one = keep(id, &frames, spool)?;
+                    found.insert(id.to_owned(), one);
+                    Ok::<_, StoreError>(())
+                })?;
+                Ok(found)
+            });
+            match outcome {
+                Ok(found) => lock(&all, found),
+                Err(error) => {
+                    next.store(table.parts().len(), Ordering::Relaxed);
+                    *failed.lock().unwrap_or_else(PoisonError::into_inner) = Some(error);
+                    return;
+                }
+            }
+            count();
+        }
+    };
+    std::thread::scope(|scope| {
+        for _ in 0..reading.n_threads.get().min(table.parts().len()) {
+            scope.spawn(work);
+        }
+    });
+    match failed.into_inner().unwrap_or_else(PoisonError::into_inner) {
+        Some(error) => Err(error),
+        None => Ok(all.into_inner().unwrap_or_else(PoisonError::into_inner)),
+    }
+}
+
+/// Puts frames into the spool, unless they are not sound.
+fn keep(
+    id: &str,
+    frames: &Array2<f32>,
+    spool: &FrameSpool,
+) -> Result<Result<Found, LeftOut>, StoreError> {
+    if let Err((kind, what)) = check(frames) {
+        let message = format!("phrase {id}: {what}");
+        return Ok(Err(LeftOut { phrase_id: id.to_owned(), kind, message }));
+    }
+    let values = frames.as_slice().expect("frames are gathered in order");
+    let bytes: Vec<u8> = values.iter().flat_map(|x| x.to_le_bytes()).collect();
+    let row = spool.append(frames.view())?;
+    Ok(Ok(Found { row, n_frames: frames.nrows(), digest: digest(&bytes) }))
+}
+
+/// Refuses frames that are not finite; those of motion are checked as ingest does, because a table may
+/// have been written by another program.
+fn check(frames: &Array2<f32>) -> Result<(), (&'static str, String)> {
+    if frames.ncols() == MOTION_DIM {
+        let sound = |frames: &Array2<f32>| -> Result<(), TrajectoryError> {
+            Trajectory::new(frames.clone())?.check(&crate::motion::ChannelLimits::Wide)
+        };
+        return sound(frames).map_err(|e| (e.kind(), e.to_string()));
+    }
+    match frames.indexed_iter().find(|(_, x)| !x.is_finite()) {
+        None => Ok(()),
+        Some(((frame, column), value)) => {
+            let name = crate::audio::feature_names().nth(column).map(|(name, _)| name);
+            let name = name.unwrap_or_default();
+            let what = format!("feature {name} is {value} at frame {frame}; extract it again");
+            Err(("non_finite", what))
+        }
+    }
+}

@@ -1,0 +1,308 @@
+//! Windows of phrases, ready to learn from: cropped, augmented, placed at the origin, normalised.
+
+use std::sync::Arc;
+
+use ndarray::{Array2, s};
+use serde::{Deserialize, Serialize};
+
+use crate::audio::FEATURE_DIM;
+use crate::autodiff::Stream;
+use crate::motion::augment::{
+    mirror_x, rotate_yaw, stretch_features, stretch_motion, stretched_frames,
+};
+use crate::motion::style::STYLE_DIM;
+use crate::motion::{Channel, MOTION_DIM, Normalizer, Placement};
+use crate::store::StoreError;
+
+use super::dataset::{Dataset, Phrase, Split};
+
+/// What makes more of each phrase; zero and false leave it as it is.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Augmentation {
+    /// Standard deviation of the noise added to features, which lie in about 0 to 1 (MFCC in ± 3).
+    pub condition_noise: f64,
+    /// Whether every other window, by chance, is mirrored in x.
+    pub mirror: bool,
+    /// Largest turn about the vertical, in degrees, either way.
+    pub yaw_deg: f64,
+    /// Largest change of speed: rates are uniform in 1 ± this.
+    pub stretch: f64,
+}
+
+impl Default for Augmentation {
+    fn default() -> Self {
+        Self { condition_noise: 0.02, mirror: true, yaw_deg: 0.0, stretch: 0.0 }
+    }
+}
+
+/// Windows side by side.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Batch {
+    pub n_windows: usize,
+    pub n_frames: usize,
+    /// Normalised motion, `[n_windows, n_frames, 25]`; beyond a phrase's end its last frame is held.
+    pub motion: Vec<f32>,
+    /// Features, `[n_windows, n_frames, 163]`, held likewise.
+    pub audio: Vec<f32>,
+    /// 1 for frames of the phrase and 0 for held ones, `[n_windows, n_frames]`.
+    pub mask: Vec<f32>,
+    /// Mean of the normalised style channels, `[n_windows, 8]`.
+    pub style: Vec<f32>,
+    pub phrase_ids: Vec<Arc<str>>,
+}
+
+impl Batch {
+    fn empty(n_windows: usize, n_frames: usize) -> Self {
+        let zeros = |width: usize| Vec::with_capacity(n_windows * n_frames * width);
+        Self {
+            n_windows: 0,
+            n_frames,
+            motion: zeros(MOTION_DIM),
+            audio: zeros(FEATURE_DIM),
+            mask: zeros(1),
+            style: Vec::with_capacity(n_windows * STYLE_DIM),
+            phrase_ids: Vec::with_capacity(n_windows),
+        }
+    }
+
+    /// Returns some windows of the batch.
+    ///
+    /// # Panics
+    /// When it has fewer.
+    pub fn windows(&self, range: std::ops::Range<usize>) -> Self {
+        let part = |values: &[f32]| {
+            let width = values.len() / self.n_windows;
+            values[range.start * width..range.end * width].to_vec()
+        };
+        Self {
+            n_windows: range.len(),
+            n_frames: self.n_frames,
+            motion: part(&self.motion),
+            audio: part(&self.audio),
+            mask: part(&self.mask),
+            style: part(&self.style),
+            phrase_ids: self.phrase_ids[range.clone()].to_vec(),
+        }
+    }
+}
+
+/// Cuts windows out of the phrases of a dataset.
+#[derive(Debug)]
+pub struct Windows {
+    dataset: Arc<Dataset>,
+    normalizer: Normalizer,
+    augmentation: Augmentation,
+    n_frames: usize,
+    seed: u64,
+    /// Training windows of an epoch: the phrase of each; longer phrases have several.
+    train: Vec<u32>,
+    /// Validation windows: phrase and first frame.
+    validation: Vec<(u32, u32)>,
+}
+
+/// Streams of random numbers, told apart by their use.
+const ORDER: u64 = 1 << 60;
+const CROP: u64 = 2 << 60;
+const NOISE: u64 = 3 << 60;
+
+/// Numbers drawn for each window before its noise.
+const N_DRAWN: usize = 4;
+
+impl Windows {
+    /// Makes windows of `n_frames` frames.
+    pub fn new(
+        dataset: Arc<Dataset>,
+        normalizer: Normalizer,
+        augmentation: Augmentation,
+        n_frames: usize,
+        seed: u64,
+    ) -> Self {
+        let (mut train, mut validation) = (Vec::new(), Vec::new());
+        for (i, phrase) in dataset.phrases().iter().enumerate() {
+            let i = i as u32;
+            let n_windows = (phrase.n_frames / n_frames).max(1);
+            match phrase.split {
+                Split::Train => train.extend(std::iter::repeat_n(i, n_windows)),
+                Split::Validation => {
+                    validation.extend((0..n_windows).map(|k| (i, (k * n_frames) as u32)));
+                }
+                Split::Test => {}
+            }
+        }
+        Self { dataset, normalizer, augmentation, n_frames, seed, train, validation }
+    }
+
+    pub fn dataset(&self) -> &Dataset {
+        &self.dataset
+    }
+
+    pub fn normalizer(&self) -> &Normalizer {
+        &self.normalizer
+    }
+
+    /// Returns how many windows an epoch has.
+    pub fn n_train(&self) -> usize {
+        self.train.len()
+    }
+
+    /// Returns how many validation windows there are.
+    pub fn n_validation(&self) -> usize {
+        self.validation.len()
+    }
+
+    /// Returns which phrase each window of an epoch is of: the same for anyone who asks.
+    ///
+    /// Fisher and Yates; each swap takes its number from the stream of the seed and epoch.
+    pub fn order(&self, epoch: u64) -> Vec<u32> {
+        let mut order = self.train.clone();
+        let mut numbers = vec![0.0_f64; order.len()];
+        Stream::new(self.seed, ORDER + epoch).uniform(0, &mut numbers);
+        for i in (1..order.len()).rev() {
+            order.swap(i, (numbers[i] * (i + 1) as f64) as usize);
+        }
+        order
+    }
+
+    /// Returns training windows, each by its number since training began and its phrase.
+    ///
+    /// # Errors
+    /// [`StoreError`] when the frames at hand cannot be read.
+    pub fn train(&self, windows: &[(u64, u32)]) -> Result<Batch, StoreError> {
+        let mut batch = Batch::empty(windows.len(), self.n_frames);
+        for &(number, phrase) in windows {
+            let phrase = &self.dataset.phrases()[phrase as usize];
+            let (motion, audio) = self.augmented(phrase, number)?;
+            self.push(&mut batch, phrase, motion, audio);
+        }
+        Ok(batch)
+    }
+
+    /// Returns validation windows as they are.
+    ///
+    /// # Errors
+    /// [`StoreError`] when the frames at hand cannot be read.
+    pub fn validation(&self, range: std::ops::Range<usize>) -> Result<Batch, StoreError> {
+        self.fixed(&self.validation[range])
+    }
+
+    /// Returns windows from given frames on, each a phrase and its first frame.
+    fn fixed(&self, windows: &[(u32, u32)]) -> Result<Batch, StoreError> {
+        let mut batch = Batch::empty(windows.len(), self.n_frames);
+        for &(phrase, first) in windows {
+            let phrase = &self.dataset.phrases()[phrase as usize];
+            let n = self.n_frames.min(phrase.n_frames - first as usize);
+            let motion = self.dataset.motion(phrase, first as usize, n)?;
+            let audio = self.dataset.features(phrase, first as usize, n)?;
+            self.push(&mut batch, phrase, placed(motion), audio);
+        }
+        Ok(batch)
+    }
+
+    /// Cuts a window by chance and changes it by chance.
+    fn augmented(
+        &self,
+        phrase: &Phrase,
+        number: u64,
+    ) -> Result<(Array2<f32>, Array2<f32>), StoreError> {
+        let stream = Stream::new(self.seed, CROP + number);
+        let mut drawn = [0.0_f64; N_DRAWN];
+        stream.uniform(0, &mut drawn);
+        let [crop, speed, turn, side] = drawn;
+        let Augmentation { condition_noise, mirror, yaw_deg, stretch } = self.augmentation;
+        let rate = 1.0 + stretch * (2.0 * speed - 1.0);
+        let is_stretched = stretch > 0.0 && phrase.n_frames > 4;
+        // Two frames more for the differences, and one for what lies between frames.
+        let n_wanted = if is_stretched {
+            ((self.n_frames + 1) as f64 * rate).ceil() as usize + 1
+        } else {
+            self.n_frames
+        };
+        let n = n_wanted.min(phrase.n_frames);
+        let first = (crop * (phrase.n_frames - n + 1) as f64) as usize;
+        let mut motion = self.dataset.motion(phrase, first, n)?;
+        let mut audio = self.dataset.features(phrase, first, n)?;
+        if is_stretched && let Ok(stretched) = stretch_motion(motion.view(), rate) {
+            let n = stretched.nrows().min(self.n_frames).min(stretched_frames(n, rate));
+            motion = stretched.slice(s![..n, ..]).to_owned();
+            audio = stretch_features(audio.view(), rate, n);
+        }
+        let mut motion = placed(motion);
+        if mirror && side < 0.5 {
+            mirror_x(motion.view_mut());
+        }
+        if yaw_deg > 0.0 {
+            rotate_yaw(&mut motion, (2.0 * turn - 1.0) * yaw_deg.to_radians());
+        }
+        if condition_noise > 0.0 {
+            let mut noise = vec![0.0_f32; audio.len()];
+            Stream::new(self.seed, NOISE + number).normal(0, &mut noise);
+            for (x, z) in audio.iter_mut().zip(noise) {
+                *x += condition_noise as f32 * z;
+            }
+        }
+        Ok((motion, audio))
+    }
+
+    /// Normalises a window and adds it to a batch, its last frame held to the end.
+    fn push(
+        &self,
+        batch: &mut Batch,
+        phrase: &Phrase,
+        mut motion: Array2<f32>,
+        audio: Array2<f32>,
+    ) {
+        let n = motion.nrows();
+        self.normalizer.normalize(motion.view_mut());
+        let rows = (0..self.n_frames).map(|t| t.min(n - 1));
+        for t in rows {
+            batch.motion.extend(motion.row(t));
+            batch.audio.extend(audio.row(t));
+        }
+        batch.mask.extend((0..self.n_frames).map(|t| if t < n { 1.0 } else { 0.0 }));
+        let style = motion.slice(s![.., Channel::Style.range()]);
+        batch.style.extend(style.columns().into_iter().map(|column| column.sum() / n as f32));
+        batch.phrase_ids.push(Arc::clone(&phrase.id));
+        batch.n_windows += 1;
+    }
+}
+
+/// Takes the placement of the first frame off.
+fn placed(mut motion: Array2<f32>) -> Array2<f32> {
+    if let Some(placement) = Placement::of_first(motion.view()) {
+        placement.remove(&mut motion);
+    }
+    motion
+}
+
+/// Most frames that a normalizer is fitted to; more say nothing new.
+const MAX_FITTED_FRAMES: usize = 1 << 20;
+
+/// Fits a normalizer to the training windows of a dataset; returns the names of constant channels too.
+///
+/// # Errors
+/// [`StoreError`] when the frames at hand cannot be read.
+///
+/// # Panics
+/// When there are no training phrases.
+pub fn fit_normalizer(
+    dataset: &Dataset,
+    n_frames: usize,
+) -> Result<(Normalizer, Vec<&'static str>), StoreError> {
+    let train = dataset.phrases().iter().filter(|phrase| phrase.split == Split::Train);
+    let windows: Vec<_> = train
+        .flat_map(|phrase| {
+            let n_windows = (phrase.n_frames / n_frames).max(1);
+            (0..n_windows).map(move |k| (phrase, k * n_frames))
+        })
+        .collect();
+    // Evenly over all phrases where there are more than enough.
+    let stride = (windows.len() * n_frames).div_ceil(MAX_FITTED_FRAMES).max(1);
+    let mut values = Vec::new();
+    for (phrase, first) in windows.into_iter().step_by(stride) {
+        let n = n_frames.min(phrase.n_frames - first);
+        values.extend(placed(dataset.motion(phrase, first, n)?));
+    }
+    let shape = (values.len() / MOTION_DIM, MOTION_DIM);
+    let frames = Array2::from_shape_vec(shape, values).expect("whole frames were gathered");
+    Ok(Normalizer::fit(frames.view()))
+}
