@@ -5,6 +5,7 @@
 pub mod audio;
 pub mod autodiff;
 pub mod cli;
+pub mod diffusion;
 pub mod model;
 pub mod motion;
 pub mod plot;

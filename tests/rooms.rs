@@ -4,10 +4,11 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Which rooms a room may use.
-const MAY_USE: [(&str, &[&str]); 10] = [
+const MAY_USE: [(&str, &[&str]); 11] = [
     ("units", &[]),
     ("audio", &["units"]),
     ("autodiff", &["model"]),
+    ("diffusion", &[]),
     ("model", &["audio", "motion"]),
     ("motion", &["units"]),
     ("plot", &["units"]),
