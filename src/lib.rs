@@ -11,5 +11,6 @@ pub mod motion;
 pub mod plot;
 pub mod stages;
 pub mod store;
+pub mod training;
 pub mod units;
 pub mod weights;

@@ -32,4 +32,4 @@ pub use parameters::{Gradients, Parameters, Plan, WeightShape};
 pub use random::Stream;
 pub use tape::{InputGradients, Tape};
 pub use tensor::Tensor;
-pub use threads::keep_awake;
+pub use threads::{Threads, keep_awake};

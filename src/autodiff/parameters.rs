@@ -15,6 +15,7 @@ use crate::model::{Parameter, ParameterId, ParameterList, Role};
 use super::arena::Arena;
 use super::element::Element;
 use super::kernel::{PANEL, pack_weight, packed_len, unpack_weight};
+use super::op::elementwise::update;
 use super::random::initial;
 
 /// Where each parameter lies.
@@ -172,6 +173,16 @@ impl<E: Element> Parameters<E> {
     /// Returns the values of one parameter in PyTorch's order.
     pub fn unpacked(&self, id: ParameterId) -> Vec<E> {
         self.plan.unpack(id, self.all())
+    }
+
+    /// Moves towards others by a share of the way: θ ← θ + share (other − θ).
+    ///
+    /// # Panics
+    /// When the others are of another network.
+    pub fn approach(&mut self, other: &Self, share: f64) {
+        let (share, other) = (E::from_f64(share), other.all());
+        assert_eq!(self.all().len(), other.len(), "parameters of one network");
+        update(self.all_mut(), other, move |x, y| x + share * (y - x));
     }
 }
 

@@ -1,7 +1,27 @@
 //! Threads that stay awake between operations.
 
+use std::num::NonZeroUsize;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
+
+/// Threads that share the work of operations.
+pub struct Threads(rayon::ThreadPool);
+
+impl Threads {
+    /// Starts threads.
+    ///
+    /// # Errors
+    /// When the system gives none.
+    pub fn start(n: NonZeroUsize) -> std::io::Result<Self> {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(n.get()).build();
+        pool.map(Self).map_err(std::io::Error::other)
+    }
+
+    /// Does work on them, awake from its beginning to its end; see [`keep_awake`].
+    pub fn run<R: Send>(&self, work: impl FnOnce() -> R + Send) -> R {
+        self.0.install(|| keep_awake(work))
+    }
+}
 
 /// How long to wait for the other threads to take part; those that are busy elsewhere are left alone.
 const PATIENCE: Duration = Duration::from_micros(200);

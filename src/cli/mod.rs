@@ -5,6 +5,7 @@
 
 mod config;
 mod exit;
+mod interrupt;
 mod log;
 mod progress;
 
@@ -20,6 +21,7 @@ use crate::stages::model::Model;
 use crate::stages::plot::Plot;
 #[cfg(feature = "query")]
 use crate::stages::query::Query;
+use crate::stages::train::Train;
 use crate::stages::{Stage, Summary};
 use progress::Bars;
 
@@ -42,6 +44,7 @@ fn entries() -> Vec<Entry> {
     vec![
         Entry::of::<Ingest>(),
         Entry::of::<Extract>(),
+        Entry::of::<Train>(),
         Entry::of::<Model>(),
         Entry::of::<Plot>(),
         #[cfg(feature = "query")]

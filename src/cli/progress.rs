@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressState, ProgressStyle};
 
+use super::interrupt;
 use crate::stages::Progress;
 
 /// Time between plain lines.
@@ -37,7 +38,10 @@ struct Count {
     /// What follows the rate.
     rate_unit: &'static str,
     done: u64,
+    /// Of those, how many were done before the counting began.
+    skipped: u64,
     total: u64,
+    said: String,
     started: Instant,
     last_line: Instant,
 }
@@ -67,7 +71,7 @@ impl Bars {
             Mode::Silent => {}
             Mode::Bar => {
                 let template = format!(
-                    "{what} {{wide_bar}} {{human_pos}}/{{human_len}} {unit} {{rate}} ETA {{eta}}"
+                    "{what} {{wide_bar}} {{human_pos}}/{{human_len}} {unit} {{rate}} ETA {{eta}} {{msg}}"
                 );
                 let style = ProgressStyle::with_template(&template)
                     .unwrap_or_else(|_| ProgressStyle::default_bar())
@@ -87,7 +91,9 @@ impl Bars {
                     unit: unit.to_owned(),
                     rate_unit,
                     done: 0,
+                    skipped: 0,
                     total,
+                    said: String::new(),
                     started: now,
                     last_line: now,
                 });
@@ -109,6 +115,17 @@ impl Progress for Bars {
         self.begin(what, "s of audio", total_s, "× real time");
     }
 
+    fn skip(&self, n: u64) {
+        let mut state = self.lock();
+        if let Some(bar) = &state.bar {
+            bar.set_position(n);
+            bar.reset_eta();
+        }
+        if let Some(count) = &mut state.count {
+            (count.done, count.skipped) = (count.done + n, count.skipped + n);
+        }
+    }
+
     #[expect(clippy::print_stderr, reason = "progress is for people, data for standard output")]
     fn advance(&self, n: u64) {
         let mut state = self.lock();
@@ -124,6 +141,27 @@ impl Progress for Bars {
         }
     }
 
+    fn say(&self, text: &str) {
+        let mut state = self.lock();
+        if let Some(bar) = &state.bar {
+            bar.set_message(text.to_owned());
+        }
+        if let Some(count) = &mut state.count {
+            text.clone_into(&mut count.said);
+        }
+    }
+
+    #[expect(clippy::print_stderr, reason = "notes are for people, data for standard output")]
+    fn note(&self, line: &str) {
+        if self.mode != Mode::Silent {
+            self.suspend(|| eprintln!("{line}"));
+        }
+    }
+
+    fn is_interrupted(&self) -> bool {
+        interrupt::is_asked_for()
+    }
+
     fn finish(&self) {
         let mut state = self.lock();
         if let Some(bar) = state.bar.take() {
@@ -135,10 +173,12 @@ impl Progress for Bars {
 
 impl Count {
     fn line(&self, elapsed: Duration) -> String {
-        let Count { what, unit, rate_unit, done, total, .. } = self;
-        let rate = *done as f64 / elapsed.as_secs_f64().max(1e-9);
+        let Count { what, unit, rate_unit, done, skipped, total, said, .. } = self;
+        let rate = (done - skipped) as f64 / elapsed.as_secs_f64().max(1e-9);
         let eta_s = total.saturating_sub(*done) as f64 / rate.max(1e-9);
-        format!("{what}: {done} of {total} {unit}, {rate:.1}{rate_unit}, ETA {}", duration(eta_s))
+        let said = if said.is_empty() { String::new() } else { format!(", {said}") };
+        let eta = duration(eta_s);
+        format!("{what}: {done} of {total} {unit}, {rate:.1}{rate_unit}, ETA {eta}{said}")
     }
 }
 
@@ -163,12 +203,18 @@ mod tests {
             unit: "phrases".into(),
             rate_unit: "/s",
             done: 300,
+            skipped: 0,
             total: 1200,
+            said: String::new(),
             started: now,
             last_line: now,
         };
         let line = count.line(Duration::from_secs(20));
         assert_eq!(line, "ingest: 300 of 1200 phrases, 15.0/s, ETA 1 min 0 s");
+        // What was done before the program began is no work of these 20 s.
+        let resumed = Count { done: 500, skipped: 200, said: "loss 0.5".into(), ..count };
+        let line = resumed.line(Duration::from_secs(20));
+        assert_eq!(line, "ingest: 500 of 1200 phrases, 15.0/s, ETA 47 s, loss 0.5");
         assert_eq!(duration(7384.0), "2 h 3 min");
         assert_eq!(duration(9.6), "10 s");
     }

@@ -8,6 +8,7 @@ pub mod model;
 pub mod plot;
 #[cfg(feature = "query")]
 pub mod query;
+pub mod train;
 
 use std::io::{self, Write};
 
@@ -44,8 +45,18 @@ pub trait Progress: Sync {
     fn start(&self, what: &str, unit: &str, total: u64);
     /// Starts counting `total` seconds of audio; the rate is a multiple of real time.
     fn start_audio(&self, what: &str, total_s: u64);
+    /// Counts `n` that were done before, which say nothing about how fast the rest goes.
+    fn skip(&self, n: u64);
     /// Counts `n` more.
     fn advance(&self, n: u64);
+    /// Says something beside the count, for as long as nothing else is said.
+    fn say(&self, text: &str);
+    /// Says something that stays.
+    fn note(&self, line: &str);
+    /// Returns whether the user asked for an end (Ctrl-C, or a signal to terminate). Who asks gets a
+    /// chance to finish what is under way: until the first call such a signal ends the program at once,
+    /// and a second one always does.
+    fn is_interrupted(&self) -> bool;
     /// Ends the counting.
     fn finish(&self);
 }
@@ -57,7 +68,13 @@ pub struct Silent;
 impl Progress for Silent {
     fn start(&self, _what: &str, _unit: &str, _total: u64) {}
     fn start_audio(&self, _what: &str, _total_s: u64) {}
+    fn skip(&self, _n: u64) {}
     fn advance(&self, _n: u64) {}
+    fn say(&self, _text: &str) {}
+    fn note(&self, _line: &str) {}
+    fn is_interrupted(&self) -> bool {
+        false
+    }
     fn finish(&self) {}
 }
 

@@ -87,6 +87,43 @@ rows! {
     }
 }
 
+rows! {
+    "One row per training step, epoch and validation of a run."
+    TrainingLogRow in "training_log" version 1 sorted by [segment, step]
+    {
+        segment: String, "", "The stretch of the log, from one checkpoint to the next: `run/stage/` and the steps done before it.";
+        run: String, "", "Name of the run.";
+        stage: String, "", "`diffusion` (the UNet), `decoder` or `finetune` (both, end to end).";
+        kind: String, "", "`step`, `epoch` (means over its steps) or `validation`.";
+        epoch: i32, "epochs", "Epoch, from 1.";
+        step: i64, "steps", "Steps done, this one included.";
+        learning_rate: Option<f64>, "", "Learning rate of the step; in finetune that of the UNet.";
+        lr_decoder: Option<f64>, "", "Learning rate of the decoder in finetune.";
+        loss: Option<f64>, "", "What is minimised; of a validation, with the weights that would be used (the average, in diffusion and decoder). None where it was not finite.";
+        loss_live: Option<f64>, "", "Of a validation: the loss of the weights themselves rather than their average.";
+        diffusion: Option<f64>, "", "Mean loss of the UNet's prediction.";
+        reconstruction: Option<f64>, "", "Mean squared error of decoded motion over all channels, in units of their spread.";
+        decoder_position: Option<f64>, "m²", "Mean squared error of decoded positions.";
+        decoder_quaternion: Option<f64>, "", "Mean squared error of decoded quaternions, of the nearer sign.";
+        velocity_coherence: Option<f64>, "", "10 ⟨(v − 30 Δp)²⟩ / 5².";
+        acceleration_coherence: Option<f64>, "", "5 ⟨(a − 30 Δv)²⟩ / 100².";
+        jerk: Option<f64>, "", "⟨‖30 Δa‖²⟩ / 50000².";
+        quaternion_delta: Option<f64>, "", "2 ⟨max(0.95 − |q · q'|, 0)⟩.";
+        phase_monotonic: Option<f64>, "", "Falls of the phase within bars, summed over a motion.";
+        position_smoothness: Option<f64>, "m", "⟨max(|Δp| − 0.5, 0)⟩.";
+        velocity_error: Option<f64>, "m/s", "Of a validation in finetune: mean |v − 30 Δp| of sampled and decoded motion.";
+        acceleration_error: Option<f64>, "m/s²", "Of a validation in finetune: mean |a − 30 Δv|.";
+        quaternion_pass_rate: Option<f64>, "", "Of a validation in finetune: share of sampled motions whose turns from frame to frame all keep |q · q'| ≥ 0.95.";
+        gradient_norm: Option<f64>, "", "Norm of the gradient before it was clipped.";
+        skipped: bool, "", "Whether the step was skipped because something was not finite.";
+        samples_per_s: Option<f64>, "1/s", "Windows learned from per second.";
+        data_wait_s: Option<f64>, "s", "How long the step waited for its batch.";
+        rss_bytes: Option<i64>, "bytes", "Memory of the process after the step.";
+        elapsed_s: f64, "s", "Time that the stage has trained, over all resumptions.";
+        time: TimestampUs, "", "When the row was made.";
+    }
+}
+
 /// Name of the feature table.
 pub const FEATURES: &str = "features";
 
@@ -159,6 +196,7 @@ pub fn all() -> Vec<TableSchema> {
         ExtractionRow::schema(),
         BeatRow::schema(),
         FailureRow::schema(),
+        TrainingLogRow::schema(),
     ]
 }
 

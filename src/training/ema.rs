@@ -1,12 +1,8 @@
 //! The average of the weights over training, which predicts better than any of them.
 
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::autodiff::{Element, Parameters};
-
-/// Numbers that one task averages.
-const CHUNK: usize = 1 << 16;
 
 /// The settings of an [`Ema`].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -59,14 +55,8 @@ impl<E: Element> Ema<E> {
             return;
         }
         let n = self.n_updates as f64;
-        let decay = E::from_f64(self.config.decay.min((1.0 + n) / (10.0 + n)));
-        let targets = self.average.all_mut().par_chunks_mut(CHUNK);
-        targets.zip(parameters.all().par_chunks(CHUNK)).for_each(|(average, now)| {
-            for (a, &x) in average.iter_mut().zip(now) {
-                // The form of the definition would leave a rounding behind where nothing changes.
-                *a += (E::ONE - decay) * (x - *a);
-            }
-        });
+        let decay = self.config.decay.min((1.0 + n) / (10.0 + n));
+        self.average.approach(parameters, 1.0 - decay);
         self.n_updates += 1;
     }
 }

@@ -57,7 +57,9 @@ mod tests {
         assert_eq!(rate.at(499, n), 1e-4);
         assert_eq!(rate.at(1000, n), 2e-4);
         // A quarter, half and three quarters of the way: (1 + cos πp) / 2.
-        for (step, share) in [(6000, 0.853_553_390_593_273_8), (11_000, 0.5), (16_000, 0.146_446_609_406_726_2)] {
+        for (step, share) in
+            [(6000, 0.853_553_390_593_273_8), (11_000, 0.5), (16_000, 0.146_446_609_406_726_2)]
+        {
             assert!((rate.at(step, n) / 2e-4 - share).abs() < 1e-12, "{step}");
         }
         assert!(rate.at(n - 1, n) < 2e-12);

@@ -54,12 +54,10 @@ impl Objective {
             return g.apply(Loss::new(self.cost()), &[prediction, target, &mask]);
         };
         let by_step = min_snr_weights(schedule, t, gamma).unwrap_or_else(|_| vec![1.0; t.len()]);
-        let weights: Vec<f64> = mask
-            .iter()
-            .enumerate()
-            .map(|(row, &w)| f64::from(w) * by_step[row / frames])
-            .collect();
-        let (total, n) = (weights.iter().sum::<f64>(), mask.iter().map(|&w| f64::from(w)).sum::<f64>());
+        let weights: Vec<f64> =
+            mask.iter().enumerate().map(|(row, &w)| f64::from(w) * by_step[row / frames]).collect();
+        let (total, n) =
+            (weights.iter().sum::<f64>(), mask.iter().map(|&w| f64::from(w)).sum::<f64>());
         let weights: Vec<_> = weights.into_iter().map(I::Element::from_f64).collect();
         let weights = g.constant(&prediction.shape()[..2], &weights);
         let loss = g.apply(Loss::new(self.cost()), &[prediction, target, &weights])?;
@@ -95,9 +93,8 @@ pub fn reconstruction<I: Interpreter>(
     let rows = decoded.shape()[..2].to_vec();
     let mask: Vec<_> = mask.iter().map(|&w| element(w)).collect();
     let mask = g.constant(&rows, &mask);
-    let squared = |g: &mut I, x: &Tensor<_>, y: &Tensor<_>| {
-        g.apply(Loss::new(Cost::Squared), &[x, y, &mask])
-    };
+    let squared =
+        |g: &mut I, x: &Tensor<_>, y: &Tensor<_>| g.apply(Loss::new(Cost::Squared), &[x, y, &mask]);
     // The same turn has two quaternions: the one on the side of the decoded one is meant.
     let q = Channel::Quaternion.range();
     let mut wanted = motion.to_vec();

@@ -113,7 +113,9 @@ pub fn temporal_losses<I: Interpreter>(
     let (batch, frames) = (motion.shape()[0], motion.shape()[1]);
     let pairs: Vec<I::Element> = mask
         .chunks_exact(frames.max(1))
-        .flat_map(|mask| mask.windows(2).map(|pair| I::Element::from_f64((pair[0] * pair[1]).into())))
+        .flat_map(|mask| {
+            mask.windows(2).map(|pair| I::Element::from_f64((pair[0] * pair[1]).into()))
+        })
         .collect();
     let n_pairs: f64 = pairs.iter().map(|w| w.to_f64()).sum();
     let pairs = g.constant(&[batch, frames.saturating_sub(1)], &pairs);
@@ -121,7 +123,8 @@ pub fn temporal_losses<I: Interpreter>(
     let tail = g.apply(TakeFrames::inner(1, 0), &[motion])?;
     let difference = g.apply(Binary::new(Pair::Subtract), &[&tail, &head])?;
 
-    let [p, v, a] = [Channel::Position, Channel::Velocity, Channel::Acceleration].map(Channel::range);
+    let [p, v, a] =
+        [Channel::Position, Channel::Velocity, Channel::Acceleration].map(Channel::range);
     let derivative = |g: &mut I, range: std::ops::Range<usize>| {
         let change = g.channels(&difference, range)?;
         g.scale(&change, FPS)

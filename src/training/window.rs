@@ -48,7 +48,21 @@ pub struct Batch {
     pub mask: Vec<f32>,
     /// Mean of the normalised style channels, `[n_windows, 8]`.
     pub style: Vec<f32>,
+    /// Standard normal noise, `[n_windows, n_frames, 25]`.
+    pub noise: Vec<f32>,
+    pub chances: Vec<Chances>,
     pub phrase_ids: Vec<Arc<str>>,
+}
+
+/// What is decided by chance for each window, as numbers uniform in \[0, 1).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Chances {
+    /// How much noise is added: step ⌊u T⌋.
+    pub step: f64,
+    /// Whether the music is withheld.
+    pub no_audio: f64,
+    /// Whether the style is withheld.
+    pub no_style: f64,
 }
 
 impl Batch {
@@ -61,6 +75,8 @@ impl Batch {
             audio: zeros(FEATURE_DIM),
             mask: zeros(1),
             style: Vec::with_capacity(n_windows * STYLE_DIM),
+            noise: zeros(MOTION_DIM),
+            chances: Vec::with_capacity(n_windows),
             phrase_ids: Vec::with_capacity(n_windows),
         }
     }
@@ -81,6 +97,8 @@ impl Batch {
             audio: part(&self.audio),
             mask: part(&self.mask),
             style: part(&self.style),
+            noise: part(&self.noise),
+            chances: self.chances[range.clone()].to_vec(),
             phrase_ids: self.phrase_ids[range.clone()].to_vec(),
         }
     }
@@ -103,10 +121,13 @@ pub struct Windows {
 /// Streams of random numbers, told apart by their use.
 const ORDER: u64 = 1 << 60;
 const CROP: u64 = 2 << 60;
-const NOISE: u64 = 3 << 60;
+const AUDIO_NOISE: u64 = 3 << 60;
+const CHANCES: u64 = 4 << 60;
+const NOISE: u64 = 5 << 60;
+const VALIDATION_NOISE: u64 = 6 << 60;
 
-/// Numbers drawn for each window before its noise.
-const N_DRAWN: usize = 4;
+/// The golden ratio's fraction: multiples of it are spread evenly over \[0, 1), however many there are.
+const GOLDEN: f64 = 0.618_033_988_749_894_9;
 
 impl Windows {
     /// Makes windows of `n_frames` frames.
@@ -173,27 +194,38 @@ impl Windows {
             let phrase = &self.dataset.phrases()[phrase as usize];
             let (motion, audio) = self.augmented(phrase, number)?;
             self.push(&mut batch, phrase, motion, audio);
+            let mut drawn = [0.0_f64; 3];
+            Stream::new(self.seed, CHANCES + number).uniform(0, &mut drawn);
+            let [step, no_audio, no_style] = drawn;
+            batch.chances.push(Chances { step, no_audio, no_style });
+            push_noise(&mut batch, Stream::new(self.seed, NOISE + number));
         }
         Ok(batch)
     }
 
-    /// Returns validation windows as they are.
+    /// Returns validation windows as they are, counted on and on: after the last comes the first again,
+    /// with other noise and another step.
+    ///
+    /// The seed plays no part, so that runs can be compared; nothing is withheld, and steps are spread
+    /// evenly, so that few windows tell much.
     ///
     /// # Errors
     /// [`StoreError`] when the frames at hand cannot be read.
+    ///
+    /// # Panics
+    /// When there are no validation windows.
     pub fn validation(&self, range: std::ops::Range<usize>) -> Result<Batch, StoreError> {
-        self.fixed(&self.validation[range])
-    }
-
-    /// Returns windows from given frames on, each a phrase and its first frame.
-    fn fixed(&self, windows: &[(u32, u32)]) -> Result<Batch, StoreError> {
-        let mut batch = Batch::empty(windows.len(), self.n_frames);
-        for &(phrase, first) in windows {
+        let mut batch = Batch::empty(range.len(), self.n_frames);
+        for number in range {
+            let (phrase, first) = self.validation[number % self.validation.len()];
             let phrase = &self.dataset.phrases()[phrase as usize];
             let n = self.n_frames.min(phrase.n_frames - first as usize);
             let motion = self.dataset.motion(phrase, first as usize, n)?;
             let audio = self.dataset.features(phrase, first as usize, n)?;
             self.push(&mut batch, phrase, placed(motion), audio);
+            let step = ((number as f64 + 0.5) * GOLDEN).fract();
+            batch.chances.push(Chances { step, no_audio: 1.0, no_style: 1.0 });
+            push_noise(&mut batch, Stream::new(0, VALIDATION_NOISE + number as u64));
         }
         Ok(batch)
     }
@@ -204,9 +236,8 @@ impl Windows {
         phrase: &Phrase,
         number: u64,
     ) -> Result<(Array2<f32>, Array2<f32>), StoreError> {
-        let stream = Stream::new(self.seed, CROP + number);
-        let mut drawn = [0.0_f64; N_DRAWN];
-        stream.uniform(0, &mut drawn);
+        let mut drawn = [0.0_f64; 4];
+        Stream::new(self.seed, CROP + number).uniform(0, &mut drawn);
         let [crop, speed, turn, side] = drawn;
         let Augmentation { condition_noise, mirror, yaw_deg, stretch } = self.augmentation;
         let rate = 1.0 + stretch * (2.0 * speed - 1.0);
@@ -235,7 +266,7 @@ impl Windows {
         }
         if condition_noise > 0.0 {
             let mut noise = vec![0.0_f32; audio.len()];
-            Stream::new(self.seed, NOISE + number).normal(0, &mut noise);
+            Stream::new(self.seed, AUDIO_NOISE + number).normal(0, &mut noise);
             for (x, z) in audio.iter_mut().zip(noise) {
                 *x += condition_noise as f32 * z;
             }
@@ -264,6 +295,13 @@ impl Windows {
         batch.phrase_ids.push(Arc::clone(&phrase.id));
         batch.n_windows += 1;
     }
+}
+
+/// Adds the noise of one more window.
+fn push_noise(batch: &mut Batch, stream: Stream) {
+    let first = batch.noise.len();
+    batch.noise.resize(first + batch.n_frames * MOTION_DIM, 0.0);
+    stream.normal(0, &mut batch.noise[first..]);
 }
 
 /// Takes the placement of the first frame off.

@@ -91,7 +91,8 @@ impl<E: Element> Operation<E> for TakeFrames {
             }
             Choice::Inner { skip, drop } if skip + drop < frames => (skip..frames - drop).collect(),
             Choice::Inner { skip, drop } => {
-                let problem = format!("input has {frames} frames, all but {} asked for", skip + drop);
+                let problem =
+                    format!("input has {frames} frames, all but {} asked for", skip + drop);
                 return Err(GraphError::shape(self.name, problem));
             }
         };

@@ -1,0 +1,421 @@
+//! `train`: the UNet learns to remove noise from motion, then the decoder to make motion of latents.
+
+mod params;
+pub mod session;
+mod summary;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{bail, ensure};
+
+use super::{ClientParams, Contract, Progress, Stage, Summary};
+use crate::autodiff::{Arena, Parameters, Threads};
+use crate::diffusion::Schedule;
+use crate::model::UNet1D;
+use crate::motion::Normalizer;
+use crate::store::Location;
+use crate::training::{
+    Augmentation, Checkpoints, DecoderLearner, Denoiser, DiffusionLearner, Drive, End, Journal,
+    Kind, Learner, Loader, Plan, State, TrainConfig, TrainingError, Windows,
+};
+use session::{Looker, MachineParams, check_run_name, claim, normalizer, read_phrases};
+pub use summary::{Account, StageAccount};
+
+/// Share of a time budget that the decoder gets.
+const DECODER_SHARE: f64 = 0.1;
+
+/// The stage.
+pub struct Train;
+
+/// What the user asks for.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Params {
+    /// Folder or bucket of the tables; the run is written below it.
+    #[arg(long, value_name = "URL")]
+    pub store: String,
+    /// Name of the run; a run that exists is continued.
+    #[arg(long, value_name = "NAME")]
+    pub run: String,
+    /// Refuse to start a run that does not exist.
+    #[arg(long)]
+    pub resume: bool,
+    #[command(flatten)]
+    pub budget: BudgetParams,
+    #[command(flatten)]
+    pub config: params::ConfigParams,
+    #[command(flatten)]
+    pub machine: MachineParams,
+    #[command(flatten)]
+    pub client: ClientParams,
+    /// Seed of everything that is left to chance.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seed: u64,
+    /// Say what would be done, and do nothing.
+    #[arg(long)]
+    pub dry_run: bool,
+    /// Start the run anew: its checkpoints and its log are removed.
+    #[arg(long)]
+    pub force: bool,
+}
+
+/// When training ends, and what happens on the way.
+#[derive(Clone, Debug, clap::Args)]
+pub struct BudgetParams {
+    /// Times that the UNet sees all phrases [default: 100, without --steps and --minutes]
+    #[arg(long, value_name = "N", help_heading = "Budget")]
+    pub epochs: Option<u64>,
+    /// Steps of the UNet.
+    #[arg(long, value_name = "N", help_heading = "Budget")]
+    pub steps: Option<u64>,
+    /// Minutes that training may take, over all its resumptions; a tenth is the decoder's.
+    #[arg(long, value_name = "M", help_heading = "Budget")]
+    pub minutes: Option<f64>,
+    /// Steps of the decoder.
+    #[arg(long, value_name = "N", default_value_t = 2000, help_heading = "Budget")]
+    pub decoder_steps: u64,
+    /// Epochs from one validation to the next.
+    #[arg(long, value_name = "N", default_value_t = 5, help_heading = "Budget")]
+    pub validate_every: u64,
+    /// Validations without improvement after which training ends; 0 for never.
+    #[arg(long, value_name = "N", default_value_t = 0, help_heading = "Budget")]
+    pub patience: u64,
+    /// Epochs from one checkpoint to the next.
+    #[arg(long, value_name = "N", default_value_t = 10, help_heading = "Budget")]
+    pub save_every: u64,
+    /// Steps from one checkpoint to the next, beside --save-every.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..),
+          help_heading = "Budget")]
+    pub save_every_steps: Option<u64>,
+    /// Longest time between two checkpoints, in minutes.
+    #[arg(long, value_name = "M", default_value_t = 10.0, help_heading = "Budget")]
+    pub save_every_minutes: f64,
+}
+
+impl Stage for Train {
+    const NAME: &'static str = "train";
+    const ABOUT: &'static str = "train the UNet and the decoder on the phrases of a store";
+    const CONTRACT: Contract = Contract {
+        reads: "phrases, motion, features",
+        writes: "runs/<run>/ (checkpoints), training_log, failures",
+    };
+    type Params = Params;
+
+    fn run(params: Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
+        check_run_name(&params.run)?;
+        let config = params.config.config(params.seed);
+        config.network.check()?;
+        check_numbers(&params, &config)?;
+        let store = Location::open(&params.store, &params.client.options())?;
+        let watch = Looker(progress);
+        let mut run = Run { params: &params, config: &config, store: &store, watch: &watch };
+        let first = run.checkpoints(DiffusionLearner::STAGE);
+        ensure!(
+            !params.resume || !first.steps(Kind::Step)?.is_empty(),
+            "run {} has no checkpoint to resume from in {store}; leave --resume out to start it",
+            params.run
+        );
+        if params.dry_run {
+            return run.dry_run(progress);
+        }
+        if params.force {
+            run.clear()?;
+        }
+        let patience = params.machine.patience();
+        claim(&store, &params.run, Self::NAME, &config, patience, &watch)?;
+        run.train(progress)
+    }
+}
+
+fn check_numbers(params: &Params, config: &TrainConfig) -> anyhow::Result<()> {
+    let share = |flag: &str, x: f64| {
+        ensure!((0.0..1.0).contains(&x), "{flag} {x} is no share; give a number from 0 to below 1");
+        Ok(())
+    };
+    let d = &config.diffusion;
+    share("--condition-dropout", d.condition_dropout)?;
+    share("--style-dropout", d.style_dropout)?;
+    share("--time-stretch", d.augmentation.stretch)?;
+    share("--decoder-dropout", config.network.decoder.dropout)?;
+    let positive = |flag: &str, x: f64| {
+        ensure!(x > 0.0 && x.is_finite(), "{flag} {x} is not above 0; give a positive number");
+        Ok(())
+    };
+    positive("--learning-rate", d.learning_rate.peak)?;
+    positive("--decoder-learning-rate", config.decoder.learning_rate.peak)?;
+    positive("--save-every-minutes", params.budget.save_every_minutes)?;
+    params.budget.minutes.map_or(Ok(()), |minutes| positive("--minutes", minutes))?;
+    ensure!(
+        d.augmentation.condition_noise >= 0.0 && d.augmentation.yaw_deg >= 0.0,
+        "--condition-noise and --yaw-rotation may not be below 0"
+    );
+    Ok(())
+}
+
+/// A run of the stage.
+struct Run<'a> {
+    params: &'a Params,
+    config: &'a TrainConfig,
+    store: &'a Location,
+    watch: &'a Looker<'a>,
+}
+
+impl<'a> Run<'a> {
+    fn checkpoints(&self, stage: &str) -> Checkpoints<'a> {
+        Checkpoints::new(self.store, &self.params.run, stage)
+    }
+
+    fn journal(&self, stage: &'static str) -> anyhow::Result<Journal<'a>> {
+        Ok(Journal::open(self.store, Train::NAME, &self.params.run, stage)?)
+    }
+
+    /// Removes what the run has left, so that it can begin anew.
+    fn clear(&mut self) -> anyhow::Result<()> {
+        for stage in [DiffusionLearner::STAGE, DecoderLearner::STAGE, "finetune"] {
+            self.checkpoints(stage).clear()?;
+        }
+        for stage in [DiffusionLearner::STAGE, DecoderLearner::STAGE] {
+            self.journal(stage)?.clear()?;
+        }
+        Journal::open(self.store, "finetune", &self.params.run, "finetune")?.clear()?;
+        for command in [Train::NAME, "finetune"] {
+            self.store.remove(&format!("runs/{}/{command}.json", self.params.run))?;
+        }
+        Ok(())
+    }
+
+    fn dry_run(&self, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
+        let machine = &self.params.machine;
+        let phrases = read_phrases(self.store, Train::NAME, machine, None, progress, self.watch)?;
+        let n_frames = self.config.network.window_frames;
+        let windows = Windows::new(
+            phrases.dataset,
+            Normalizer::identity(),
+            Augmentation::default(),
+            n_frames,
+            0,
+        );
+        let (_, list) = UNet1D::new(&self.config.network.unet);
+        Ok(Box::new(summary::DryRun {
+            run: self.params.run.clone(),
+            n_train: windows.n_train(),
+            n_validation: windows.n_validation(),
+            n_left_out: phrases.left_out.len(),
+            n_parameters: list.n_elements(),
+            steps_per_epoch: windows.n_train().div_ceil(self.config.diffusion.batch_size),
+        }))
+    }
+
+    fn train(&mut self, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
+        let (params, config) = (self.params, self.config);
+        let phrases =
+            read_phrases(self.store, Train::NAME, &params.machine, None, progress, self.watch)?;
+        let threads = params.machine.start_threads()?;
+        let n_frames = config.network.window_frames;
+        let normalizer = normalizer(&phrases.dataset, n_frames, self.watch)?;
+        let windows = |augmentation: Augmentation| {
+            let (dataset, normalizer) = (Arc::clone(&phrases.dataset), normalizer.clone());
+            Arc::new(Windows::new(dataset, normalizer, augmentation, n_frames, params.seed))
+        };
+        let mut account = Account::new(&params.run, self.store, phrases.left_out.clone());
+
+        let augmented = windows(config.diffusion.augmentation.clone());
+        let mut learner =
+            DiffusionLearner::new(&config.network, &config.diffusion, &augmented, params.seed)?;
+        let end = self.stage(&mut learner, &augmented, &threads, &mut account)?;
+        drop(learner);
+        if end == End::Interrupted {
+            return Ok(Box::new(account.interrupted(&resume_command(params))));
+        }
+
+        let (unet, list) = UNet1D::new(&config.network.unet);
+        let weights = best_unet(&self.checkpoints(DiffusionLearner::STAGE), &params.run, list)?;
+        let arena = Arena::default();
+        let takes_style = config.network.unet.style_dim > 0;
+        let denoiser = Denoiser { unet: &unet, parameters: &weights, arena: &arena, takes_style };
+        let schedule = Schedule::new(&config.network.diffusion)?;
+        let augmented =
+            windows(Augmentation { condition_noise: 0.0, ..config.diffusion.augmentation.clone() });
+        let mut learner = DecoderLearner::new(
+            &config.network.decoder,
+            &config.decoder,
+            denoiser,
+            schedule,
+            &augmented,
+            params.seed,
+        );
+        let end = self.stage(&mut learner, &augmented, &threads, &mut account)?;
+        if end == End::Interrupted {
+            return Ok(Box::new(account.interrupted(&resume_command(params))));
+        }
+        Ok(Box::new(account))
+    }
+
+    /// Trains one network, from its newest checkpoint on.
+    fn stage<L: Learner>(
+        &self,
+        learner: &mut L,
+        windows: &Arc<Windows>,
+        threads: &Threads,
+        account: &mut Account,
+    ) -> anyhow::Result<End> {
+        let checkpoints = self.checkpoints(L::STAGE);
+        let plan = self.plan::<L>(windows);
+        let state = State::new(
+            L::STAGE,
+            self.config.clone(),
+            windows.dataset().fingerprint(),
+            windows.normalizer().clone(),
+        );
+        let state = restore(learner, &checkpoints, state, &self.params.run, self.watch)?;
+        let started_at = state.progress.step;
+        let mut drive = Drive {
+            plan,
+            state,
+            checkpoints,
+            journal: self.journal(L::STAGE)?,
+            watch: self.watch,
+            threads,
+        };
+        let machine = &self.params.machine;
+        let end = drive.run(learner, |first| {
+            Loader::start(windows, plan.batch_size as usize, first, machine.loader_threads)
+        })?;
+        account.add(StageAccount::of(L::STAGE, &drive.state.progress, started_at, end));
+        Ok(end)
+    }
+
+    fn plan<L: Learner>(&self, windows: &Windows) -> Plan {
+        let b = &self.params.budget;
+        let minutes = |m: f64| Duration::try_from_secs_f64(m * 60.0).unwrap_or(Duration::MAX);
+        let is_decoder = L::STAGE == DecoderLearner::STAGE;
+        let (n_steps, n_epochs, share, batch_size) = if is_decoder {
+            let steps = Some(b.decoder_steps);
+            (steps, None, DECODER_SHARE, self.config.decoder.batch_size)
+        } else {
+            let is_bounded = b.steps.is_some() || b.minutes.is_some();
+            let epochs = b.epochs.or_else(|| (!is_bounded).then_some(100));
+            (b.steps, epochs, 1.0 - DECODER_SHARE, self.config.diffusion.batch_size)
+        };
+        Plan {
+            n_steps,
+            n_epochs,
+            time: b.minutes.map(|m| minutes(share * m)),
+            windows_per_epoch: windows.n_train() as u64,
+            batch_size: batch_size as u64,
+            validate_every_epochs: b.validate_every,
+            save_every_epochs: b.save_every,
+            save_every_steps: b.save_every_steps,
+            save_every: minutes(b.save_every_minutes),
+            patience: (b.patience > 0).then_some(b.patience),
+            store_patience: self.params.machine.patience(),
+        }
+    }
+}
+
+/// Takes up the newest checkpoint that can be read, if there is one.
+///
+/// # Errors
+/// When it is of another configuration, of other data, or of another network.
+pub fn restore<L: Learner, C>(
+    learner: &mut L,
+    checkpoints: &Checkpoints,
+    fresh: State<C>,
+    run: &str,
+    watch: &Looker,
+) -> anyhow::Result<State<C>>
+where
+    C: serde::Serialize + serde::de::DeserializeOwned,
+{
+    use crate::training::Watch as _;
+    for step in checkpoints.steps(Kind::Step)?.into_iter().rev() {
+        let read = checkpoints.read(Kind::Step, step, |archive, place| {
+            let state = State::<C>::of(archive, place)?;
+            let differences = crate::training::differences(&fresh.config, &state.config);
+            if !differences.is_empty() {
+                return Err(TrainingError::OtherConfig { run: run.to_owned(), differences });
+            }
+            if state.data != fresh.data {
+                let short = |digest: &str| digest.chars().take(12).collect();
+                return Err(TrainingError::OtherData {
+                    run: run.to_owned(),
+                    known: short(&state.data),
+                    found: short(&fresh.data),
+                });
+            }
+            learner.restore(archive, place, &state.progress)?;
+            Ok(state)
+        });
+        match read {
+            Ok(state) => {
+                watch.note(&format!("{}: going on from step {step}", L::STAGE));
+                return Ok(state);
+            }
+            // A disk may have lost what it said it had written; the one before is as good.
+            Err(TrainingError::Weights { place, source }) if is_damaged(&source) => {
+                watch.note(&format!(
+                    "checkpoint {place} is damaged ({source}); taking an older one"
+                ));
+            }
+            Err(error) => bail!(error),
+        }
+    }
+    Ok(fresh)
+}
+
+fn is_damaged(error: &crate::weights::WeightsError) -> bool {
+    matches!(error, crate::weights::WeightsError::Format(_))
+}
+
+/// Reads the UNet of a run that validated best.
+///
+/// # Errors
+/// When there is none, or it is of another network.
+pub fn best_unet(
+    checkpoints: &Checkpoints,
+    run: &str,
+    list: crate::model::ParameterList,
+) -> Result<Parameters<f32>, TrainingError> {
+    best_section(checkpoints, run, "unet.", "trained UNet", list)
+}
+
+/// Reads weights of a run that validated best, by the beginning of their names.
+///
+/// # Errors
+/// When there are none, or they are of another network.
+pub fn best_section(
+    checkpoints: &Checkpoints,
+    run: &str,
+    prefix: &str,
+    what: &'static str,
+    list: crate::model::ParameterList,
+) -> Result<Parameters<f32>, TrainingError> {
+    let Some(&step) = checkpoints.steps(Kind::Best)?.last() else {
+        let way_out = format!("run motiongen train --run {run} to the end first");
+        return Err(TrainingError::Missing { run: run.to_owned(), what, way_out });
+    };
+    checkpoints.read(Kind::Best, step, |archive, place| {
+        let place = place.to_owned();
+        archive.section(prefix, list).map_err(|source| TrainingError::Weights { place, source })
+    })
+}
+
+/// Returns the command that goes on where this one stopped.
+fn resume_command(params: &Params) -> String {
+    let arguments: Vec<String> = std::env::args().collect();
+    let mut words: Vec<String> = arguments.iter().map(|word| quoted(word)).collect();
+    words.retain(|word| word != "--force");
+    if !params.resume {
+        words.push("--resume".to_owned());
+    }
+    words.join(" ")
+}
+
+/// Quotes a word for the shell where it needs it.
+pub fn quoted(word: &str) -> String {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./:=,@+%".contains(c);
+    if !word.is_empty() && word.chars().all(is_plain) {
+        return word.to_owned();
+    }
+    format!("'{}'", word.replace('\'', r"'\''"))
+}

@@ -1,0 +1,297 @@
+//! The flags of training, and the configuration that they make.
+
+use std::num::NonZeroUsize;
+
+use crate::diffusion::{BetaSchedule, DiffusionConfig, LossType, Prediction};
+use crate::model::{DecoderConfig, Preset, UNetConfig};
+use crate::motion::ChannelLimits;
+use crate::motion::style::STYLE_DIM;
+use crate::training::{
+    Augmentation, Course, DecoderTraining, DiffusionTraining, EmaConfig, LearningRate,
+    NetworkConfig, Objective, OptimizerConfig, TrainConfig,
+};
+
+/// Sizes of the networks; each wins over the preset.
+#[derive(Clone, Debug, clap::Args)]
+pub struct NetworkParams {
+    /// Size of the UNet.
+    #[arg(long, value_enum, default_value_t = Preset::Small, help_heading = "Networks")]
+    pub preset: Preset,
+    /// Channels of each level, 256,512,… [default: the preset's]
+    #[arg(long, value_name = "N", value_delimiter = ',', help_heading = "Networks")]
+    pub widths: Vec<usize>,
+    /// Residual blocks of a level [default: 2]
+    #[arg(long, value_name = "N", help_heading = "Networks")]
+    pub num_res_blocks: Option<usize>,
+    /// Levels that attend [default: all but the first]
+    #[arg(long, value_name = "LEVEL", value_delimiter = ',', help_heading = "Networks")]
+    pub attention_levels: Option<Vec<usize>>,
+    /// Heads of attention [default: the preset's]
+    #[arg(long, value_name = "N", help_heading = "Networks")]
+    pub num_heads: Option<usize>,
+    /// Channels of a head, instead of --num-heads
+    #[arg(long, value_name = "N", help_heading = "Networks")]
+    pub num_head_channels: Option<usize>,
+    /// Numbers of the time embedding [default: the preset's]
+    #[arg(long, value_name = "N", help_heading = "Networks")]
+    pub time_embed_dim: Option<usize>,
+    /// Channels of the music as attention sees it [default: the preset's]
+    #[arg(long, value_name = "N", help_heading = "Networks")]
+    pub context_dim: Option<usize>,
+    /// Share of the UNet's numbers that training drops [default: 0.1]
+    #[arg(long, value_name = "P", help_heading = "Networks")]
+    pub dropout: Option<f64>,
+    /// Compute inner values of the UNet again for their gradient: less memory, a third more time.
+    #[arg(long, help_heading = "Networks")]
+    pub use_checkpoint: bool,
+    /// Let the UNet take a style (the mean of the style channels) beside the music.
+    #[arg(long, help_heading = "Networks")]
+    pub style: bool,
+    /// Width of the decoder.
+    #[arg(long, value_name = "N", default_value_t = DecoderConfig::default().hidden_dim,
+          help_heading = "Networks")]
+    pub decoder_hidden_dim: usize,
+    /// Blocks of the decoder.
+    #[arg(long, value_name = "N", default_value_t = DecoderConfig::default().n_blocks,
+          help_heading = "Networks")]
+    pub decoder_blocks: usize,
+    /// Share of the decoder's numbers that training drops.
+    #[arg(long, value_name = "P", default_value_t = 0.0, help_heading = "Networks")]
+    pub decoder_dropout: f64,
+    /// Limits within which the decoder keeps velocities and accelerations.
+    #[arg(long, value_enum, default_value_t = ChannelLimits::Wide, help_heading = "Networks")]
+    pub limits: ChannelLimits,
+    /// Frames of a window, 30 a second.
+    #[arg(long, value_name = "N", default_value_t = 120, help_heading = "Networks")]
+    pub window_frames: usize,
+}
+
+/// The diffusion process.
+#[derive(Clone, Debug, clap::Args)]
+pub struct DiffusionParams {
+    /// Steps of the diffusion.
+    #[arg(long, value_name = "N", default_value_t = DiffusionConfig::default().n_steps,
+          help_heading = "Diffusion")]
+    pub timesteps: usize,
+    /// How noise grows from step to step.
+    #[arg(long, value_enum, default_value_t = DiffusionConfig::default().beta_schedule,
+          help_heading = "Diffusion")]
+    pub beta_schedule: BetaSchedule,
+    /// First noise of a linear or sqrt schedule.
+    #[arg(long, value_name = "X", default_value_t = DiffusionConfig::default().beta_start,
+          help_heading = "Diffusion")]
+    pub beta_start: f64,
+    /// Last noise of a linear or sqrt schedule.
+    #[arg(long, value_name = "X", default_value_t = DiffusionConfig::default().beta_end,
+          help_heading = "Diffusion")]
+    pub beta_end: f64,
+    /// What the UNet predicts.
+    #[arg(long, value_enum, default_value_t = DiffusionConfig::default().prediction,
+          help_heading = "Diffusion")]
+    pub prediction: Prediction,
+    /// Estimates of clean motion are kept within so many standard deviations; 0 for no limit.
+    #[arg(long, value_name = "X", default_value_t = 5.0, help_heading = "Diffusion")]
+    pub clip_range: f64,
+    /// What is made small.
+    #[arg(long, value_enum, default_value_t = LossType::Mse, help_heading = "Diffusion")]
+    pub loss: LossType,
+    /// Where Huber's loss turns from squared to linear.
+    #[arg(long, value_name = "X", default_value_t = Objective::default().huber_delta,
+          help_heading = "Diffusion")]
+    pub huber_delta: f64,
+    /// Weigh steps by min-SNR with this γ (5 is usual) [default: all steps alike]
+    #[arg(long, value_name = "GAMMA", help_heading = "Diffusion")]
+    pub min_snr_gamma: Option<f64>,
+    /// Probability that a window goes without its music, for guidance.
+    #[arg(long, value_name = "P", default_value_t = 0.1, help_heading = "Diffusion")]
+    pub condition_dropout: f64,
+    /// Probability that a window goes without its style, with --style.
+    #[arg(long, value_name = "P", default_value_t = 0.1, help_heading = "Diffusion")]
+    pub style_dropout: f64,
+}
+
+/// What makes more of each phrase.
+#[derive(Clone, Debug, clap::Args)]
+pub struct AugmentationParams {
+    /// Standard deviation of the noise added to features.
+    #[arg(long, value_name = "X", default_value_t = Augmentation::default().condition_noise,
+          help_heading = "Augmentation")]
+    pub condition_noise: f64,
+    /// Do not mirror windows in x.
+    #[arg(long, help_heading = "Augmentation")]
+    pub no_mirror: bool,
+    /// Turn windows about the vertical by up to so many degrees.
+    #[arg(long, value_name = "DEG", default_value_t = Augmentation::default().yaw_deg,
+          help_heading = "Augmentation")]
+    pub yaw_rotation: f64,
+    /// Change the speed of windows, music and motion, by up to this share.
+    #[arg(long, value_name = "X", default_value_t = Augmentation::default().stretch,
+          help_heading = "Augmentation")]
+    pub time_stretch: f64,
+}
+
+/// How weights are moved.
+#[derive(Clone, Debug, clap::Args)]
+pub struct OptimizerParams {
+    /// Windows of a step.
+    #[arg(long, value_name = "N", default_value_t = NonZeroUsize::new(32).expect("not 0"),
+          help_heading = "Optimizer")]
+    pub batch_size: NonZeroUsize,
+    /// Parts of a batch done one after the other, to save memory.
+    #[arg(long, value_name = "N", default_value_t = NonZeroUsize::MIN, help_heading = "Optimizer")]
+    pub accumulate: NonZeroUsize,
+    /// Highest learning rate of the UNet [default: 1e-4; 5e-4 for tiny and small]
+    #[arg(long, value_name = "X", help_heading = "Optimizer")]
+    pub learning_rate: Option<f64>,
+    /// Course of the learning rate after the warm-up.
+    #[arg(long, value_enum, default_value_t = Course::Cosine, help_heading = "Optimizer")]
+    pub lr_schedule: Course,
+    /// Steps of the warm-up; in a short training a tenth of all.
+    #[arg(long, value_name = "N", default_value_t = 1000, help_heading = "Optimizer")]
+    pub warmup_steps: u64,
+    /// Decay of weights.
+    #[arg(long, value_name = "X", default_value_t = OptimizerConfig::default().weight_decay,
+          help_heading = "Optimizer")]
+    pub weight_decay: f64,
+    /// Largest norm of the gradient; 0 for no limit.
+    #[arg(long, value_name = "X", default_value_t = 1.0, help_heading = "Optimizer")]
+    pub gradient_clip: f64,
+    /// Decay of the average of the weights.
+    #[arg(long, value_name = "X", default_value_t = EmaConfig::default().decay,
+          help_heading = "Optimizer")]
+    pub ema_decay: f64,
+    /// Steps between two updates of the average.
+    #[arg(long, value_name = "N", default_value_t = EmaConfig::default().every,
+          value_parser = clap::value_parser!(u64).range(1..), help_heading = "Optimizer")]
+    pub ema_update_every: u64,
+    /// Windows of a step of the decoder.
+    #[arg(long, value_name = "N", default_value_t = NonZeroUsize::new(8).expect("not 0"),
+          help_heading = "Optimizer")]
+    pub decoder_batch_size: NonZeroUsize,
+    /// Highest learning rate of the decoder.
+    #[arg(long, value_name = "X", default_value_t = 1e-3, help_heading = "Optimizer")]
+    pub decoder_learning_rate: f64,
+}
+
+/// Everything that determines what a run learns.
+#[derive(Clone, Debug, clap::Args)]
+pub struct ConfigParams {
+    #[command(flatten)]
+    pub network: NetworkParams,
+    #[command(flatten)]
+    pub diffusion: DiffusionParams,
+    #[command(flatten)]
+    pub augmentation: AugmentationParams,
+    #[command(flatten)]
+    pub optimizer: OptimizerParams,
+}
+
+impl NetworkParams {
+    fn unet(&self, timesteps: usize) -> UNetConfig {
+        let preset = self.preset.config();
+        let levels = if self.widths.is_empty() { preset.widths.len() } else { self.widths.len() };
+        let attention_levels = match (&self.attention_levels, self.widths.is_empty()) {
+            (Some(levels), _) => levels.clone(),
+            (None, true) => preset.attention_levels.clone(),
+            (None, false) => (1..levels).collect(),
+        };
+        UNetConfig {
+            widths: if self.widths.is_empty() {
+                preset.widths.clone()
+            } else {
+                self.widths.clone()
+            },
+            num_res_blocks: self.num_res_blocks.unwrap_or(preset.num_res_blocks),
+            attention_levels,
+            num_heads: self.num_heads.unwrap_or(preset.num_heads),
+            num_head_channels: self.num_head_channels.or(preset.num_head_channels),
+            time_embed_dim: self.time_embed_dim.unwrap_or(preset.time_embed_dim),
+            context_dim: self.context_dim.unwrap_or(preset.context_dim),
+            style_dim: if self.style { STYLE_DIM } else { 0 },
+            dropout: self.dropout.unwrap_or(preset.dropout),
+            n_steps: timesteps,
+            use_checkpoint: self.use_checkpoint,
+            ..preset
+        }
+    }
+
+    fn decoder(&self) -> DecoderConfig {
+        DecoderConfig {
+            hidden_dim: self.decoder_hidden_dim,
+            n_blocks: self.decoder_blocks,
+            dropout: self.decoder_dropout,
+            limits: self.limits,
+            ..DecoderConfig::default()
+        }
+    }
+
+    /// Returns the learning rate that suits the preset: small networks learn faster than large ones.
+    fn learning_rate(&self) -> f64 {
+        match self.preset {
+            Preset::Tiny | Preset::Small => 5e-4,
+            Preset::Base | Preset::Large => 1e-4,
+        }
+    }
+}
+
+impl ConfigParams {
+    /// Returns the configuration that the flags make.
+    pub fn config(&self, seed: u64) -> TrainConfig {
+        let Self { network, diffusion: d, augmentation: a, optimizer: o } = self;
+        let positive = |x: f64| (x > 0.0).then_some(x);
+        let ema = EmaConfig { decay: o.ema_decay, every: o.ema_update_every };
+        let optimizer = OptimizerConfig {
+            weight_decay: o.weight_decay,
+            gradient_clip: positive(o.gradient_clip),
+            ..OptimizerConfig::default()
+        };
+        let rate =
+            |peak: f64| LearningRate { peak, course: o.lr_schedule, warmup_steps: o.warmup_steps };
+        TrainConfig {
+            seed,
+            network: NetworkConfig {
+                unet: network.unet(d.timesteps),
+                decoder: network.decoder(),
+                diffusion: DiffusionConfig {
+                    n_steps: d.timesteps,
+                    beta_schedule: d.beta_schedule,
+                    beta_start: d.beta_start,
+                    beta_end: d.beta_end,
+                    prediction: d.prediction,
+                    clip_range: positive(d.clip_range),
+                },
+                window_frames: network.window_frames,
+            },
+            diffusion: DiffusionTraining {
+                objective: Objective {
+                    loss: d.loss,
+                    huber_delta: d.huber_delta,
+                    min_snr_gamma: d.min_snr_gamma,
+                },
+                augmentation: Augmentation {
+                    condition_noise: a.condition_noise,
+                    mirror: !a.no_mirror,
+                    yaw_deg: a.yaw_rotation,
+                    stretch: a.time_stretch,
+                },
+                condition_dropout: d.condition_dropout,
+                style_dropout: d.style_dropout,
+                batch_size: o.batch_size.get(),
+                accumulate: o.accumulate.get(),
+                learning_rate: rate(o.learning_rate.unwrap_or_else(|| network.learning_rate())),
+                optimizer: optimizer.clone(),
+                ema,
+            },
+            decoder: DecoderTraining {
+                batch_size: o.decoder_batch_size.get(),
+                learning_rate: rate(o.decoder_learning_rate),
+                optimizer,
+                ema,
+                noised_to: 0.05,
+                sampled_every: 4,
+                sampled_from: 0.5,
+                sampler_steps: 5,
+            },
+        }
+    }
+}

@@ -1,0 +1,264 @@
+//! Training of the decoder: from latents that are a little off to the motion that they should be.
+
+use std::sync::Arc;
+
+use ndarray::Array3;
+
+use crate::autodiff::{AdamW, Arena, Eager, Gradients, Interpreter, Parameters, Stream, Tape};
+use crate::diffusion::{Schedule, ddim_update};
+use crate::model::{DecoderConfig, MotionDecoder};
+use crate::motion::MOTION_DIM;
+use crate::weights::{Archive, Section};
+
+use super::checkpoint::Progress;
+use super::config::DecoderTraining;
+use super::diffusion::{AVERAGE, MOMENTS, section, tape_seed};
+use super::drive::{Alone, Learner, Losses, Reducer, Step, Validation};
+use super::ema::Ema;
+use super::error::TrainingError;
+use super::objective::{Reconstruction, reconstruction};
+use super::sampling::{Condition, Denoiser, motion_view};
+use super::window::{Batch, Windows};
+
+/// Windows of a validation.
+const N_VALIDATION: usize = 64;
+
+/// Name of the section of the decoder's weights.
+pub(super) const DECODER: &str = "decoder.";
+
+/// Stream of what the sampler draws beside a window's own noise.
+const STARTS: u64 = 7 << 60;
+
+/// Trains a decoder on the latents of a UNet that stays as it is.
+pub struct DecoderLearner<'u> {
+    decoder: MotionDecoder,
+    parameters: Parameters<f32>,
+    gradients: Gradients<f32>,
+    optimizer: AdamW<f32>,
+    ema: Ema<f32>,
+    arena: Arena<f32>,
+    denoiser: Denoiser<'u>,
+    schedule: Schedule,
+    config: DecoderTraining,
+    seed: u64,
+    windows: Arc<Windows>,
+    reducer: Box<dyn Reducer>,
+}
+
+impl<'u> DecoderLearner<'u> {
+    /// Begins with weights that depend on the seed.
+    pub fn new(
+        decoder: &DecoderConfig,
+        config: &DecoderTraining,
+        denoiser: Denoiser<'u>,
+        schedule: Schedule,
+        windows: &Arc<Windows>,
+        seed: u64,
+    ) -> Self {
+        let (decoder, list) = MotionDecoder::new(decoder);
+        let parameters = Parameters::new(list, seed);
+        Self {
+            decoder,
+            gradients: Gradients::new(&parameters),
+            optimizer: AdamW::new(config.optimizer.adamw(), &parameters),
+            ema: Ema::new(config.ema, &parameters),
+            parameters,
+            arena: Arena::default(),
+            denoiser,
+            schedule,
+            config: config.clone(),
+            seed,
+            windows: Arc::clone(windows),
+            reducer: Box::new(Alone),
+        }
+    }
+
+    /// Returns the latents to decode: those of a batch, made noisy, or what the UNet makes of them.
+    fn latents(
+        &self,
+        batch: &Batch,
+        is_sampled: bool,
+        number: u64,
+    ) -> Result<Vec<f32>, TrainingError> {
+        if !is_sampled {
+            return Ok(self.noised(batch));
+        }
+        let mut start = [0.0_f64];
+        Stream::new(self.seed, STARTS + number).uniform(0, &mut start);
+        let share = self.config.sampled_from * start[0];
+        let last = self.schedule.len() - 1;
+        let t = ((share * self.schedule.len() as f64) as usize).min(last);
+        self.sampled(batch, t)
+    }
+
+    /// x0 + √((1 − ᾱ)/ᾱ) ε: x_t as a sampler that stopped at t would take it for clean.
+    fn noised(&self, batch: &Batch) -> Vec<f32> {
+        let frame = batch.n_frames * MOTION_DIM;
+        let mut latents = batch.motion.clone();
+        let windows = latents.chunks_exact_mut(frame).zip(batch.noise.chunks_exact(frame));
+        for ((latents, noise), chance) in windows.zip(&batch.chances) {
+            let share = self.config.noised_to * chance.step;
+            let t = ((share * self.schedule.len() as f64) as usize).min(self.schedule.len() - 1);
+            let level = self.schedule.level(Some(t));
+            let factor = (level.noise / level.signal) as f32;
+            for (x, z) in latents.iter_mut().zip(noise) {
+                *x += factor * z;
+            }
+        }
+        latents
+    }
+
+    /// Noise up to step t, and some steps of DDIM back to clean.
+    fn sampled(&self, batch: &Batch, t: usize) -> Result<Vec<f32>, TrainingError> {
+        let (n, frames) = (batch.n_windows, batch.n_frames);
+        let (x0, noise) =
+            (motion_view(&batch.motion, n, frames), motion_view(&batch.noise, n, frames));
+        let mut x = self.schedule.add_noise(x0, noise, &vec![t; n]);
+        let n_steps = self.config.sampler_steps.clamp(1, t + 1);
+        let condition = Condition::of(batch);
+        for i in 0..n_steps {
+            let at = t * (n_steps - i) / n_steps;
+            let next = (i + 1 < n_steps).then(|| t * (n_steps - i - 1) / n_steps);
+            let steps = vec![at; n];
+            let prediction = self.denoiser.predict(x.view(), &steps, &condition)?;
+            let (x0, epsilon) = self.schedule.estimate(prediction.view(), x.view(), &steps);
+            let update = ddim_update(&self.schedule, at, next, 0.0);
+            x = combine(update.x0, &x0, update.epsilon, &epsilon);
+        }
+        Ok(x.into_raw_vec_and_offset().0)
+    }
+
+    /// Returns how far the decoded latents are from the batch's motion.
+    fn losses<I: Interpreter<Element = f32>>(
+        &self,
+        g: &mut I,
+        batch: &Batch,
+        latents: &[f32],
+    ) -> Result<Reconstruction<crate::autodiff::Tensor<f32>>, TrainingError> {
+        let latents = g.constant(&[batch.n_windows, batch.n_frames, MOTION_DIM], latents);
+        let decoded = self.decoder.forward(g, &latents)?;
+        let normalizer = self.windows.normalizer();
+        Ok(reconstruction(g, normalizer, &decoded, &batch.motion, &batch.mask)?)
+    }
+
+    fn differentiate(&mut self, batch: &Batch, step: u64) -> Result<Losses, TrainingError> {
+        let every = self.config.sampled_every;
+        let is_sampled = every > 0 && step % every == every - 1;
+        let latents = self.latents(batch, is_sampled, step)?;
+        self.gradients.clear();
+        let seed = tape_seed(self.seed, step);
+        let mut tape = Tape::new(&self.parameters, &self.arena, Some(seed));
+        let found = self.losses(&mut tape, batch, &latents)?;
+        let losses = named(&found);
+        tape.backward(found.all, &mut self.gradients)?;
+        self.reducer.reduce(&mut self.gradients);
+        Ok(losses)
+    }
+
+    fn validation_losses(&self, parameters: &Parameters<f32>) -> Result<Losses, TrainingError> {
+        let mut sum = Losses::default();
+        let n = N_VALIDATION.div_ceil(self.config.batch_size.max(1));
+        for i in 0..n {
+            let first = i * self.config.batch_size;
+            let batch = self.windows.validation(first..first + self.config.batch_size)?;
+            // Half of them are the UNet's, from steps that are spread evenly.
+            let share = self.config.sampled_from * (i as f64 + 0.5) / n as f64;
+            let t = (share * self.schedule.len() as f64) as usize;
+            let latents = if i % 2 == 0 { self.noised(&batch) } else { self.sampled(&batch, t)? };
+            let mut g = Eager::new(parameters, &self.arena);
+            let found = self.losses(&mut g, &batch, &latents)?;
+            sum.add(&named(&found), 1.0 / n as f64);
+        }
+        Ok(sum)
+    }
+}
+
+fn named(found: &Reconstruction<crate::autodiff::Tensor<f32>>) -> Losses {
+    let value = |x: &crate::autodiff::Tensor<f32>| f64::from(x.scalar());
+    Losses {
+        total: value(&found.all),
+        parts: vec![
+            ("reconstruction", value(&found.all)),
+            ("decoder_position", value(&found.position)),
+            ("decoder_quaternion", value(&found.quaternion)),
+        ],
+    }
+}
+
+/// a x + b y.
+fn combine(a: f64, x: &Array3<f32>, b: f64, y: &Array3<f32>) -> Array3<f32> {
+    let (a, b) = (a as f32, b as f32);
+    ndarray::Zip::from(x).and(y).map_collect(|&x, &y| a * x + b * y)
+}
+
+impl Learner for DecoderLearner<'_> {
+    const STAGE: &'static str = "decoder";
+
+    fn step(&mut self, batch: &Batch, step: u64, n_steps: u64) -> Result<Step, TrainingError> {
+        let losses = self.differentiate(batch, step)?;
+        let learning_rate = self.config.learning_rate.at(step, n_steps);
+        let gradient_norm = if losses.total.is_finite() {
+            self.optimizer.step(&mut self.parameters, &mut self.gradients, learning_rate)
+        } else {
+            f64::NAN
+        };
+        if gradient_norm.is_finite() {
+            self.ema.after_step(step + 1, &self.parameters);
+        }
+        Ok(Step { losses, gradient_norm, learning_rate, lr_decoder: None })
+    }
+
+    fn rehearse(&mut self, batch: &Batch) -> Result<(), TrainingError> {
+        // Steps are of two kinds; what counts is how long they take on average.
+        let every = self.config.sampled_every.max(1);
+        for step in 0..every {
+            self.differentiate(batch, step)?;
+        }
+        Ok(())
+    }
+
+    fn steps_of_rehearsal(&self) -> u64 {
+        self.config.sampled_every.max(1)
+    }
+
+    fn validate(&mut self) -> Result<Validation, TrainingError> {
+        let losses = self.validation_losses(self.ema.average())?;
+        let live = self.validation_losses(&self.parameters)?.total;
+        Ok(Validation { losses, live: Some(live) })
+    }
+
+    fn sections(&self) -> Vec<Section<'_, f32>> {
+        let plan = self.parameters.plan();
+        let ([m, v], _) = self.optimizer.state();
+        vec![
+            Section { prefix: DECODER, plan, values: self.parameters.all() },
+            Section { prefix: AVERAGE, plan, values: self.ema.average().all() },
+            Section { prefix: MOMENTS[0], plan, values: m },
+            Section { prefix: MOMENTS[1], plan, values: v },
+        ]
+    }
+
+    fn best(&self) -> Vec<Section<'_, f32>> {
+        let plan = self.parameters.plan();
+        vec![Section { prefix: DECODER, plan, values: self.ema.average().all() }]
+    }
+
+    fn n_updates(&self) -> (u64, u64) {
+        (self.optimizer.state().1, self.ema.n_updates())
+    }
+
+    fn restore(
+        &mut self,
+        archive: &Archive,
+        place: &str,
+        at: &Progress,
+    ) -> Result<(), TrainingError> {
+        let read = |prefix: &str| section(archive, prefix, &self.parameters, place);
+        let (parameters, average) = (read(DECODER)?, read(AVERAGE)?);
+        let [m, v] = [read(MOMENTS[0])?, read(MOMENTS[1])?];
+        self.optimizer.restore([m.all(), v.all()], at.n_updates);
+        self.ema = Ema::resume(self.config.ema, average, at.n_averaged);
+        self.parameters = parameters;
+        Ok(())
+    }
+}

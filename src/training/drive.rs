@@ -1,0 +1,455 @@
+//! The course of a training: steps, epochs, validations, checkpoints, and every way it can end.
+
+use std::time::{Duration, Instant};
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use crate::autodiff::{Gradients, Threads};
+use crate::store::{Patience, StoreError};
+use crate::weights::{Archive, Section};
+
+use super::checkpoint::{Best, Checkpoints, Kind, Progress, State};
+use super::error::TrainingError;
+use super::journal::{Entry, Journal, RowKind};
+use super::loader::Loader;
+use super::window::Batch;
+
+/// Steps in a row that may be skipped because something is not finite.
+const MAX_SKIPPED_IN_A_ROW: u32 = 10;
+/// Steps that are tried, without effect, to see how many fit into a time.
+const N_TRIED: u32 = 3;
+/// Share of the time that steps may take when their number is chosen; the optimizer and
+/// validations take the rest.
+const SHARE_OF_TIME: f64 = 0.92;
+
+/// Losses by name, and what is minimised.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Losses {
+    pub total: f64,
+    /// Names are columns of the table of training.
+    pub parts: Vec<(&'static str, f64)>,
+}
+
+impl Losses {
+    /// Adds another's losses, weighted.
+    pub fn add(&mut self, other: &Self, weight: f64) {
+        self.total += weight * other.total;
+        for &(name, value) in &other.parts {
+            match self.parts.iter_mut().find(|(known, _)| *known == name) {
+                Some((_, sum)) => *sum += weight * value,
+                None => self.parts.push((name, weight * value)),
+            }
+        }
+    }
+}
+
+/// What a step came to.
+#[derive(Clone, Debug)]
+pub struct Step {
+    pub losses: Losses,
+    /// Norm of the gradient before it was clipped.
+    pub gradient_norm: f64,
+    pub learning_rate: f64,
+    pub lr_decoder: Option<f64>,
+}
+
+impl Step {
+    fn is_finite(&self) -> bool {
+        self.losses.total.is_finite() && self.gradient_norm.is_finite()
+    }
+}
+
+/// What a validation came to.
+#[derive(Clone, Debug)]
+pub struct Validation {
+    /// Of the weights that would be used: the average, where there is one.
+    pub losses: Losses,
+    /// Of the weights themselves, where they are not the ones that would be used.
+    pub live: Option<f64>,
+}
+
+/// Gradients on their way from the tape to the optimizer.
+///
+/// All gradients pass through here once a step. A trainer over several processes adds those of the others.
+pub trait Reducer: Send {
+    /// Replaces the gradients of this process by those of all.
+    fn reduce(&mut self, gradients: &mut Gradients<f32>);
+}
+
+/// A trainer alone.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Alone;
+
+impl Reducer for Alone {
+    fn reduce(&mut self, _gradients: &mut Gradients<f32>) {}
+}
+
+/// What learns.
+pub trait Learner: Send {
+    /// Name of the stage, as tables and folders spell it.
+    const STAGE: &'static str;
+
+    /// Learns from a batch: step number `step` (from 0) of `n_steps`.
+    ///
+    /// Where loss or gradient is not finite, nothing changes.
+    ///
+    /// # Errors
+    /// Shapes that do not fit.
+    fn step(&mut self, batch: &Batch, step: u64, n_steps: u64) -> Result<Step, TrainingError>;
+
+    /// Does the work of a step but for the optimizer's, and forgets it, to see how long it takes.
+    ///
+    /// # Errors
+    /// As [`Learner::step`].
+    fn rehearse(&mut self, batch: &Batch) -> Result<(), TrainingError>;
+
+    /// Returns how many steps a rehearsal is worth.
+    fn steps_of_rehearsal(&self) -> u64 {
+        1
+    }
+
+    /// Measures what was learned.
+    ///
+    /// # Errors
+    /// As [`Learner::step`], and what the store says.
+    fn validate(&mut self) -> Result<Validation, TrainingError>;
+
+    /// Returns all numbers, to go on from.
+    fn sections(&self) -> Vec<Section<'_, f32>>;
+
+    /// Returns the weights to use.
+    fn best(&self) -> Vec<Section<'_, f32>>;
+
+    /// Returns how many updates optimizer and average have seen.
+    fn n_updates(&self) -> (u64, u64);
+
+    /// Takes up the numbers of [`Learner::sections`].
+    ///
+    /// # Errors
+    /// When they are not those of these networks.
+    fn restore(
+        &mut self,
+        archive: &Archive,
+        place: &str,
+        at: &Progress,
+    ) -> Result<(), TrainingError>;
+}
+
+/// When training ends, saves and validates.
+#[derive(Clone, Copy, Debug)]
+pub struct Plan {
+    pub n_steps: Option<u64>,
+    pub n_epochs: Option<u64>,
+    pub time: Option<Duration>,
+    pub windows_per_epoch: u64,
+    pub batch_size: u64,
+    pub validate_every_epochs: u64,
+    pub save_every_epochs: u64,
+    pub save_every_steps: Option<u64>,
+    pub save_every: Duration,
+    /// Validations without improvement after which training ends.
+    pub patience: Option<u64>,
+    /// How long a store that does not answer is waited for.
+    pub store_patience: Patience,
+}
+
+impl Plan {
+    /// Returns the epoch of a step, from 0.
+    fn epoch(&self, step: u64) -> u64 {
+        step * self.batch_size / self.windows_per_epoch.max(1)
+    }
+
+    /// Returns how many epochs are over after `step` steps.
+    fn epochs_done(&self, steps: u64) -> u64 {
+        self.epoch(steps)
+    }
+
+    /// Returns the steps that end `n` epochs.
+    fn steps_of(&self, n: u64) -> u64 {
+        (n * self.windows_per_epoch).div_ceil(self.batch_size)
+    }
+
+    /// Returns the steps that the plan names, if it names any.
+    fn named_steps(&self) -> Option<u64> {
+        let by_epochs = self.n_epochs.map(|n| self.steps_of(n));
+        match (self.n_steps, by_epochs) {
+            (Some(a), Some(b)) => Some(a.min(b)),
+            (a, b) => a.or(b),
+        }
+    }
+}
+
+/// Whoever looks on.
+pub trait Watch {
+    /// Training begins at `step` of `n_steps`.
+    fn begin(&self, stage: &'static str, step: u64, n_steps: u64);
+    /// A step was taken.
+    fn step(&self, said: &str);
+    /// Something worth a line.
+    fn note(&self, line: &str);
+    /// Whether someone asked for an end.
+    fn is_interrupted(&self) -> bool;
+    /// Memory of the process, in bytes, if it can be told.
+    fn resident_bytes(&self) -> Option<u64>;
+    /// Training ends.
+    fn end(&self);
+}
+
+/// How training ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum End {
+    /// All steps were done.
+    Done,
+    /// The time was over.
+    OutOfTime,
+    /// Nothing improved any more.
+    Stale,
+    /// Someone asked for it.
+    Interrupted,
+}
+
+/// A stage of a run that is under way.
+pub struct Drive<'a, C> {
+    pub plan: Plan,
+    pub state: State<C>,
+    pub checkpoints: Checkpoints<'a>,
+    pub journal: Journal<'a>,
+    pub watch: &'a dyn Watch,
+    /// Threads that steps run on.
+    pub threads: &'a Threads,
+}
+
+impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
+    /// Trains until the plan is fulfilled, and returns how it ended.
+    ///
+    /// # Errors
+    /// [`TrainingError`]; the last good checkpoint is named where there is one.
+    pub fn run<L: Learner>(
+        &mut self,
+        learner: &mut L,
+        start_loader: impl FnOnce(u64) -> Loader,
+    ) -> Result<End, TrainingError> {
+        let mut loader = start_loader(self.state.progress.step);
+        let mut first = Some(loader.next_batch()?);
+        if self.state.progress.n_steps == 0 {
+            let batch = first.as_ref().expect("just put there");
+            self.state.progress.n_steps = self.choose_steps(learner, batch)?;
+        } else if let Some(n_steps) = self.plan.named_steps() {
+            self.state.progress.n_steps = n_steps;
+        }
+        let n_steps = self.state.progress.n_steps;
+        self.watch.begin(L::STAGE, self.state.progress.step, n_steps);
+        self.journal.begin(self.state.progress.step);
+        let before_s = self.state.progress.elapsed_s;
+        let started = Instant::now();
+        let mut last_save = Instant::now();
+        let end = loop {
+            let step = self.state.progress.step;
+            if step >= n_steps {
+                break End::Done;
+            }
+            if self.watch.is_interrupted() {
+                break End::Interrupted;
+            }
+            let elapsed_s = before_s + started.elapsed().as_secs_f64();
+            if self.plan.time.is_some_and(|time| elapsed_s >= time.as_secs_f64()) {
+                break End::OutOfTime;
+            }
+            let batch = match first.take() {
+                Some(batch) => batch,
+                None => loader.next_batch()?,
+            };
+            let step_started = Instant::now();
+            let taken = self.threads.run(|| learner.step(&batch, step, n_steps))?;
+            let took = step_started.elapsed();
+            self.state.progress.elapsed_s = before_s + started.elapsed().as_secs_f64();
+            self.after_step(learner, &batch, &taken, took, loader.waited())?;
+            let done = self.state.progress.step;
+            let epochs = self.plan.epochs_done(done);
+            let is_new_epoch = epochs > self.plan.epochs_done(step);
+            if is_new_epoch {
+                self.end_epoch(epochs);
+            }
+            let every = |n: u64| n > 0 && is_new_epoch && epochs.is_multiple_of(n);
+            let is_last = done >= n_steps;
+            if every(self.plan.validate_every_epochs) || is_last {
+                self.validate(learner)?;
+                if self.is_stale() {
+                    break End::Stale;
+                }
+            }
+            let by_steps = self.plan.save_every_steps.is_some_and(|n| done.is_multiple_of(n));
+            let by_time = last_save.elapsed() >= self.plan.save_every;
+            if (every(self.plan.save_every_epochs) || by_steps || by_time) && !is_last {
+                self.state.progress.elapsed_s = before_s + started.elapsed().as_secs_f64();
+                self.save(learner)?;
+                last_save = Instant::now();
+            }
+        };
+        self.state.progress.elapsed_s = before_s + started.elapsed().as_secs_f64();
+        if end == End::OutOfTime {
+            self.validate(learner)?;
+        }
+        self.save(learner)?;
+        self.watch.end();
+        Ok(end)
+    }
+
+    /// Returns how many steps to take: those that the plan names, or as many as fit into its time.
+    ///
+    /// The number is a part of the run's state from then on, because the learning rate depends on it.
+    fn choose_steps<L: Learner>(
+        &self,
+        learner: &mut L,
+        batch: &Batch,
+    ) -> Result<u64, TrainingError> {
+        let named = self.plan.named_steps();
+        let Some(time) = self.plan.time else { return Ok(named.unwrap_or(u64::MAX)) };
+        // The first asks the system for memory; those after it are like all others.
+        self.threads.run(|| learner.rehearse(batch))?;
+        let started = Instant::now();
+        for _ in 0..N_TRIED {
+            self.threads.run(|| learner.rehearse(batch))?;
+        }
+        let n_tried = u64::from(N_TRIED) * learner.steps_of_rehearsal();
+        let step_s = started.elapsed().as_secs_f64() / n_tried as f64;
+        let fitting = (SHARE_OF_TIME * time.as_secs_f64() / step_s.max(1e-6)).floor() as u64;
+        Ok(named.unwrap_or(u64::MAX).min(fitting.max(1)))
+    }
+
+    fn after_step<L: Learner>(
+        &mut self,
+        learner: &L,
+        batch: &Batch,
+        taken: &Step,
+        took: Duration,
+        waited: Duration,
+    ) -> Result<(), TrainingError> {
+        let is_skipped = !taken.is_finite();
+        let epoch = self.plan.epoch(self.state.progress.step);
+        let progress = &mut self.state.progress;
+        progress.step += 1;
+        (progress.n_updates, progress.n_averaged) = learner.n_updates();
+        if is_skipped {
+            progress.n_skipped += 1;
+            progress.n_skipped_in_a_row += 1;
+        } else {
+            progress.n_skipped_in_a_row = 0;
+            progress.epoch_loss.0 += taken.losses.total;
+            progress.epoch_loss.1 += 1;
+        }
+        let (step, in_a_row) = (progress.step, progress.n_skipped_in_a_row);
+        self.journal.add(Entry {
+            kind: RowKind::Step,
+            epoch,
+            step,
+            losses: &taken.losses,
+            live_loss: None,
+            taken: Some(taken),
+            is_skipped,
+            samples_per_s: Some(batch.n_windows as f64 / took.as_secs_f64().max(1e-9)),
+            data_wait_s: Some(waited.as_secs_f64()),
+            resident_bytes: self.watch.resident_bytes(),
+            elapsed_s: progress.elapsed_s,
+        });
+        self.watch.step(&format!("epoch {} loss {:.4}", epoch + 1, taken.losses.total));
+        if in_a_row >= MAX_SKIPPED_IN_A_ROW {
+            let mut phrases: Vec<_> = batch.phrase_ids.iter().map(ToString::to_string).collect();
+            phrases.sort();
+            phrases.dedup();
+            let checkpoint = self.last_checkpoint();
+            let (stage, n) = (L::STAGE, in_a_row);
+            return Err(TrainingError::NotFinite { stage, n, step, phrases, checkpoint });
+        }
+        Ok(())
+    }
+
+    fn end_epoch(&mut self, epochs: u64) {
+        let progress = &mut self.state.progress;
+        let (sum, n) = std::mem::take(&mut progress.epoch_loss);
+        let losses = Losses { total: sum / n as f64, parts: Vec::new() };
+        self.journal.add(Entry::of_epoch(RowKind::Epoch, epochs - 1, progress, &losses, None));
+    }
+
+    fn validate<L: Learner>(&mut self, learner: &mut L) -> Result<(), TrainingError> {
+        let found = self.threads.run(|| learner.validate())?;
+        let progress = &mut self.state.progress;
+        let epoch = self.plan.epoch(progress.step.saturating_sub(1));
+        let loss = found.losses.total;
+        let is_better = loss.is_finite() && progress.best.is_none_or(|best| loss < best.loss);
+        let kind = RowKind::Validation;
+        self.journal.add(Entry::of_epoch(kind, epoch, progress, &found.losses, found.live));
+        if is_better {
+            progress.best = Some(Best { step: progress.step, loss });
+            progress.n_stale = 0;
+        } else {
+            progress.n_stale += 1;
+        }
+        let step = progress.step;
+        self.watch.note(&format!(
+            "{}: step {step}, validation loss {loss:.4}{}",
+            L::STAGE,
+            if is_better { ", the best so far" } else { "" }
+        ));
+        if is_better {
+            let best = learner.best();
+            self.write(Kind::Best, &best)?;
+        }
+        Ok(())
+    }
+
+    fn is_stale(&self) -> bool {
+        self.plan.patience.is_some_and(|patience| self.state.progress.n_stale >= patience)
+    }
+
+    /// Writes the log, then the checkpoint.
+    ///
+    /// In this order, so that no checkpoint is ahead of the log: what was logged and not saved is done,
+    /// and logged, again.
+    fn save<L: Learner>(&mut self, learner: &L) -> Result<(), TrainingError> {
+        let step = self.state.progress.step;
+        let done = {
+            let watch = self.watch;
+            let notice = |error: &StoreError, pause| notice(watch, error, pause);
+            self.journal.commit(step, self.plan.store_patience, &notice)
+        };
+        let done = done.and_then(|()| self.write(Kind::Step, &learner.sections()));
+        done.map_err(|source| TrainingError::NotSaved {
+            stage: L::STAGE,
+            step,
+            checkpoint: self.last_checkpoint(),
+            source: Box::new(source),
+        })
+    }
+
+    fn write(&self, kind: Kind, sections: &[Section<f32>]) -> Result<(), TrainingError> {
+        let mut outcome = Ok(());
+        let written = self.plan.store_patience.wait_out(
+            |error, pause| notice(self.watch, error, pause),
+            || match self.checkpoints.write(kind, &self.state, sections) {
+                Ok(_) => Ok(()),
+                Err(TrainingError::Store(error)) => Err(error),
+                Err(other) => {
+                    outcome = Err(other);
+                    Ok(())
+                }
+            },
+        );
+        written?;
+        outcome
+    }
+
+    /// Returns what messages call the newest checkpoint.
+    fn last_checkpoint(&self) -> String {
+        match self.checkpoints.steps(Kind::Step).unwrap_or_default().last() {
+            Some(&step) => self.checkpoints.place(Kind::Step, step),
+            None => "none".to_owned(),
+        }
+    }
+}
+
+/// Says that the store does not answer.
+pub fn notice(watch: &dyn Watch, error: &StoreError, pause: Duration) {
+    watch.note(&format!("{error}; trying again in {:.0} s", pause.as_secs_f64()));
+}

@@ -1,0 +1,379 @@
+//! End-to-end fine-tuning: the UNet and the decoder together, with gradients through the sampler.
+//!
+//! Reference, section 7. The loss is w_diff · L_diffusion + w_dec · (L_position + L_quaternion) +
+//! w_temp · L_temporal, the last two of motion that was sampled from noise in a few steps and decoded.
+
+use std::sync::Arc;
+
+use crate::autodiff::op::binary::{Binary, Pair};
+use crate::autodiff::op::elementwise::{Function, Map};
+use crate::autodiff::{AdamW, Arena, Eager, Gradients, Interpreter, Parameters, Tape, Tensor};
+use crate::diffusion::{Schedule, Spacing, ddim_linear, steps};
+use crate::model::{Graph, MotionDecoder, Parameter, ParameterList, Scope, UNet1D, UNetInputs};
+use crate::motion::style::STYLE_DIM;
+use crate::motion::{Channel, MOTION_DIM};
+use crate::units::FPS;
+use crate::weights::{Archive, Section};
+
+use super::checkpoint::Progress;
+use super::config::{FinetuneConfig, NetworkConfig};
+use super::decoder::DECODER;
+use super::diffusion::{Given, MOMENTS, UNET, Withhold, section, tape_seed};
+use super::drive::{Alone, Learner, Losses, Reducer, Step, Validation};
+use super::error::TrainingError;
+use super::objective::{Objective, reconstruction};
+use super::sampling::is_partial;
+use super::temporal::{TemporalLosses, temporal_losses};
+use super::window::{Batch, Windows};
+
+/// Windows of a validation.
+const N_VALIDATION: usize = 64;
+
+/// Section of both networks beside the optimizer's.
+const BOTH: &str = "model.";
+
+/// Both networks, over one list of parameters.
+#[derive(Clone, Debug)]
+pub struct Pipeline {
+    pub unet: Arc<UNet1D>,
+    pub decoder: MotionDecoder,
+    takes_style: bool,
+}
+
+impl Pipeline {
+    /// Makes both networks; names begin with `unet.` and `decoder.`.
+    pub fn new(network: &NetworkConfig) -> (Self, ParameterList) {
+        let mut list = ParameterList::default();
+        let mut root = Scope::root(&mut list);
+        let unet = UNet1D::within(&mut root.at(UNET.trim_end_matches('.')), &network.unet);
+        let decoder =
+            MotionDecoder::within(&mut root.at(DECODER.trim_end_matches('.')), &network.decoder);
+        let takes_style = network.unet.style_dim > 0;
+        (Self { unet: Arc::new(unet), decoder, takes_style }, list)
+    }
+
+    /// Samples from noise by DDIM, every step of which gradients can flow through.
+    ///
+    /// x̂0 = A x + B p, kept within the clip range; x' = c x + d x̂0 with c = √((1 − ᾱ')/(1 − ᾱ)) and
+    /// d = √ᾱ' − c √ᾱ, which is DDIM with the ε̂ that fits x̂0; the last step leads to x̂0 itself.
+    /// Steps are evenly spaced from T − 1 to 0 (reference, 7.3). Each call of the network is run again
+    /// for its gradient, so that memory is that of one call.
+    ///
+    /// # Shapes
+    /// - `noise`, returned: \[batch, frames, 25\]
+    ///
+    /// # Errors
+    /// Shapes that do not fit; a number of steps that there is not.
+    pub fn sample<I: Interpreter<Element = f32>>(
+        &self,
+        g: &mut I,
+        schedule: &Schedule,
+        n_steps: usize,
+        noise: &[f32],
+        batch: &Batch,
+    ) -> Result<Tensor<f32>, TrainingError> {
+        let (n, frames) = (batch.n_windows, batch.n_frames);
+        let n_features = batch.audio.len() / (n * frames);
+        let mut x = g.constant(&[n, frames, MOTION_DIM], noise);
+        let audio = g.constant(&[n, frames, n_features], &batch.audio);
+        let mask = is_partial(&batch.mask).then(|| g.constant(&[n, frames], &batch.mask));
+        let style = self.takes_style.then(|| g.constant(&[n, STYLE_DIM], &batch.style));
+        for step in steps(schedule.len(), n_steps, Spacing::Linspace)? {
+            let t = g.constant(&[n], &vec![step.t as f32; n]);
+            let mut inputs = vec![&x, &t, &audio];
+            inputs.extend(&mask);
+            inputs.extend(&style);
+            let (unet, has_mask, has_style) =
+                (Arc::clone(&self.unet), mask.is_some(), style.is_some());
+            let prediction = g.checkpoint(&inputs, move |g, inputs| {
+                let given = UNetInputs {
+                    x: &inputs[0],
+                    t: &inputs[1],
+                    audio: &inputs[2],
+                    drop_audio: None,
+                    mask: has_mask.then(|| &inputs[3]),
+                    style: has_style.then(|| &inputs[3 + usize::from(has_mask)]),
+                };
+                unet.forward(g, given)
+            })?;
+            let (a, b) = ddim_linear(schedule, step.t, None);
+            let estimate = weighted_sum(g, &[(&x, a), (&prediction, b)])?;
+            let estimate = match schedule.clip_range() {
+                Some(range) => {
+                    let clamp = Function::Clamp { low: -range, high: range };
+                    g.apply(Map::new(clamp), &[&estimate])?
+                }
+                None => estimate,
+            };
+            let (from, to) = (schedule.level(Some(step.t)), schedule.level(step.next));
+            let c = to.noise / from.noise;
+            let d = to.signal - c * from.signal;
+            x = if step.next.is_none() {
+                estimate
+            } else {
+                weighted_sum(g, &[(&x, c), (&estimate, d)])?
+            };
+        }
+        Ok(x)
+    }
+}
+
+/// Σ w x.
+fn weighted_sum<I: Interpreter<Element = f32>>(
+    g: &mut I,
+    terms: &[(&Tensor<f32>, f64)],
+) -> Result<Tensor<f32>, TrainingError> {
+    let mut sum: Option<Tensor<f32>> = None;
+    for &(x, w) in terms {
+        let term = g.scale(x, w)?;
+        sum = Some(match sum {
+            None => term,
+            Some(sum) => g.apply(Binary::new(Pair::Add), &[&sum, &term])?,
+        });
+    }
+    Ok(sum.expect("a sum has terms"))
+}
+
+/// What end-to-end training adds up, and the motion that it is about.
+pub struct EndToEnd<T> {
+    pub total: T,
+    pub diffusion: T,
+    pub position: T,
+    pub quaternion: T,
+    pub temporal: TemporalLosses<T>,
+    /// \[batch, frames, 25\], in metres and the like.
+    pub decoded: T,
+}
+
+/// Trains both networks together.
+pub struct FinetuneLearner {
+    pipeline: Pipeline,
+    parameters: Parameters<f32>,
+    gradients: Gradients<f32>,
+    optimizer: AdamW<f32>,
+    arena: Arena<f32>,
+    schedule: Schedule,
+    objective: Objective,
+    config: FinetuneConfig,
+    windows: Arc<Windows>,
+    reducer: Box<dyn Reducer>,
+}
+
+impl FinetuneLearner {
+    /// Begins with trained networks.
+    ///
+    /// # Errors
+    /// A configuration that makes no network; more sampling steps than there are.
+    pub fn new(
+        network: &NetworkConfig,
+        objective: &Objective,
+        config: &FinetuneConfig,
+        windows: &Arc<Windows>,
+        [unet, decoder]: [&Parameters<f32>; 2],
+    ) -> Result<Self, TrainingError> {
+        network.check()?;
+        let schedule = Schedule::new(&network.diffusion)?;
+        steps(schedule.len(), config.num_steps, Spacing::Linspace)?;
+        let (pipeline, list) = Pipeline::new(network);
+        let parameters = Parameters::from_fn(list, |parameter| {
+            let (source, name) = split(parameter, unet, decoder);
+            let id = source.list().by_name()[name];
+            source.unpacked(id)
+        });
+        Ok(Self {
+            pipeline,
+            gradients: Gradients::new(&parameters),
+            optimizer: AdamW::new(config.optimizer.adamw(), &parameters),
+            parameters,
+            arena: Arena::default(),
+            schedule,
+            objective: objective.clone(),
+            config: config.clone(),
+            windows: Arc::clone(windows),
+            reducer: Box::new(Alone),
+        })
+    }
+
+    /// Returns all losses of a batch.
+    ///
+    /// # Errors
+    /// Shapes that do not fit.
+    pub fn losses<I: Interpreter<Element = f32>>(
+        &self,
+        g: &mut I,
+        batch: &Batch,
+    ) -> Result<EndToEnd<Tensor<f32>>, TrainingError> {
+        let Self { pipeline, schedule, config: c, .. } = self;
+        let given = Given::of(batch, schedule, Withhold::default(), pipeline.takes_style);
+        let diffusion = given.loss(g, &pipeline.unet, schedule, &self.objective)?;
+        // The sample begins with the same noise that was added above, turned round: independent of
+        // where a network that sees only the other went, and no further draw.
+        let noise: Vec<f32> = batch.noise.iter().rev().copied().collect();
+        let latent = pipeline.sample(g, schedule, c.num_steps, &noise, batch)?;
+        let decoded = pipeline.decoder.forward(g, &latent)?;
+        let normalizer = self.windows.normalizer();
+        let found = reconstruction(g, normalizer, &decoded, &batch.motion, &batch.mask)?;
+        let temporal = temporal_losses(g, &c.temporal, &decoded, &batch.mask)?;
+        let mut terms = vec![
+            (&diffusion, c.diffusion_weight),
+            (&found.position, c.decoder_weight),
+            (&found.quaternion, c.decoder_weight),
+        ];
+        terms.extend(temporal.all().map(|loss| (loss, c.temporal_weight)));
+        let total = weighted_sum(g, &terms)?;
+        let (position, quaternion) = (found.position, found.quaternion);
+        Ok(EndToEnd { total, diffusion, position, quaternion, temporal, decoded })
+    }
+
+    fn differentiate(&mut self, batch: &Batch, step: u64) -> Result<Losses, TrainingError> {
+        self.gradients.clear();
+        let seed = tape_seed(self.config.seed, step);
+        let mut tape = Tape::new(&self.parameters, &self.arena, Some(seed));
+        let found = self.losses(&mut tape, batch)?;
+        let losses = named(&found);
+        let EndToEnd { total, .. } = found;
+        tape.backward(total, &mut self.gradients)?;
+        self.reducer.reduce(&mut self.gradients);
+        Ok(losses)
+    }
+}
+
+/// Returns where a parameter of both networks comes from, and what it is called there.
+fn split<'a>(
+    parameter: &'a Parameter,
+    unet: &'a Parameters<f32>,
+    decoder: &'a Parameters<f32>,
+) -> (&'a Parameters<f32>, &'a str) {
+    match parameter.name.strip_prefix(UNET) {
+        Some(name) => (unet, name),
+        None => (decoder, parameter.name.strip_prefix(DECODER).unwrap_or(&parameter.name)),
+    }
+}
+
+fn named(found: &EndToEnd<Tensor<f32>>) -> Losses {
+    let value = |x: &Tensor<f32>| f64::from(x.scalar());
+    let mut parts = vec![
+        ("diffusion", value(&found.diffusion)),
+        ("decoder_position", value(&found.position)),
+        ("decoder_quaternion", value(&found.quaternion)),
+    ];
+    let temporal = TemporalLosses::<()>::NAMES.into_iter().zip(found.temporal.all());
+    parts.extend(temporal.map(|(name, loss)| (name, value(loss))));
+    Losses { total: value(&found.total), parts }
+}
+
+/// Mean |v − f Δp| and |a − f Δv|, and whether every turn keeps |q · q'| above a target.
+struct Coherence {
+    velocity_m_s: f64,
+    acceleration_m_s2: f64,
+    is_smooth: bool,
+}
+
+impl Coherence {
+    /// Measures the first `n` frames of one motion.
+    fn of(frames: &[f32], n: usize, target_dot: f64) -> Self {
+        let at = |t: usize, i: usize| f64::from(frames[t * MOTION_DIM + i]);
+        let [p, v, a, q] =
+            [Channel::Position, Channel::Velocity, Channel::Acceleration, Channel::Quaternion]
+                .map(|channel| channel.range().start);
+        let n_pairs = n.saturating_sub(1).max(1);
+        let error = |of: usize, derivative: usize| {
+            let differences = (0..n.saturating_sub(1)).flat_map(|t| {
+                (0..3).map(move |i| {
+                    (at(t, derivative + i) - FPS * (at(t + 1, of + i) - at(t, of + i))).abs()
+                })
+            });
+            differences.sum::<f64>() / (3 * n_pairs) as f64
+        };
+        let is_smooth = (0..n.saturating_sub(1)).all(|t| {
+            let dot: f64 = (0..4).map(|i| at(t, q + i) * at(t + 1, q + i)).sum();
+            dot.abs() >= target_dot
+        });
+        Self { velocity_m_s: error(p, v), acceleration_m_s2: error(v, a), is_smooth }
+    }
+}
+
+impl Learner for FinetuneLearner {
+    const STAGE: &'static str = "finetune";
+
+    fn step(&mut self, batch: &Batch, step: u64, _n_steps: u64) -> Result<Step, TrainingError> {
+        let losses = self.differentiate(batch, step)?;
+        let FinetuneConfig { lr_diffusion, lr_decoder, .. } = self.config;
+        let gradient_norm = if losses.total.is_finite() {
+            self.optimizer.step_by(&mut self.parameters, &mut self.gradients, |parameter| {
+                if parameter.name.starts_with(UNET) { lr_diffusion } else { lr_decoder }
+            })
+        } else {
+            f64::NAN
+        };
+        let lr_decoder = Some(lr_decoder);
+        Ok(Step { losses, gradient_norm, learning_rate: lr_diffusion, lr_decoder })
+    }
+
+    fn rehearse(&mut self, batch: &Batch) -> Result<(), TrainingError> {
+        self.differentiate(batch, 0).map(|_| ())
+    }
+
+    fn validate(&mut self) -> Result<Validation, TrainingError> {
+        let mut sum = Losses::default();
+        let size = self.config.batch_size.max(1);
+        let n = N_VALIDATION.div_ceil(size);
+        for i in 0..n {
+            let batch = self.windows.validation(i * size..(i + 1) * size)?;
+            let mut g = Eager::new(&self.parameters, &self.arena);
+            let found = self.losses(&mut g, &batch)?;
+            let mut losses = named(&found);
+            let motions = found.decoded.data().chunks_exact(batch.n_frames * MOTION_DIM);
+            let target = self.config.temporal.target_quaternion_dot;
+            let measured: Vec<_> = motions
+                .zip(batch.mask.chunks_exact(batch.n_frames))
+                .map(|(motion, mask)| {
+                    let n_frames = mask.iter().filter(|&&w| w > 0.0).count();
+                    Coherence::of(motion, n_frames, target)
+                })
+                .collect();
+            let mean = |of: &dyn Fn(&Coherence) -> f64| {
+                measured.iter().map(of).sum::<f64>() / measured.len() as f64
+            };
+            losses.parts.extend([
+                ("velocity_error", mean(&|c| c.velocity_m_s)),
+                ("acceleration_error", mean(&|c| c.acceleration_m_s2)),
+                ("quaternion_pass_rate", mean(&|c| f64::from(u8::from(c.is_smooth)))),
+            ]);
+            sum.add(&losses, 1.0 / n as f64);
+        }
+        Ok(Validation { losses: sum, live: None })
+    }
+
+    fn sections(&self) -> Vec<Section<'_, f32>> {
+        let plan = self.parameters.plan();
+        let ([m, v], _) = self.optimizer.state();
+        vec![
+            Section { prefix: BOTH, plan, values: self.parameters.all() },
+            Section { prefix: MOMENTS[0], plan, values: m },
+            Section { prefix: MOMENTS[1], plan, values: v },
+        ]
+    }
+
+    fn best(&self) -> Vec<Section<'_, f32>> {
+        vec![Section { prefix: "", plan: self.parameters.plan(), values: self.parameters.all() }]
+    }
+
+    fn n_updates(&self) -> (u64, u64) {
+        (self.optimizer.state().1, 0)
+    }
+
+    fn restore(
+        &mut self,
+        archive: &Archive,
+        place: &str,
+        at: &Progress,
+    ) -> Result<(), TrainingError> {
+        let read = |prefix: &str| section(archive, prefix, &self.parameters, place);
+        let parameters = read(BOTH)?;
+        let [m, v] = [read(MOMENTS[0])?, read(MOMENTS[1])?];
+        self.optimizer.restore([m.all(), v.all()], at.n_updates);
+        self.parameters = parameters;
+        Ok(())
+    }
+}

@@ -1,0 +1,42 @@
+//! Training: phrases in, weights that predict out.
+//!
+//! A [`Dataset`] is read once from the tables of a store; [`Windows`] are cut from it, and a [`Loader`]
+//! makes them into batches ahead of time. What is learned and what that costs is in `objective` and
+//! `temporal`. Everything depends on seeds and numbers of steps, nothing on threads or clocks.
+
+mod checkpoint;
+mod config;
+mod dataset;
+mod decoder;
+mod diffusion;
+mod drive;
+mod ema;
+mod error;
+mod finetune;
+mod journal;
+mod learning_rate;
+mod loader;
+mod objective;
+mod sampling;
+mod temporal;
+mod window;
+
+pub use checkpoint::{Best, Checkpoints, Kind, Progress, State};
+pub use config::{
+    DecoderTraining, DiffusionTraining, FinetuneConfig, NetworkConfig, OptimizerConfig,
+    TrainConfig, differences,
+};
+pub use dataset::{Dataset, DatasetError, LeftOut, Phrase, Reading, Split};
+pub use decoder::DecoderLearner;
+pub use diffusion::{DiffusionLearner, Given, Withhold};
+pub use drive::{Alone, Drive, End, Learner, Losses, Plan, Reducer, Step, Validation, Watch};
+pub use ema::{Ema, EmaConfig};
+pub use error::TrainingError;
+pub use finetune::FinetuneLearner;
+pub use journal::{Journal, RowKind};
+pub use learning_rate::{Course, LearningRate};
+pub use loader::Loader;
+pub use objective::{Objective, Reconstruction, reconstruction};
+pub use sampling::{Condition, Denoiser};
+pub use temporal::{TemporalConfig, TemporalLosses, temporal_losses};
+pub use window::{Augmentation, Batch, Windows, fit_normalizer};
