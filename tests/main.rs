@@ -1,6 +1,7 @@
 //! The one integration-test crate; every file of `tests/` is a module of it.
 
 mod audio_header;
+mod diffusion;
 mod engine;
 mod extract;
 mod ingest_bad_input;

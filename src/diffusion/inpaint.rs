@@ -11,8 +11,9 @@ use super::schedule::Level;
 
 /// Values of a sample that are known, such as its first frames or its style channels.
 ///
-/// The sampled rest sees them only through the network, with the noise of the step: the mean of the
-/// rest moves towards that of the conditional distribution but, without resampling, stops short of it.
+/// The rest sees them only through the network and under the noise of the step, so that its mean moves
+/// towards that of the conditional distribution but stops short of it: for two channels of one
+/// Gaussian with a correlation of 0.79, half way with DDPM, a third of the way with DDIM and η = 0.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Known {
     values: Array3<f32>,
@@ -66,11 +67,11 @@ impl Known {
 
     /// Sets the known part of x_t to √ᾱ value + √(1−ᾱ) z.
     pub(super) fn impose_noisy(&self, x_t: &mut Array3<f32>, level: Level, z: &Array3<f32>) {
-        let (signal, noise) = (level.signal as f32, level.noise as f32);
+        let Level { signal, noise } = level;
         Zip::from(x_t).and(&self.values).and(&self.mask).and(z).for_each(
             |x_t, &value, &known, &z| {
                 if known {
-                    *x_t = signal * value + noise * z;
+                    *x_t = (signal * f64::from(value) + noise * f64::from(z)) as f32;
                 }
             },
         );
@@ -126,7 +127,7 @@ mod tests {
         let level = Level { signal: 0.6, noise: 0.8 };
         let mut x_t = arr3(&[[[7.0, 7.5]]]);
         known.impose_noisy(&mut x_t, level, &arr3(&[[[0.5, 0.5]]]));
-        assert_eq!(x_t, arr3(&[[[0.6_f32 * 3.0 + 0.8_f32 * 0.5, 7.5]]]));
+        assert_eq!(x_t, arr3(&[[[2.2, 7.5]]]));
         let (mut x0, mut epsilon) = (arr3(&[[[0.1, 0.2]]]), arr3(&[[[0.3, 0.4]]]));
         known.impose_on_estimates(&mut x0, &mut epsilon, &x_t, level);
         assert_eq!(x0, arr3(&[[[3.0, 0.2]]]));

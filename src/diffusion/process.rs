@@ -105,6 +105,9 @@ impl Schedule {
     }
 
     /// Returns the sum, sample by sample, of two tensors times what `factors` says of their level.
+    ///
+    /// Summed in f64 and rounded once: 1/√ᾱ is 2e4 where the cosine schedule ends, and what two
+    /// products lose in single precision would be as much as the network's own rounding.
     fn combine(
         &self,
         x: ArrayView3<'_, f32>,
@@ -117,11 +120,10 @@ impl Schedule {
         let mut sum = Array3::zeros(x.raw_dim());
         for (i, &t) in t.iter().enumerate() {
             let (a, b) = factors(self.level(Some(t)));
-            let (a, b) = (a as f32, b as f32);
             Zip::from(sum.index_axis_mut(Axis(0), i))
                 .and(x.index_axis(Axis(0), i))
                 .and(y.index_axis(Axis(0), i))
-                .for_each(|sum, &x, &y| *sum = a * x + b * y);
+                .for_each(|sum, &x, &y| *sum = (a * f64::from(x) + b * f64::from(y)) as f32);
         }
         sum
     }
@@ -145,7 +147,7 @@ pub(super) fn inversion(prediction: Prediction, level: Level) -> Inversion {
 
 /// Returns the ε of which x_t and x0 consist: (x_t − √ᾱ x0) / √(1−ᾱ).
 pub(super) fn epsilon_of(level: Level, x_t: f32, x0: f32) -> f32 {
-    (x_t - level.signal as f32 * x0) / level.noise as f32
+    ((f64::from(x_t) - level.signal * f64::from(x0)) / level.noise) as f32
 }
 
 #[cfg(test)]
@@ -184,9 +186,9 @@ mod tests {
             let (got_x0, got_noise) = schedule.estimate_within(target.view(), x_t.view(), &t, None);
             for (i, &t) in t.iter().enumerate() {
                 let Level { signal, noise: deviation } = schedule.level(Some(t));
-                // x_t and v are at most 4√2, each a sum of two rounded products of rounded
-                // factors; the inversion adds as many roundings and divides by √ᾱ or √(1−ᾱ).
-                let rounding = 8.0 * 5.7 * f64::from(f32::EPSILON);
+                // x_t and v are at most 4√2, each rounded once; the inversion divides what they
+                // lose by √ᾱ or √(1−ᾱ), and rounds once more.
+                let rounding = 2.0 * 5.7 * f64::from(f32::EPSILON);
                 let (x0_bound, noise_bound) = match prediction {
                     Prediction::Epsilon => (rounding / signal, 0.0),
                     Prediction::Sample => (0.0, rounding / deviation),

@@ -15,11 +15,10 @@ use super::spacing::{Step, steps};
 ///
 /// - `x`: x_T, standard normal, \[batch, frames, channels\]
 /// - `denoise`: x_t and t to the network's prediction, which [`Schedule::prediction`] names
-/// - `noise`: fills a slice, which is in the order of \[batch, frames, channels\], with the standard
-///   normal numbers of a draw. Every draw has its own number:
-///   2i for the noise that step i adds, 2i + 1 for the noise on known values before step i. A draw is
-///   asked for at most once, and not at all where nothing is random: same `x` and same draws, same
-///   bytes
+/// - `noise`: fills a slice, in the order of \[batch, frames, channels\], with the standard normal
+///   numbers of a draw. Every draw has its own number: 2i for the noise that step i adds, 2i + 1 for
+///   the noise on known values before step i. A draw is asked for at most once, and not at all where
+///   nothing is random: same `x` and same draws, same bytes
 /// - `known`: values to keep; the sample has them exactly
 ///
 /// NaN and infinity from the denoiser stay in the samples that have them.

@@ -28,8 +28,7 @@ impl Level {
 
 /// β and ᾱ of every step of a diffusion, with what the network predicts and where x0 is clipped.
 ///
-/// Steps are t = 0 .. `len() − 1`. Tables and coefficients are f64; they become f32 where they are
-/// multiplied with a tensor.
+/// Steps are t = 0 .. `len() − 1`. Tables and coefficients are f64; what they make of tensors is f32.
 ///
 /// # Panics
 /// Methods that take a step panic where it is not below `len()`.

@@ -1,0 +1,8 @@
+//! The diffusion against published formulas and against closed forms of a Gaussian.
+
+mod gaussian;
+mod golden;
+mod guidance;
+mod known;
+mod propagation;
+mod samplers;
