@@ -16,6 +16,7 @@ use std::process::ExitCode;
 use clap::{Arg, ArgAction, ArgMatches, Command, FromArgMatches as _};
 
 use crate::stages::extract::Extract;
+use crate::stages::finetune::Finetune;
 use crate::stages::ingest::Ingest;
 use crate::stages::model::Model;
 use crate::stages::plot::Plot;
@@ -45,6 +46,7 @@ fn entries() -> Vec<Entry> {
         Entry::of::<Ingest>(),
         Entry::of::<Extract>(),
         Entry::of::<Train>(),
+        Entry::of::<Finetune>(),
         Entry::of::<Model>(),
         Entry::of::<Plot>(),
         #[cfg(feature = "query")]

@@ -3,6 +3,7 @@
 pub mod extract;
 pub mod failure;
 pub mod feature_file;
+pub mod finetune;
 pub mod ingest;
 pub mod model;
 pub mod plot;

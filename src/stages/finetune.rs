@@ -1,0 +1,277 @@
+//! `finetune`: the UNet and the decoder of a run learn together, end to end, to hold motion together.
+
+use std::num::NonZeroUsize;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::ensure;
+
+use super::train::session::{Looker, MachineParams, check_run_name, claim, read_phrases};
+use super::train::{Account, StageAccount, best_section, quoted, restore};
+use super::{ClientParams, Contract, Progress, Stage, Summary};
+use crate::model::{MotionDecoder, UNet1D};
+use crate::store::Location;
+use crate::training::{
+    Augmentation, Checkpoints, DecoderLearner, DiffusionLearner, Drive, End, FinetuneConfig,
+    FinetuneLearner, Journal, Kind, Learner, Loader, OptimizerConfig, Plan, State, TemporalConfig,
+    TrainConfig, TrainingError, Windows,
+};
+
+/// The stage.
+pub struct Finetune;
+
+/// What the user asks for.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Params {
+    /// Folder or bucket of the tables and the run.
+    #[arg(long, value_name = "URL")]
+    pub store: String,
+    /// Name of the run, which `train` has finished; fine-tuning that was begun is continued.
+    #[arg(long, value_name = "NAME")]
+    pub run: String,
+    /// Refuse to start fine-tuning that was not begun.
+    #[arg(long)]
+    pub resume: bool,
+    /// Times that all phrases are seen [default: 50, without --minutes]
+    #[arg(long, value_name = "N", help_heading = "Budget")]
+    pub epochs: Option<u64>,
+    /// Steps.
+    #[arg(long, value_name = "N", help_heading = "Budget")]
+    pub steps: Option<u64>,
+    /// Minutes that fine-tuning may take, over all its resumptions.
+    #[arg(long, value_name = "M", help_heading = "Budget")]
+    pub minutes: Option<f64>,
+    /// Training phrases to use [default: all]
+    #[arg(long, value_name = "N", help_heading = "Budget")]
+    pub num_phrases: Option<NonZeroUsize>,
+    /// Validations without improvement after which fine-tuning ends; 0 for never.
+    #[arg(long, value_name = "N", default_value_t = 10, help_heading = "Budget")]
+    pub patience: u64,
+    /// Epochs from one validation to the next.
+    #[arg(long, value_name = "N", default_value_t = 1, help_heading = "Budget")]
+    pub validate_every: u64,
+    /// Epochs from one checkpoint to the next.
+    #[arg(long, value_name = "N", default_value_t = 10, help_heading = "Budget")]
+    pub save_every: u64,
+    /// Steps from one checkpoint to the next, beside --save-every.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..),
+          help_heading = "Budget")]
+    pub save_every_steps: Option<u64>,
+    /// Longest time between two checkpoints, in minutes.
+    #[arg(long, value_name = "M", default_value_t = 10.0, help_heading = "Budget")]
+    pub save_every_minutes: f64,
+    /// Windows of a step.
+    #[arg(long, value_name = "N", default_value_t = NonZeroUsize::new(8).expect("not 0"),
+          help_heading = "Optimizer")]
+    pub batch_size: NonZeroUsize,
+    /// Learning rate of the UNet.
+    #[arg(long, value_name = "X", default_value_t = 1e-6, help_heading = "Optimizer")]
+    pub lr_diffusion: f64,
+    /// Learning rate of the decoder.
+    #[arg(long, value_name = "X", default_value_t = 5e-5, help_heading = "Optimizer")]
+    pub lr_decoder: f64,
+    /// Weight of the loss of the UNet's prediction.
+    #[arg(long, value_name = "W", default_value_t = 0.1, help_heading = "Losses")]
+    pub diffusion_weight: f64,
+    /// Weight of the distance of sampled motion from the phrase's.
+    #[arg(long, value_name = "W", default_value_t = 1.0, help_heading = "Losses")]
+    pub decoder_weight: f64,
+    /// Weight of the losses of coherence in time.
+    #[arg(long, value_name = "W", default_value_t = 10.0, help_heading = "Losses")]
+    pub temporal_weight: f64,
+    /// Weight of steps longer than half a metre, within the losses of coherence.
+    #[arg(long, value_name = "W", default_value_t = TemporalConfig::default().smoothness_weight,
+          help_heading = "Losses")]
+    pub smoothness_weight: f64,
+    /// Steps of DDIM that gradients flow through.
+    #[arg(long, value_name = "N", default_value_t = 5, help_heading = "Losses")]
+    pub num_steps: usize,
+    #[command(flatten)]
+    pub machine: MachineParams,
+    #[command(flatten)]
+    pub client: ClientParams,
+    /// Seed of everything that is left to chance.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seed: u64,
+    /// Start fine-tuning anew: its checkpoints and its log are removed.
+    #[arg(long)]
+    pub force: bool,
+}
+
+impl Params {
+    fn config(&self) -> FinetuneConfig {
+        FinetuneConfig {
+            seed: self.seed,
+            batch_size: self.batch_size.get(),
+            lr_diffusion: self.lr_diffusion,
+            lr_decoder: self.lr_decoder,
+            diffusion_weight: self.diffusion_weight,
+            decoder_weight: self.decoder_weight,
+            temporal_weight: self.temporal_weight,
+            temporal: TemporalConfig {
+                smoothness_weight: self.smoothness_weight,
+                ..TemporalConfig::default()
+            },
+            num_steps: self.num_steps,
+            optimizer: OptimizerConfig::default(),
+            num_phrases: self.num_phrases.map(NonZeroUsize::get),
+        }
+    }
+
+    fn check(&self) -> anyhow::Result<()> {
+        check_run_name(&self.run)?;
+        for (flag, x) in [
+            ("--lr-diffusion", self.lr_diffusion),
+            ("--lr-decoder", self.lr_decoder),
+            ("--diffusion-weight", self.diffusion_weight),
+            ("--decoder-weight", self.decoder_weight),
+            ("--temporal-weight", self.temporal_weight),
+            ("--smoothness-weight", self.smoothness_weight),
+        ] {
+            ensure!(
+                x >= 0.0 && x.is_finite(),
+                "{flag} {x} is below 0; give 0 or a positive number"
+            );
+        }
+        for (flag, x) in
+            [("--minutes", self.minutes), ("--save-every-minutes", Some(self.save_every_minutes))]
+        {
+            let is_positive = x.is_none_or(|x| x > 0.0 && x.is_finite());
+            ensure!(is_positive, "{flag} is not above 0; give a positive number");
+        }
+        Ok(())
+    }
+
+    fn plan(&self, windows: &Windows) -> Plan {
+        let minutes = |m: f64| Duration::try_from_secs_f64(m * 60.0).unwrap_or(Duration::MAX);
+        let is_bounded = self.steps.is_some() || self.minutes.is_some();
+        Plan {
+            n_steps: self.steps,
+            n_epochs: self.epochs.or_else(|| (!is_bounded).then_some(50)),
+            time: self.minutes.map(minutes),
+            windows_per_epoch: windows.n_train() as u64,
+            batch_size: self.batch_size.get() as u64,
+            validate_every_epochs: self.validate_every,
+            save_every_epochs: self.save_every,
+            save_every_steps: self.save_every_steps,
+            save_every: minutes(self.save_every_minutes),
+            patience: (self.patience > 0).then_some(self.patience),
+            store_patience: self.machine.patience(),
+        }
+    }
+}
+
+impl Stage for Finetune {
+    const NAME: &'static str = "finetune";
+    const ABOUT: &'static str = "fine-tune a trained run end to end for motion that holds together";
+    const CONTRACT: Contract = Contract {
+        reads: "phrases, motion, features, runs/<run>/",
+        writes: "runs/<run>/finetune/ (checkpoints), training_log, failures",
+    };
+    type Params = Params;
+
+    fn run(params: Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
+        params.check()?;
+        let config = params.config();
+        let store = Location::open(&params.store, &params.client.options())?;
+        let watch = Looker(progress);
+        let run = params.run.as_str();
+        let checkpoints = Checkpoints::new(&store, run, Self::NAME);
+        ensure!(
+            !params.resume || !checkpoints.steps(Kind::Step)?.is_empty(),
+            "run {run} has no fine-tuning to resume in {store}; leave --resume out to start it"
+        );
+        let trained = Trained::read(&store, run)?;
+        if params.force {
+            checkpoints.clear()?;
+            Journal::open(&store, Self::NAME, run, Self::NAME)?.clear()?;
+            store.remove(&format!("runs/{run}/{}.json", Self::NAME))?;
+        }
+        let patience = params.machine.patience();
+        claim(&store, run, Self::NAME, &config, patience, &watch)?;
+
+        let machine = &params.machine;
+        let limit = config.num_phrases;
+        let phrases = read_phrases(&store, Self::NAME, machine, limit, progress, &watch)?;
+        let network = &trained.state.config.network;
+        let windows = Arc::new(Windows::new(
+            Arc::clone(&phrases.dataset),
+            trained.state.normalizer.clone(),
+            // The phrases as they are: sampled motion is held against them.
+            Augmentation { condition_noise: 0.0, mirror: false, yaw_deg: 0.0, stretch: 0.0 },
+            network.window_frames,
+            params.seed,
+        ));
+        let objective = &trained.state.config.diffusion.objective;
+        let mut learner = FinetuneLearner::new(
+            network,
+            objective,
+            &config,
+            &windows,
+            [&trained.unet, &trained.decoder],
+        )?;
+        let fresh = State::new(
+            Self::NAME,
+            config.clone(),
+            windows.dataset().fingerprint(),
+            windows.normalizer().clone(),
+        );
+        let state = restore(&mut learner, &checkpoints, fresh, run, &watch)?;
+        let started_at = state.progress.step;
+        let threads = machine.start_threads()?;
+        let plan = params.plan(&windows);
+        let mut drive = Drive {
+            plan,
+            state,
+            checkpoints,
+            journal: Journal::open(&store, Self::NAME, run, Self::NAME)?,
+            watch: &watch,
+            threads: &threads,
+        };
+        let batch_size = plan.batch_size as usize;
+        let end = drive.run(&mut learner, |first| {
+            Loader::start(&windows, batch_size, first, machine.loader_threads)
+        })?;
+        let mut account = Account::new(run, &store, phrases.left_out);
+        account.add(StageAccount::of(Self::NAME, &drive.state.progress, started_at, end));
+        if end == End::Interrupted {
+            let mut words: Vec<String> = std::env::args().map(|word| quoted(&word)).collect();
+            words.retain(|word| word != "--force");
+            if !params.resume {
+                words.push("--resume".to_owned());
+            }
+            return Ok(Box::new(account.interrupted(&words.join(" "))));
+        }
+        Ok(Box::new(account))
+    }
+}
+
+/// What `train` left of a run.
+struct Trained {
+    state: State<TrainConfig>,
+    unet: crate::autodiff::Parameters<f32>,
+    decoder: crate::autodiff::Parameters<f32>,
+}
+
+impl Trained {
+    fn read(store: &Location, run: &str) -> Result<Self, TrainingError> {
+        let of = |stage: &'static str| Checkpoints::new(store, run, stage);
+        let diffusion = of(DiffusionLearner::STAGE);
+        let Some(&step) = diffusion.steps(Kind::Best)?.last() else {
+            let way_out = format!("run motiongen train --run {run} first");
+            return Err(TrainingError::Missing {
+                run: run.to_owned(),
+                what: "trained UNet",
+                way_out,
+            });
+        };
+        let state: State<TrainConfig> = diffusion.read(Kind::Best, step, State::of)?;
+        let network = &state.config.network;
+        let (_, unet) = UNet1D::new(&network.unet);
+        let (_, decoder) = MotionDecoder::new(&network.decoder);
+        let unet = best_section(&diffusion, run, "unet.", "trained UNet", unet)?;
+        let (stage, what) = (of(DecoderLearner::STAGE), "trained decoder");
+        let decoder = best_section(&stage, run, "decoder.", what, decoder)?;
+        Ok(Self { state, unet, decoder })
+    }
+}
