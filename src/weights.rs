@@ -9,6 +9,7 @@ use std::collections::{BTreeMap, HashMap};
 use half::{bf16, f16};
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, SafeTensorError, TensorView, View};
+use tempfile::NamedTempFile;
 
 use crate::autodiff::{Element, Parameters, Plan};
 use crate::model::{ParameterId, ParameterList};
@@ -103,7 +104,8 @@ pub fn save<E: Element>(
     Ok(safetensors::serialize(tensors(&[section], precision), header(metadata))?)
 }
 
-/// Writes several sections into a file that the caller made, one tensor in memory at a time.
+/// Writes several sections in place of a file that the caller made, one tensor in memory at a time, and
+/// returns the file that is there then.
 ///
 /// # Errors
 /// If the format cannot hold them, or the disk is full.
@@ -111,10 +113,15 @@ pub fn save_to_file<E: Element>(
     sections: &[Section<E>],
     precision: Precision,
     metadata: &BTreeMap<String, String>,
-    file: &tempfile::NamedTempFile,
-) -> Result<(), WeightsError> {
+    file: NamedTempFile,
+) -> Result<NamedTempFile, WeightsError> {
+    let path = file.into_temp_path();
     let tensors = tensors(sections, precision);
-    Ok(safetensors::serialize_to_file(tensors, header(metadata), file.path())?)
+    safetensors::serialize_to_file(tensors, header(metadata), &path)?;
+    // The library writes another file and renames it: what was open is not what lies there now.
+    let open = std::fs::File::options().read(true).write(true).open(&path);
+    let open = open.map_err(SafeTensorError::IoError)?;
+    Ok(NamedTempFile::from_parts(open, path))
 }
 
 /// A safetensors file that was read.
@@ -257,13 +264,14 @@ mod tests {
     fn sections_are_told_apart_by_their_prefix() {
         let weights = Parameters::<f32>::new(small(), 3);
         let average = Parameters::<f32>::new(small(), 4);
-        let file = tempfile::NamedTempFile::new().unwrap();
+        let file = NamedTempFile::new().unwrap();
         let sections = [("model.", &weights), ("ema.", &average)].map(|(prefix, parameters)| {
             Section { prefix, plan: parameters.plan(), values: parameters.all() }
         });
         let metadata = BTreeMap::from([("step".to_owned(), "7".to_owned())]);
-        save_to_file(&sections, Precision::F32, &metadata, &file).unwrap();
+        let file = save_to_file(&sections, Precision::F32, &metadata, file).unwrap();
         let bytes = std::fs::read(file.path()).unwrap();
+        assert_eq!(file.as_file().metadata().unwrap().len(), bytes.len() as u64);
         let archive = Archive::open(&bytes).unwrap();
         assert_eq!(archive.metadata(), &metadata);
         assert_eq!(archive.section::<f32>("ema.", small()).unwrap().all(), average.all());

@@ -17,6 +17,7 @@ pub mod bvh;
 pub mod capture;
 pub mod channels;
 pub mod kinematics;
+pub mod locking;
 pub mod lowpass;
 pub mod normalizer;
 pub mod npy;

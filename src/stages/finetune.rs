@@ -187,6 +187,7 @@ impl Stage for Finetune {
             Journal::open(&store, Self::NAME, run, Self::NAME)?.clear()?;
             store.remove(&format!("runs/{run}/{}.json", Self::NAME))?;
         }
+        store.sweep()?;
         let patience = params.machine.patience();
         claim(&store, run, Self::NAME, &config, patience, &watch)?;
 

@@ -8,6 +8,8 @@ use super::location::{Listed, Put};
 /// Start of the names of files being written. The dot keeps an abandoned one out of `*.parquet` globs
 /// and of listings.
 const PARTIAL: &str = ".partial-";
+/// Start of the names that libraries give to files that they write beside the one they were asked for.
+const LIBRARY_PARTIAL: &str = ".tmp";
 /// Age at which a file being written is taken for abandoned.
 const PARTIAL_LIFETIME: std::time::Duration = std::time::Duration::from_secs(24 * 3600);
 
@@ -98,10 +100,13 @@ pub fn sweep(root: &FsPath) -> Result<(), StoreError> {
     if !root.exists() {
         return Ok(());
     }
-    for entry in walkdir::WalkDir::new(root).max_depth(3) {
+    for entry in walkdir::WalkDir::new(root).max_depth(4) {
         let place = || root.display().to_string();
         let entry = entry.map_err(|e| StoreError::io("list", &place(), e.into()))?;
-        let left_behind = entry.file_name().as_encoded_bytes().starts_with(PARTIAL.as_bytes())
+        let name = entry.file_name().as_encoded_bytes();
+        let is_partial =
+            [PARTIAL, LIBRARY_PARTIAL].iter().any(|start| name.starts_with(start.as_bytes()));
+        let left_behind = is_partial
             && entry
                 .metadata()
                 .ok()

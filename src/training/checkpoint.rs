@@ -177,7 +177,7 @@ impl<'a> Checkpoints<'a> {
         })?;
         let metadata = BTreeMap::from([(STATE.to_owned(), text)]);
         let file = self.store.temporary(&path)?;
-        save_to_file(sections, Precision::F32, &metadata, &file)
+        let file = save_to_file(sections, Precision::F32, &metadata, file)
             .map_err(|source| TrainingError::Weights { place: self.store.url_of(&path), source })?;
         let put = self.store.put_file_new(&path, file)?;
         let kept = match kind {

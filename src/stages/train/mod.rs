@@ -121,6 +121,7 @@ impl Stage for Train {
         if params.force {
             run.clear()?;
         }
+        store.sweep()?;
         let patience = params.machine.patience();
         claim(&store, &params.run, Self::NAME, &config, patience, &watch)?;
         run.train(progress)

@@ -1,0 +1,313 @@
+//! What a run learned, measured on songs that it never saw.
+//!
+//!     cargo run --release --no-default-features --example learned -- --store URL --run NAME
+//!
+//! Motion is sampled for phrases of the validation and test songs, and asked: does its vertical velocity
+//! follow the bar (R² of a regression on four harmonics of the bar's phase, against the same at wrong
+//! tempi)? A control gets the music of another song. See docs/training.md.
+
+use std::num::NonZeroUsize;
+use std::sync::Arc;
+
+use motiongen::autodiff::{Arena, Eager, Interpreter as _, Stream, Threads};
+use motiongen::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
+use motiongen::model::{MotionDecoder, UNet1D};
+use motiongen::motion::locking::bar_locking;
+use motiongen::motion::{Channel, MOTION_DIM};
+use motiongen::store::{ClientOptions, Location, Patience};
+use motiongen::training::{
+    Checkpoints, Condition, Dataset, Denoiser, Kind, Phrase, Reading, Split, State, TrainConfig,
+};
+use ndarray::Array3;
+
+/// Wrong tempi that the true one is held against.
+const N_WRONG: usize = 199;
+const BATCH: usize = 16;
+
+struct Arguments {
+    store: String,
+    run: String,
+    /// `diffusion` (the UNet and the decoder as trained) or `finetune`.
+    stage: String,
+    n_windows: usize,
+    n_steps: usize,
+    threads: usize,
+}
+
+fn arguments() -> Arguments {
+    let mut found = Arguments {
+        store: String::new(),
+        run: String::new(),
+        stage: "diffusion".to_owned(),
+        n_windows: 128,
+        n_steps: 20,
+        threads: std::thread::available_parallelism().map_or(1, NonZeroUsize::get),
+    };
+    let mut words = std::env::args().skip(1);
+    while let (Some(flag), Some(value)) = (words.next(), words.next()) {
+        let number = || value.parse().expect("a number");
+        match flag.as_str() {
+            "--store" => found.store = value,
+            "--run" => found.run = value,
+            "--stage" => found.stage = value,
+            "--windows" => found.n_windows = number(),
+            "--steps" => found.n_steps = number(),
+            "--threads" => found.threads = number(),
+            _ => panic!("unknown flag {flag}"),
+        }
+    }
+    found
+}
+
+/// A phrase of a song that training did not see.
+struct HeldOut {
+    song: String,
+    /// \[frames, 163\]
+    audio: Vec<f32>,
+    /// Bar phase of each frame.
+    phase: Vec<f64>,
+    /// As captured: vertical velocity, m/s.
+    real: Vec<f64>,
+}
+
+fn column(frames: &[f32], channel: usize) -> Vec<f64> {
+    frames.chunks_exact(MOTION_DIM).map(|frame| f64::from(frame[channel])).collect()
+}
+
+fn held_out(dataset: &Dataset, n_frames: usize, n: usize) -> Vec<HeldOut> {
+    let phrases: Vec<&Phrase> = dataset
+        .phrases()
+        .iter()
+        .filter(|phrase| phrase.split != Split::Train && phrase.n_frames >= n_frames)
+        .collect();
+    let stride = phrases.len().div_ceil(n).max(1);
+    phrases
+        .into_iter()
+        .step_by(stride)
+        .map(|phrase| {
+            let motion = dataset.motion(phrase, 0, n_frames).expect("frames at hand");
+            let audio = dataset.features(phrase, 0, n_frames).expect("frames at hand");
+            let frames: Vec<f32> = motion.iter().copied().collect();
+            HeldOut {
+                song: phrase.id.split(".t").next().unwrap_or_default().to_owned(),
+                audio: audio.iter().copied().collect(),
+                phase: column(&frames, Channel::Phase.range().start),
+                real: column(&frames, Channel::Velocity.range().start + 1),
+            }
+        })
+        .collect()
+}
+
+/// A phase that counts bars on.
+fn unwrapped(phase: &[f64]) -> Vec<f64> {
+    let mut bars = 0.0;
+    let mut last = phase.first().copied().unwrap_or(0.0);
+    phase
+        .iter()
+        .map(|&x| {
+            if last - x > 0.5 {
+                bars += 1.0;
+            }
+            last = x;
+            bars + x
+        })
+        .collect()
+}
+
+/// Tempo ratios from 0.55 to 1.8 that are none of small whole numbers, evenly on a log scale.
+fn wrong_ratios() -> Vec<f64> {
+    let simple: Vec<f64> =
+        (1..=4).flat_map(|a| (1..=4).map(move |b| f64::from(a) / f64::from(b))).collect();
+    let all = (0..4000).map(|i| 0.55 * (1.8_f64 / 0.55).powf(f64::from(i) / 3999.0));
+    let apart: Vec<f64> =
+        all.filter(|r| simple.iter().all(|s| (r / s).ln().abs() > 0.04)).collect();
+    (0..N_WRONG).map(|i| apart[i * (apart.len() - 1) / (N_WRONG - 1)]).collect()
+}
+
+struct Lock {
+    r2: f64,
+    wrong_mean: f64,
+    p: f64,
+}
+
+/// R² of all windows at the true tempo, against wrong ones.
+fn lock(windows: &[HeldOut], signals: &[Vec<f64>]) -> Lock {
+    let mean = |ratio: f64| {
+        let of = |(window, signal): (&HeldOut, &Vec<f64>)| {
+            let phase: Vec<f64> = unwrapped(&window.phase).iter().map(|x| x * ratio).collect();
+            bar_locking(signal, &phase)
+        };
+        windows.iter().zip(signals).map(of).sum::<f64>() / windows.len() as f64
+    };
+    let r2 = mean(1.0);
+    let wrong: Vec<f64> = wrong_ratios().into_iter().map(mean).collect();
+    let n_as_good = wrong.iter().filter(|&&w| w >= r2).count();
+    Lock {
+        r2,
+        wrong_mean: wrong.iter().sum::<f64>() / wrong.len() as f64,
+        p: (1 + n_as_good) as f64 / (1 + wrong.len()) as f64,
+    }
+}
+
+fn correlation(a: &[f64], b: &[f64]) -> f64 {
+    let n = a.len() as f64;
+    let mean = |x: &[f64]| x.iter().sum::<f64>() / n;
+    let (ma, mb) = (mean(a), mean(b));
+    let dot = |x: &[f64], mx: f64, y: &[f64], my: f64| {
+        x.iter().zip(y).map(|(x, y)| (x - mx) * (y - my)).sum::<f64>()
+    };
+    dot(a, ma, b, mb) / (dot(a, ma, a, ma) * dot(b, mb, b, mb)).sqrt().max(1e-12)
+}
+
+fn main() {
+    let arguments = arguments();
+    let store = Location::open(&arguments.store, &ClientOptions::default()).expect("a store");
+    let threads =
+        Threads::start(NonZeroUsize::new(arguments.threads).expect("some")).expect("threads");
+    let reading = Reading {
+        in_memory: true,
+        n_threads: NonZeroUsize::new(arguments.threads).expect("some"),
+        patience: Patience::default(),
+        max_train_phrases: None,
+    };
+    let (dataset, _) =
+        Dataset::read(&store, &reading, &|e, _| eprintln!("{e}"), &|_, _| ()).expect("phrases");
+    let dataset = Arc::new(dataset);
+
+    let trained = Checkpoints::new(&store, &arguments.run, "diffusion");
+    let last = |checkpoints: &Checkpoints| {
+        *checkpoints.steps(Kind::Best).expect("listed").last().expect("a checkpoint")
+    };
+    let state: State<TrainConfig> =
+        trained.read(Kind::Best, last(&trained), State::of).expect("a state");
+    let network = &state.config.network;
+    let (unet, unet_list) = UNet1D::new(&network.unet);
+    let (decoder, decoder_list) = MotionDecoder::new(&network.decoder);
+    let (from_unet, from_decoder) = match arguments.stage.as_str() {
+        "finetune" => {
+            let tuned = Checkpoints::new(&store, &arguments.run, "finetune");
+            (tuned.clone(), tuned)
+        }
+        _ => (trained, Checkpoints::new(&store, &arguments.run, "decoder")),
+    };
+    let read = |checkpoints: &Checkpoints, prefix: &str, list: motiongen::model::ParameterList| {
+        checkpoints
+            .read(Kind::Best, last(checkpoints), |archive, _| {
+                Ok(archive.section::<f32>(prefix, list.clone()).expect("weights"))
+            })
+            .expect("read")
+    };
+    let weights = read(&from_unet, "unet.", unet_list);
+    let decoder_weights = read(&from_decoder, "decoder.", decoder_list);
+    let schedule = Schedule::new(&network.diffusion).expect("a schedule");
+    let windows = held_out(&dataset, network.window_frames, arguments.n_windows);
+    let n_songs = {
+        let mut songs: Vec<_> = windows.iter().map(|w| w.song.as_str()).collect();
+        songs.dedup();
+        songs.len()
+    };
+    println!(
+        "run {} ({}), {} phrases of {n_songs} held-out songs, DDIM {} steps",
+        arguments.run,
+        arguments.stage,
+        windows.len(),
+        arguments.n_steps
+    );
+
+    let sample = |audio_of: &dyn Fn(usize) -> usize, seed: u64| -> Vec<Vec<f32>> {
+        let frames = network.window_frames;
+        let arena = Arena::default();
+        let takes_style = network.unet.style_dim > 0;
+        let denoiser = Denoiser { unet: &unet, parameters: &weights, arena: &arena, takes_style };
+        let config = SamplerConfig {
+            sampler: Sampler::Ddim { eta: 0.0 },
+            n_steps: arguments.n_steps,
+            spacing: Spacing::Trailing,
+            clip: true,
+        };
+        let mut motions = Vec::new();
+        for first in (0..windows.len()).step_by(BATCH) {
+            let n = BATCH.min(windows.len() - first);
+            let mut noise = Array3::<f32>::zeros((n, frames, MOTION_DIM));
+            let values = noise.as_slice_mut().expect("in order");
+            Stream::new(seed, first as u64).normal(0, values);
+            let audio: Vec<f32> =
+                (first..first + n).flat_map(|i| windows[audio_of(i)].audio.clone()).collect();
+            let mask = vec![1.0; n * frames];
+            let style = vec![0.0; n * 8];
+            let condition =
+                Condition { audio: &audio, mask: &mask, style: &style, drop_audio: &[] };
+            let latent = threads.run(|| {
+                denoiser.sample(&config, &schedule, noise, &condition, |_, _| ()).expect("sampled")
+            });
+            let latent = latent.as_standard_layout().into_owned();
+            let mut g = Eager::new(&decoder_weights, &arena);
+            let x = g.constant(latent.shape(), latent.as_slice().expect("in order"));
+            let y = decoder.forward(&mut g, &x).expect("decoded");
+            motions.extend(y.data().chunks_exact(frames * MOTION_DIM).map(<[f32]>::to_vec));
+        }
+        motions
+    };
+    let up = Channel::Velocity.range().start + 1;
+    let signals = |motions: &[Vec<f32>]| -> Vec<Vec<f64>> {
+        motions.iter().map(|motion| column(motion, up)).collect()
+    };
+    let real: Vec<Vec<f64>> = windows.iter().map(|w| w.real.clone()).collect();
+    let generated = sample(&|i| i, 1);
+    // The music of a phrase half the list away, which is another song's.
+    let n = windows.len();
+    let shuffled = sample(&|i| (i + n / 2) % n, 1);
+
+    println!("{:<22} {:>8} {:>12} {:>8}", "", "R²", "wrong tempi", "p");
+    let show = |name: &str, signals: &[Vec<f64>]| {
+        let Lock { r2, wrong_mean, p } = lock(&windows, signals);
+        println!("{name:<22} {r2:>8.3} {wrong_mean:>12.3} {p:>8.3}");
+    };
+    show("constructed (truth)", &real);
+    show("generated", &signals(&generated));
+    show("shuffled condition", &signals(&shuffled));
+
+    let speed = |motion: &[f32]| {
+        let v = Channel::Velocity.range();
+        let frames = motion.chunks_exact(MOTION_DIM);
+        let n = frames.len() as f64;
+        frames
+            .map(|f| f[v.clone()].iter().map(|x| f64::from(*x).powi(2)).sum::<f64>().sqrt())
+            .sum::<f64>()
+            / n
+    };
+    let onset = |window: &HeldOut| {
+        let dim = window.audio.len() / window.phase.len();
+        let frames = window.audio.chunks_exact(dim);
+        let n = frames.len() as f64;
+        frames.map(|f| f64::from(f[dim - 1]) + f64::from(f[dim - 3])).sum::<f64>() / n
+    };
+    let onsets: Vec<f64> = windows.iter().map(onset).collect();
+    let speeds = |motions: &[Vec<f32>]| motions.iter().map(|m| speed(m)).collect::<Vec<_>>();
+    println!(
+        "speed against onset strength and loudness: generated {:.2}, shuffled {:.2}; mean speed {:.2} m/s",
+        correlation(&speeds(&generated), &onsets),
+        correlation(&speeds(&shuffled), &onsets),
+        speeds(&generated).iter().sum::<f64>() / n as f64
+    );
+    let errors = |motions: &[Vec<f32>], of: Channel, derivative: Channel| {
+        let mut sum = 0.0;
+        for motion in motions {
+            let frames = motion.chunks_exact(MOTION_DIM).collect::<Vec<_>>();
+            let mut error = 0.0;
+            for pair in frames.windows(2) {
+                for i in 0..3 {
+                    let (x, d) = (of.range().start + i, derivative.range().start + i);
+                    error += f64::from((pair[0][d] - 30.0 * (pair[1][x] - pair[0][x])).abs()) / 3.0;
+                }
+            }
+            sum += error / (frames.len() - 1) as f64;
+        }
+        sum / motions.len() as f64
+    };
+    println!(
+        "coherence of generated motion: |v - dp/dt| {:.4} m/s, |a - dv/dt| {:.3} m/s²",
+        errors(&generated, Channel::Position, Channel::Velocity),
+        errors(&generated, Channel::Velocity, Channel::Acceleration)
+    );
+}
