@@ -18,3 +18,4 @@ mod schemas;
 mod servers;
 mod store_suite;
 mod support;
+mod train;

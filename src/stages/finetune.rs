@@ -6,7 +6,9 @@ use std::time::Duration;
 
 use anyhow::ensure;
 
-use super::train::session::{Looker, MachineParams, check_run_name, claim, read_phrases};
+use super::train::session::{
+    Looker, MachineParams, check_run_name, claim, claim_path, read_phrases,
+};
 use super::train::{Account, StageAccount, best_section, quoted, restore};
 use super::{ClientParams, Contract, Progress, Stage, Summary};
 use crate::model::{MotionDecoder, UNet1D};
@@ -185,12 +187,9 @@ impl Stage for Finetune {
         if params.force {
             checkpoints.clear()?;
             Journal::open(&store, Self::NAME, run, Self::NAME)?.clear()?;
-            store.remove(&format!("runs/{run}/{}.json", Self::NAME))?;
+            store.remove(&claim_path(run, Self::NAME))?;
         }
         store.sweep()?;
-        let patience = params.machine.patience();
-        claim(&store, run, Self::NAME, &config, patience, &watch)?;
-
         let machine = &params.machine;
         let limit = config.num_phrases;
         let phrases = read_phrases(&store, Self::NAME, machine, limit, progress, &watch)?;
@@ -211,6 +210,7 @@ impl Stage for Finetune {
             &windows,
             [&trained.unet, &trained.decoder],
         )?;
+        claim(&store, run, Self::NAME, &config, machine.patience(), &watch)?;
         let fresh = State::new(
             Self::NAME,
             config.clone(),
@@ -227,6 +227,7 @@ impl Stage for Finetune {
             checkpoints,
             journal: Journal::open(&store, Self::NAME, run, Self::NAME)?,
             watch: &watch,
+            anchor: claim_path(run, Self::NAME),
             threads: &threads,
         };
         let batch_size = plan.batch_size as usize;

@@ -6,7 +6,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::motion::Normalizer;
-use crate::store::{Location, Put};
+use crate::store::{Location, Put, StoreError};
 use crate::weights::{Archive, Precision, Section, save_to_file};
 
 use super::error::TrainingError;
@@ -142,6 +142,14 @@ impl<'a> Checkpoints<'a> {
         self.store.url_of(&self.path(kind, step))
     }
 
+    /// Refuses a store in which a file of the run is missing.
+    ///
+    /// # Errors
+    /// [`StoreError::NotFound`], or what the store says.
+    pub fn check_anchor(&self, path: &str) -> Result<(), StoreError> {
+        self.store.size_bytes(path).map(|_| ())
+    }
+
     /// Returns the steps of the checkpoints that are there, in order.
     ///
     /// # Errors
@@ -193,6 +201,14 @@ impl<'a> Checkpoints<'a> {
         Ok(put)
     }
 
+    /// Removes a checkpoint.
+    ///
+    /// # Errors
+    /// What the store says.
+    pub fn remove(&self, kind: Kind, step: u64) -> Result<(), TrainingError> {
+        Ok(self.store.remove(&self.path(kind, step))?)
+    }
+
     /// Removes all checkpoints of the stage.
     ///
     /// # Errors
@@ -200,7 +216,7 @@ impl<'a> Checkpoints<'a> {
     pub fn clear(&self) -> Result<(), TrainingError> {
         for kind in [Kind::Step, Kind::Best] {
             for step in self.steps(kind)? {
-                self.store.remove(&self.path(kind, step))?;
+                self.remove(kind, step)?;
             }
         }
         Ok(())

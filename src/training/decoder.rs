@@ -1,13 +1,14 @@
 //! Training of the decoder: from latents that are a little off to the motion that they should be.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use ndarray::Array3;
 
 use crate::autodiff::{AdamW, Arena, Eager, Gradients, Interpreter, Parameters, Stream, Tape};
 use crate::diffusion::{Schedule, ddim_update};
-use crate::model::{DecoderConfig, MotionDecoder};
-use crate::motion::MOTION_DIM;
+use crate::model::{DecoderConfig, MotionDecoder, ParameterList};
+use crate::motion::{Channel, ChannelLimits, MOTION_DIM, Normalizer};
 use crate::weights::{Archive, Section};
 
 use super::checkpoint::Progress;
@@ -55,8 +56,8 @@ impl<'u> DecoderLearner<'u> {
         windows: &Arc<Windows>,
         seed: u64,
     ) -> Self {
-        let (decoder, list) = MotionDecoder::new(decoder);
-        let parameters = Parameters::new(list, seed);
+        let (limits, (decoder, list)) = (decoder.limits, MotionDecoder::new(decoder));
+        let parameters = near_the_data(list, windows.normalizer(), limits, seed);
         Self {
             decoder,
             gradients: Gradients::new(&parameters),
@@ -171,6 +172,45 @@ impl<'u> DecoderLearner<'u> {
         }
         Ok(sum)
     }
+}
+
+/// Fills parameters so that the heads begin with motion of the usual centre and spread.
+///
+/// A head that starts as any layer does speaks of accelerations of ± 50 m/s², twenty times what dancers
+/// do, and spends its first thousand steps on that. Rows of its weight are multiplied by the spread of
+/// their channel over its limit (tanh is linear near 0), biases become the centre.
+fn near_the_data(
+    list: ParameterList,
+    normalizer: &Normalizer,
+    limits: ChannelLimits,
+    seed: u64,
+) -> Parameters<f32> {
+    let plain = Parameters::<f32>::new(list.clone(), seed);
+    let ids: BTreeMap<String, _> =
+        list.iter().map(|(id, parameter)| (parameter.name.clone(), id)).collect();
+    Parameters::from_fn(list, |parameter| {
+        let mut values = plain.unpacked(ids[&parameter.name]);
+        let head = Channel::ALL.into_iter().find_map(|channel| {
+            let rest = parameter.name.strip_prefix(channel.name())?.strip_prefix("_head.")?;
+            Some((channel, rest == "bias"))
+        });
+        let Some((channel, is_bias)) = head else { return values };
+        let limit = match channel {
+            Channel::Velocity | Channel::Acceleration | Channel::AngularVelocity => {
+                limits.bounds(channel).1
+            }
+            Channel::Position | Channel::Style => 1.0,
+            // Of unit norm and within 0 to 1 whatever the weights.
+            Channel::Quaternion | Channel::Phase => return values,
+        };
+        let row = values.len() / channel.width();
+        for (values, i) in values.chunks_exact_mut(row).zip(channel.range()) {
+            for x in values {
+                *x = if is_bias { normalizer.centre[i] } else { *x * normalizer.scale[i] } / limit;
+            }
+        }
+        values
+    })
 }
 
 fn named(found: &Reconstruction<crate::autodiff::Tensor<f32>>) -> Losses {

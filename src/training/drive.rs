@@ -216,6 +216,9 @@ pub struct Drive<'a, C> {
     pub checkpoints: Checkpoints<'a>,
     pub journal: Journal<'a>,
     pub watch: &'a dyn Watch,
+    /// A file of the run, below the store. Where it is missing so is the store (a disk that is not
+    /// mounted, a folder that was moved), and nothing is written in its place.
+    pub anchor: String,
     /// Threads that steps run on.
     pub threads: &'a Threads,
 }
@@ -412,7 +415,11 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
         let done = {
             let watch = self.watch;
             let notice = |error: &StoreError, pause| notice(watch, error, pause);
-            self.journal.commit(step, self.plan.store_patience, &notice)
+            let patience = self.plan.store_patience;
+            patience
+                .wait_out(notice, || self.checkpoints.check_anchor(&self.anchor))
+                .map_err(TrainingError::from)
+                .and_then(|()| self.journal.commit(step, patience, &notice))
         };
         let done = done.and_then(|()| self.write(Kind::Step, &learner.sections()));
         done.map_err(|source| TrainingError::NotSaved {
@@ -427,7 +434,12 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
         let mut outcome = Ok(());
         let written = self.plan.store_patience.wait_out(
             |error, pause| notice(self.watch, error, pause),
-            || match self.checkpoints.write(kind, &self.state, sections) {
+            || match self
+                .checkpoints
+                .check_anchor(&self.anchor)
+                .map_err(TrainingError::from)
+                .and_then(|()| self.checkpoints.write(kind, &self.state, sections))
+            {
                 Ok(_) => Ok(()),
                 Err(TrainingError::Store(error)) => Err(error),
                 Err(other) => {

@@ -19,7 +19,7 @@ use crate::training::{
     Augmentation, Checkpoints, DecoderLearner, Denoiser, DiffusionLearner, Drive, End, Journal,
     Kind, Learner, Loader, Plan, State, TrainConfig, TrainingError, Windows,
 };
-use session::{Looker, MachineParams, check_run_name, claim, normalizer, read_phrases};
+use session::{Looker, MachineParams, check_run_name, claim, claim_path, normalizer, read_phrases};
 pub use summary::{Account, StageAccount};
 
 /// Share of a time budget that the decoder gets.
@@ -122,8 +122,6 @@ impl Stage for Train {
             run.clear()?;
         }
         store.sweep()?;
-        let patience = params.machine.patience();
-        claim(&store, &params.run, Self::NAME, &config, patience, &watch)?;
         run.train(progress)
     }
 }
@@ -180,7 +178,7 @@ impl<'a> Run<'a> {
         }
         Journal::open(self.store, "finetune", &self.params.run, "finetune")?.clear()?;
         for command in [Train::NAME, "finetune"] {
-            self.store.remove(&format!("runs/{}/{command}.json", self.params.run))?;
+            self.store.remove(&claim_path(&self.params.run, command))?;
         }
         Ok(())
     }
@@ -223,6 +221,9 @@ impl<'a> Run<'a> {
         let augmented = windows(config.diffusion.augmentation.clone());
         let mut learner =
             DiffusionLearner::new(&config.network, &config.diffusion, &augmented, params.seed)?;
+        // Only now is it certain that there is something to train and to train on.
+        let patience = params.machine.patience();
+        claim(self.store, &params.run, Train::NAME, config, patience, self.watch)?;
         let end = self.stage(&mut learner, &augmented, &threads, &mut account)?;
         drop(learner);
         if end == End::Interrupted {
@@ -276,6 +277,7 @@ impl<'a> Run<'a> {
             checkpoints,
             journal: self.journal(L::STAGE)?,
             watch: self.watch,
+            anchor: claim_path(&self.params.run, Train::NAME),
             threads,
         };
         let machine = &self.params.machine;
@@ -357,6 +359,8 @@ where
                 watch.note(&format!(
                     "checkpoint {place} is damaged ({source}); taking an older one"
                 ));
+                // What is there is not written again, so it must go.
+                checkpoints.remove(Kind::Step, step)?;
             }
             Err(error) => bail!(error),
         }

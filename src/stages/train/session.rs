@@ -80,7 +80,12 @@ pub fn check_run_name(run: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Claims a run's name for a configuration: `runs/<run>/<command>.json`.
+/// Returns where a command's claim on a run lies below the store.
+pub fn claim_path(run: &str, command: &str) -> String {
+    format!("runs/{run}/{command}.json")
+}
+
+/// Claims a run's name for a configuration.
 ///
 /// # Errors
 /// [`TrainingError::OtherConfig`] when the run has another one.
@@ -92,7 +97,7 @@ pub fn claim<C: Serialize + DeserializeOwned>(
     patience: Patience,
     watch: &Looker,
 ) -> anyhow::Result<()> {
-    let path = format!("runs/{run}/{command}.json");
+    let path = claim_path(run, command);
     let text = serde_json::to_vec_pretty(config)?;
     let notice = |error: &StoreError, pause| watch.notice(error, pause);
     let put = patience.wait_out(notice, || store.put_new(&path, text.clone().into()))?;
