@@ -16,6 +16,7 @@ pub mod augment;
 pub mod bvh;
 pub mod capture;
 pub mod channels;
+pub mod choreography;
 pub mod kinematics;
 pub mod locking;
 pub mod lowpass;

@@ -188,7 +188,7 @@ impl Beats {
     }
 
     /// Index of the first downbeat; the first beat when beats carry no numbers.
-    fn first_downbeat(&self) -> usize {
+    pub(super) fn first_downbeat(&self) -> usize {
         let numbers = self.numbers.as_deref().unwrap_or_default();
         numbers.iter().position(|&n| n == 1).unwrap_or(0)
     }

@@ -295,20 +295,20 @@ fn gradient(x: &[f64]) -> Vec<f64> {
 }
 
 /// A normalised Hann window that averages a signal around every frame.
-struct Window {
+pub(super) struct Window {
     weights: Vec<f64>,
 }
 
 impl Window {
     /// `w[i] ∝ sin²(π (i + 1) / (n + 1))`, `i = 0..n`: a Hann window without its zero ends.
-    fn hann(n: usize) -> Self {
+    pub(super) fn hann(n: usize) -> Self {
         let w = |i: usize| (std::f64::consts::PI * (i + 1) as f64 / (n + 1) as f64).sin().powi(2);
         let sum: f64 = (0..n).map(w).sum();
         Self { weights: (0..n).map(|i| w(i) / sum).collect() }
     }
 
     /// Weighted mean around every frame, the first and last value repeated beyond the ends.
-    fn mean(&self, x: &[f64]) -> Vec<f64> {
+    pub(super) fn mean(&self, x: &[f64]) -> Vec<f64> {
         let (n, before) = (self.weights.len(), self.weights.len() / 2);
         let Some((&first, &last)) = x.first().zip(x.last()) else { return Vec::new() };
         let mut padded = vec![first; before];
