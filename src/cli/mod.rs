@@ -18,6 +18,7 @@ use clap::{Arg, ArgAction, ArgMatches, Command, FromArgMatches as _};
 use crate::stages::extract::Extract;
 use crate::stages::finetune::Finetune;
 use crate::stages::ingest::Ingest;
+use crate::stages::library::Library;
 use crate::stages::model::Model;
 use crate::stages::plot::Plot;
 #[cfg(feature = "query")]
@@ -45,6 +46,7 @@ fn entries() -> Vec<Entry> {
     vec![
         Entry::of::<Ingest>(),
         Entry::of::<Extract>(),
+        Entry::of::<Library>(),
         Entry::of::<Train>(),
         Entry::of::<Finetune>(),
         Entry::of::<Model>(),

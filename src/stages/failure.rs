@@ -25,6 +25,10 @@ pub enum FailureKind {
     LengthMismatch,
     MissingKey,
     Name,
+    /// A song without enough beats to dance to.
+    NoBeats,
+    /// A capture that nothing can be danced of.
+    NoPrimitive,
     NonFinite,
     NotAFile,
     NpyFormat,
@@ -35,9 +39,12 @@ pub enum FailureKind {
     QuaternionNorm,
     Shape,
     Symlink,
+    /// A tempo that nobody dances to.
+    Tempo,
     Timeout,
     TooLarge,
     TooLong,
+    TooShort,
     Truncated,
     Unreadable,
 }
@@ -62,6 +69,8 @@ impl FailureKind {
             FailureKind::LengthMismatch => "length_mismatch",
             FailureKind::MissingKey => "missing_key",
             FailureKind::Name => "name",
+            FailureKind::NoBeats => "no_beats",
+            FailureKind::NoPrimitive => "no_primitive",
             FailureKind::NonFinite => "non_finite",
             FailureKind::NotAFile => "not_a_file",
             FailureKind::NpyFormat => "npy_format",
@@ -71,9 +80,11 @@ impl FailureKind {
             FailureKind::QuaternionNorm => "quaternion_norm",
             FailureKind::Shape => "shape",
             FailureKind::Symlink => "symlink",
+            FailureKind::Tempo => "tempo",
             FailureKind::Timeout => "timeout",
             FailureKind::TooLarge => "too_large",
             FailureKind::TooLong => "too_long",
+            FailureKind::TooShort => "too_short",
             FailureKind::Truncated => "truncated",
             FailureKind::Unreadable => "unreadable",
         }
@@ -125,7 +136,7 @@ pub fn guarded<T>(path: &str, work: impl FnOnce() -> Result<T, Failure>) -> Resu
 
 impl FailureKind {
     /// Every kind, for looking one up by the name that a reader gives.
-    const ALL: [FailureKind; 30] = [
+    const ALL: [FailureKind; 34] = [
         FailureKind::AudioCodec,
         FailureKind::AudioData,
         FailureKind::AudioHeader,
@@ -142,6 +153,8 @@ impl FailureKind {
         FailureKind::LengthMismatch,
         FailureKind::MissingKey,
         FailureKind::Name,
+        FailureKind::NoBeats,
+        FailureKind::NoPrimitive,
         FailureKind::NonFinite,
         FailureKind::NotAFile,
         FailureKind::NpyFormat,
@@ -151,9 +164,11 @@ impl FailureKind {
         FailureKind::QuaternionNorm,
         FailureKind::Shape,
         FailureKind::Symlink,
+        FailureKind::Tempo,
         FailureKind::Timeout,
         FailureKind::TooLarge,
         FailureKind::TooLong,
+        FailureKind::TooShort,
         FailureKind::Truncated,
         FailureKind::Unreadable,
     ];

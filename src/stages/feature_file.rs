@@ -1,7 +1,11 @@
 //! The reference's feature files: `features.npz` with one array per block.
 
+use std::io::{self, Seek, Write};
+
+use ndarray::{ArrayView2, s};
+
 use crate::audio::{BLOCKS, Block};
-use crate::motion::npz::{Npz, NpzError};
+use crate::motion::npz::{Npz, NpzError, NpzWriter};
 use crate::stages::failure::{Failure, FailureKind};
 
 /// Largest array of a feature file: over four hours of mel bands. A small archive can hold any
@@ -80,4 +84,25 @@ pub fn read_features(
         file.beat_times_s = beats.values;
     }
     Ok(file)
+}
+
+/// Adds the blocks of features to a feature file; frames of shape `[T, 163]`.
+///
+/// # Errors
+/// What the output says.
+pub fn write_blocks<W: Write + Seek>(
+    npz: &mut NpzWriter<W>,
+    frames: ArrayView2<'_, f32>,
+) -> io::Result<()> {
+    let n_frames = frames.nrows();
+    let mut first = 0;
+    for block in BLOCKS {
+        // Columns of the frames are rows of the reference's arrays.
+        let values = frames.slice_move(s![.., first..first + block.len]).reversed_axes();
+        let shape = [block.len, n_frames];
+        let shape = if block.len == 1 { &shape[1..] } else { &shape[..] };
+        npz.add(block.name, shape, values.iter().copied())?;
+        first += block.len;
+    }
+    Ok(())
 }

@@ -5,6 +5,7 @@ pub mod failure;
 pub mod feature_file;
 pub mod finetune;
 pub mod ingest;
+pub mod library;
 pub mod model;
 pub mod plot;
 #[cfg(feature = "query")]

@@ -10,11 +10,11 @@ use crate::motion::{CHANNEL_NAMES, channel_unit};
 const ITEM_COLUMN: &str = "phrase_id";
 
 rows! {
-    "One row per phrase that ingest accepted."
+    "One row per phrase that ingest accepted or library constructed."
     PhraseRow in "phrases" version 1 sorted by [phrase_id]
     {
-        phrase_id: String, "", "Name of the phrase: its folder in a phrase layout, its relative path in a music library.";
-        source: String, "URL", "The source it came from.";
+        phrase_id: String, "", "Name of the phrase: its folder in a phrase layout, its relative path in a music library; of a constructed one `SONG.tTAKE.NUMBER`.";
+        source: String, "URL", "The source it came from; of a constructed phrase, the song.";
         motion_url: Option<String>, "URL", "The file that the motion was read from.";
         features_url: Option<String>, "URL", "The feature file (`features.npz`).";
         audio_url: Option<String>, "URL", "The audio file.";
@@ -23,23 +23,33 @@ rows! {
         features_bytes: Option<i64>, "bytes", "Size of the feature file.";
         audio_bytes: Option<i64>, "bytes", "Size of the audio file.";
         beats_bytes: Option<i64>, "bytes", "Size of the beat list.";
-        content_hash: String, "BLAKE3", "Digest of the phrase's files: BLAKE3 over one line `role digest` per file, roles sorted.";
+        content_hash: String, "BLAKE3", "Digest of the phrase's files: BLAKE3 over one line `role digest` per file, roles sorted; of a constructed phrase, over its features and motion as little-endian 32-bit floats.";
         has_motion: bool, "", "Whether the phrase has motion.";
-        has_features: bool, "", "Whether the phrase has a feature file.";
+        has_features: bool, "", "Whether the phrase has a feature file, or was constructed with features.";
         has_audio: bool, "", "Whether the phrase has audio.";
-        has_beats: bool, "", "Whether the phrase has beat times (beat list or feature file).";
-        motion_format: Option<String>, "", "`npy` (25 channels as they were) or `bvh` (converted).";
+        has_beats: bool, "", "Whether the phrase has beat times (beat list, feature file, or those of its song).";
+        motion_format: Option<String>, "", "`npy` (25 channels as they were), `bvh` (converted) or `constructed` (by library).";
         audio_codec: Option<String>, "", "Codec named by the audio header.";
         sample_rate_hz: Option<i32>, "Hz", "Sample rate named by the audio header.";
         n_channels: Option<i32>, "channels", "Channels named by the audio header.";
         duration_s: f64, "s", "Length of the audio; without audio, frames / 30.";
         n_frames: Option<i64>, "frames", "Motion frames at 30 fps.";
-        n_feature_frames: Option<i64>, "frames", "Frames in the feature file.";
-        split: String, "", "`train` (90 %), `validation` (5 %) or `test` (5 %), by a stable hash of `phrase_id`.";
+        n_feature_frames: Option<i64>, "frames", "Frames in the feature file, or of the features.";
+        split: String, "", "`train` (90 %), `validation` (5 %) or `test` (5 %), by a stable hash of `phrase_id`; constructed phrases go with their song.";
         tempo_bpm: Option<f64>, "beats/min", "Tempo.";
-        tempo_source: Option<String>, "", "Where the tempo came from: `beats_file` or `features`.";
+        tempo_source: Option<String>, "", "Where the tempo came from: `beats_file`, `features`, or `beat_tracker` (constructed phrases).";
         beats_per_bar: Option<i32>, "beats", "Beats in a bar.";
         beats_per_bar_source: Option<String>, "", "Where that came from: `beats_file` (numbered beats) or `default`.";
+    }
+}
+
+/// `motion_format` of a phrase that library constructed.
+pub const CONSTRUCTED: &str = "constructed";
+
+impl PhraseRow {
+    /// Returns whether library constructed the phrase.
+    pub fn is_constructed(&self) -> bool {
+        self.motion_format.as_deref() == Some(CONSTRUCTED)
     }
 }
 
@@ -83,7 +93,7 @@ rows! {
         phrase_id: String, "", "The phrase, as in `phrases`.";
         beat: i32, "beats", "Index within the phrase, from 0.";
         frame: i32, "frames", "The nearest frame of the phrase.";
-        time_s: f64, "s", "Time of the beat; frame / 30 where the beat tracker found it.";
+        time_s: f64, "s", "Time of the beat; frame / 30 where the beat tracker found it. In a constructed phrase, from its begin, and beyond the first and last beat of the song at its median interval.";
     }
 }
 
@@ -136,8 +146,7 @@ pub fn features() -> TableSchema {
         unit: "",
         description: Cow::Borrowed(block.meaning),
     });
-    let description =
-        "One row per frame of music at 30 fps: the 163 audio features (docs/features.md).";
+    let description = "One row per frame of music at 30 fps: the 163 audio features (docs/features.md). Those of a constructed phrase are an excerpt of its song's, relative to the whole song.";
     frame_table(FEATURES, description, channels)
 }
 

@@ -6,19 +6,18 @@ use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
-use anyhow::{Context as _, bail};
-use ndarray::s;
-
 use super::one::{Extracted, Origin, extract, needed_bytes};
 use super::pool::{self, Budget, lock};
 use super::{Done, Job};
-use crate::audio::BLOCKS;
+use crate::audio::FEATURE_DIM;
 use crate::audio::header::read_header_from;
 use crate::motion::npz::NpzWriter;
 use crate::stages::failure::{Failure, FailureKind};
+use crate::stages::feature_file::write_blocks;
 use crate::store::{
     Content, PartWriter, SourceFile, StoreError, replace_file, tables, temporary_beside,
 };
+use anyhow::{Context as _, bail};
 
 /// Files up to this size are read at once.
 const IN_MEMORY_BYTES: u64 = 16 << 20;
@@ -162,17 +161,8 @@ fn write_npz(path: &Path, extracted: &Extracted) -> anyhow::Result<()> {
         let mut file = temporary_beside(&std::path::absolute(path)?)?;
         let mut npz = NpzWriter::new(BufWriter::new(file.as_file_mut()));
         let n_frames = extracted.frames.nrows();
-        let mut first = 0;
-        for block in BLOCKS {
-            let columns = s![.., first..first + block.len];
-            // Columns of the frames are rows of the reference's arrays.
-            let values = extracted.frames.slice(columns).reversed_axes();
-            let shape = [block.len, n_frames];
-            let shape = if block.len == 1 { &shape[1..] } else { &shape[..] };
-            npz.add(block.name, shape, values.iter().copied())?;
-            first += block.len;
-        }
-        npz.add("features", &[first, n_frames], extracted.frames.t().iter().copied())?;
+        write_blocks(&mut npz, extracted.frames.view())?;
+        npz.add("features", &[FEATURE_DIM, n_frames], extracted.frames.t().iter().copied())?;
         let beats = &extracted.beats;
         npz.add("tempo", &[], [extracted.tempo_bpm.unwrap_or(0.0)])?;
         npz.add("beat_times", &[beats.len()], beats.iter().map(|beat| beat.1))?;

@@ -3,7 +3,7 @@
 mod files;
 mod one;
 mod phrases;
-mod pool;
+pub(in crate::stages) mod pool;
 
 use std::io::{self, Write};
 use std::num::NonZeroUsize;
@@ -16,6 +16,7 @@ use crate::audio::Tuning;
 use crate::store::{Location, Shard, digest};
 
 pub use one::{Extracted, Rules};
+pub(in crate::stages) use one::{Origin, extract, needed_bytes};
 
 /// Raised when extract writes something else for the same input and parameters.
 const OUTPUT_VERSION: u32 = 1;

@@ -68,7 +68,8 @@ pub fn run(job: &Job<'_>, target: &Target<'_>) -> anyhow::Result<Done> {
     }
     let ledger = Ledger::read(target.store, Extract::NAME)?;
     let names: BTreeSet<String> = rows.iter().map(|row| row.phrase_id.clone()).collect();
-    let n_phrases = rows.len() as u64;
+    // Constructed phrases have features of their song, without a file of their own.
+    let n_phrases = rows.iter().filter(|row| !row.is_constructed()).count() as u64;
     let mut tasks = plan(rows);
     let mut done = Done { n_without: n_phrases - tasks.len() as u64, ..Done::default() };
     tasks.retain(|task| target.shard.takes(&task.row.phrase_id));

@@ -15,6 +15,7 @@ use crate::store::{Cache, Ledger, Location, Shard, Source, StoreError, digest};
 use super::failure::Failure;
 pub use layout::{Layout, Plan, Planned, Role, plan};
 pub use phrase::{Rules, content_hash_of_audio};
+pub(in crate::stages) use phrase::{read_beats, read_bvh, read_trajectory};
 
 /// Raised when ingest writes something else for the same input and rules.
 const OUTPUT_VERSION: u32 = 1;

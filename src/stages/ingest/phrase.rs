@@ -219,7 +219,11 @@ fn audio_header(path: &str, content: Content) -> Result<AudioHeader, Failure> {
     read.map_err(|e: AudioHeaderError| Failure::of(path, e.kind(), &e))
 }
 
-fn read_beats(path: &str, bytes: &[u8]) -> Result<Beats, Failure> {
+/// Reads a beat list.
+///
+/// # Errors
+/// A [`Failure`] that names the file.
+pub(in crate::stages) fn read_beats(path: &str, bytes: &[u8]) -> Result<Beats, Failure> {
     let refuse = |message: &dyn std::fmt::Display| {
         Failure::new(FailureKind::BeatsFormat, path, format!("{path}: {message}"))
     };
@@ -241,7 +245,11 @@ fn tempo_of(beats: &Beats) -> Tempo {
     Tempo { bpm: beats.tempo_bpm(), source: "beats_file", beats_per_bar }
 }
 
-fn read_trajectory(path: &str, bytes: &[u8]) -> Result<Trajectory, Failure> {
+/// Reads a `trajectory.npy`; its values are not looked at.
+///
+/// # Errors
+/// A [`Failure`] that names the file.
+pub(in crate::stages) fn read_trajectory(path: &str, bytes: &[u8]) -> Result<Trajectory, Failure> {
     let array = npy::read_f32(bytes).map_err(|e: NpyError| Failure::of(path, e.kind(), &e))?;
     let shape_failure = || {
         let hint =
@@ -258,7 +266,15 @@ fn read_trajectory(path: &str, bytes: &[u8]) -> Result<Trajectory, Failure> {
     Trajectory::new(frames).map_err(|e: TrajectoryError| Failure::of(path, e.kind(), &e))
 }
 
-fn read_bvh(path: &str, bytes: &[u8], beats: Option<&Beats>) -> Result<Trajectory, Failure> {
+/// Reads a motion capture; beat times give the phase.
+///
+/// # Errors
+/// A [`Failure`] that names the file.
+pub(in crate::stages) fn read_bvh(
+    path: &str,
+    bytes: &[u8],
+    beats: Option<&Beats>,
+) -> Result<Trajectory, Failure> {
     if bytes.is_empty() {
         let message = format!("{path} is empty; export the capture again");
         return Err(Failure::new(FailureKind::EmptyFile, path, message));

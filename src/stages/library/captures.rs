@@ -1,0 +1,237 @@
+//! The motion that dances are made of: captures of a folder, or those that a store has.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::Read as _;
+use std::ops::ControlFlow;
+
+use anyhow::bail;
+use ndarray::Array2;
+
+use super::Known;
+use crate::motion::choreography::{PrimitiveError, Repertoire};
+use crate::motion::{ChannelLimits, Trajectory};
+use crate::stages::failure::{Failure, FailureKind, guarded};
+use crate::stages::ingest::{read_bvh, read_trajectory};
+use crate::store::{
+    ClientOptions, Content, Listing, Location, Snapshot, Source, SourceFile, SourceProblemKind,
+    StoreError, digest, tables, visit_frames,
+};
+
+/// Endings of the files that are read.
+const MOTION_EXTENSIONS: [&str; 2] = ["bvh", "npy"];
+/// Largest motion file that is read, in bytes.
+const MAX_FILE_BYTES: u64 = 1 << 30;
+
+/// Captures that were found, not yet read.
+pub struct Captures {
+    /// Where they come from, as commits name it.
+    pub origin: String,
+    /// What the storage says of all of them, without reading them.
+    pub fingerprint: String,
+    place: Place,
+}
+
+enum Place {
+    /// Phrases of the store, with the digests of their files.
+    Store {
+        place: Location,
+        ids: BTreeMap<String, String>,
+    },
+    Folder {
+        source: Source,
+        files: Vec<SourceFile>,
+        problems: Vec<(String, Failure)>,
+    },
+}
+
+/// Captures that were read.
+#[derive(Default)]
+pub struct Loaded {
+    pub repertoire: Repertoire,
+    /// Digest of their content.
+    pub content_hash: String,
+    /// Those that failed, with their URLs.
+    pub failed: Vec<(String, String, Failure)>,
+}
+
+impl Captures {
+    /// Finds the captures of a store: phrases with motion and without audio that library has not
+    /// constructed.
+    pub fn of_store(store: &Location, known: &Known) -> Self {
+        let ids = known.captures.clone();
+        let lines: String = ids.iter().map(|(id, hash)| format!("{hash} {id}\n")).collect();
+        Self {
+            origin: super::FROM_STORE.to_owned(),
+            fingerprint: digest(lines.as_bytes()),
+            place: Place::Store { place: store.clone(), ids },
+        }
+    }
+
+    /// Finds every `.bvh` and `.npy` file below a folder.
+    ///
+    /// # Errors
+    /// [`StoreError`] when the folder cannot be listed.
+    pub fn of_folder(url: &str, options: &ClientOptions) -> Result<Self, StoreError> {
+        let source = Source::open(url, options, None)?;
+        let Listing { files, problems, .. } = source.list()?;
+        let is_motion = |path: &str| {
+            let name = path.rsplit('/').next().unwrap_or(path);
+            let extension = name.rsplit_once('.').map_or("", |(_, extension)| extension);
+            !name.starts_with('.')
+                && MOTION_EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension))
+        };
+        let files: Vec<_> = files.into_iter().filter(|file| is_motion(&file.path)).collect();
+        let problems = problems.into_iter().filter(|p| is_motion(&p.path)).map(|p| {
+            let kind = match p.kind {
+                SourceProblemKind::Name => FailureKind::Name,
+                SourceProblemKind::NotAFile => FailureKind::NotAFile,
+                SourceProblemKind::Symlink => FailureKind::Symlink,
+                SourceProblemKind::Unreadable => FailureKind::Unreadable,
+            };
+            let message = format!("{} {}", p.path, p.message);
+            (p.path.clone(), Failure::new(kind, &p.path, message))
+        });
+        let lines: String =
+            files.iter().map(|f| format!("{} {}\n", f.fingerprint, f.path)).collect();
+        Ok(Self {
+            origin: source.location().url().to_owned(),
+            fingerprint: digest(lines.as_bytes()),
+            place: Place::Folder { problems: problems.collect(), files, source },
+        })
+    }
+
+    /// Returns the names of all captures.
+    pub fn names(&self) -> BTreeSet<String> {
+        match &self.place {
+            Place::Store { ids, .. } => ids.keys().cloned().collect(),
+            Place::Folder { files, problems, .. } => {
+                let problems = problems.iter().map(|(name, _)| name.clone());
+                files.iter().map(|file| file.path.clone()).chain(problems).collect()
+            }
+        }
+    }
+
+    /// Reads all captures and cuts them into primitives.
+    ///
+    /// # Errors
+    /// When there is no capture at all, or the store cannot be read.
+    pub fn load(self) -> anyhow::Result<Loaded> {
+        match self.place {
+            Place::Store { place, ids } => {
+                if ids.is_empty() {
+                    bail!(
+                        "store {place} has no captures: no phrase has motion without audio; ingest \
+                         some, or name a folder of .bvh or .npy files with --captures"
+                    );
+                }
+                let mut frames: BTreeMap<String, Array2<f32>> = BTreeMap::new();
+                let table = tables::motion();
+                let snapshot = Snapshot::take(&place, table.clone())?;
+                visit_frames(
+                    &snapshot,
+                    &table,
+                    |id| ids.contains_key(id),
+                    |id, found| {
+                        frames.insert(id.to_owned(), found);
+                        ControlFlow::Continue(())
+                    },
+                )?;
+                let mut reading = Reading::default();
+                for (id, frames) in frames {
+                    let added = guarded(&id, || {
+                        let motion = Trajectory::new(frames);
+                        reading.add(&id, motion.map_err(|e| Failure::of(&id, e.kind(), &e))?)
+                    });
+                    reading.settle(&id, &place.url_of(&id), added);
+                }
+                Ok(reading.finish(self.fingerprint))
+            }
+            Place::Folder { source, files, problems } => {
+                if files.is_empty() && problems.is_empty() {
+                    bail!(
+                        "captures folder {}: no .bvh or .npy file anywhere below it; name the folder \
+                         of your motion captures",
+                        source.location()
+                    );
+                }
+                let mut reading = Reading::default();
+                let mut hashes = String::new();
+                let contents = source.read_in_order(files.clone());
+                for (file, (content, _permit)) in files.iter().zip(contents) {
+                    let path = file.path.as_str();
+                    let added = bytes_of(file, content).and_then(|bytes| {
+                        hashes += &format!("{} {path}\n", digest(&bytes));
+                        guarded(path, || {
+                            let motion = read(path, &bytes)?;
+                            reading.add(path, motion)
+                        })
+                    });
+                    reading.settle(path, &source.location().url_of(path), added);
+                }
+                for (path, failure) in problems {
+                    reading.settle(&path, &source.location().url_of(&path), Err(failure));
+                }
+                Ok(reading.finish(digest(hashes.as_bytes())))
+            }
+        }
+    }
+}
+
+/// The repertoire as it grows.
+#[derive(Default)]
+struct Reading {
+    repertoire: Repertoire,
+    failed: Vec<(String, String, Failure)>,
+}
+
+impl Reading {
+    fn add(&mut self, path: &str, motion: Trajectory) -> Result<(), Failure> {
+        motion.check(&ChannelLimits::Wide).map_err(|e| Failure::of(path, e.kind(), &e))?;
+        let refused = |e: PrimitiveError| {
+            let kind = match e {
+                PrimitiveError::TooShort { .. } => FailureKind::TooShort,
+                _ => FailureKind::NoPrimitive,
+            };
+            Failure::new(kind, path, format!("{path}: {e}"))
+        };
+        self.repertoire.add(&motion).map(|_| ()).map_err(refused)
+    }
+
+    fn settle(&mut self, name: &str, url: &str, added: Result<(), Failure>) {
+        if let Err(failure) = added {
+            self.failed.push((name.to_owned(), url.to_owned(), failure));
+        }
+    }
+
+    fn finish(self, content_hash: String) -> Loaded {
+        Loaded { repertoire: self.repertoire, content_hash, failed: self.failed }
+    }
+}
+
+fn bytes_of(
+    file: &SourceFile,
+    content: Result<Content, StoreError>,
+) -> Result<bytes::Bytes, Failure> {
+    let path = file.path.as_str();
+    if file.size_bytes > MAX_FILE_BYTES {
+        let message = format!(
+            "{path} has {} bytes, more than the {MAX_FILE_BYTES} that are read; split the take",
+            file.size_bytes
+        );
+        return Err(Failure::new(FailureKind::TooLarge, path, message));
+    }
+    match content.map_err(|e| super::unreadable(path, &e))? {
+        Content::Bytes(bytes) => Ok(bytes),
+        Content::File(mut open) => {
+            let mut bytes = Vec::new();
+            open.read_to_end(&mut bytes)
+                .map_err(|e| Failure::new(FailureKind::Unreadable, path, e))?;
+            Ok(bytes.into())
+        }
+    }
+}
+
+fn read(path: &str, bytes: &[u8]) -> Result<Trajectory, Failure> {
+    let is_bvh = path.rsplit_once('.').is_some_and(|(_, e)| e.eq_ignore_ascii_case("bvh"));
+    if is_bvh { read_bvh(path, bytes, None) } else { read_trajectory(path, bytes) }
+}

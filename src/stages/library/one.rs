@@ -1,0 +1,247 @@
+//! One song: its features and beats become dances, and those phrases.
+
+use std::io::Read as _;
+use std::time::Duration;
+
+use ndarray::{Array2, ArrayView1, s};
+use xxhash_rust::xxh3::xxh3_64_with_seed;
+
+use super::songs::{BeatList, Files, Input, Song};
+use super::{Rules, unreadable};
+use crate::audio::BLOCKS;
+use crate::motion::choreography::{self, BeatGrid, Repertoire, SongError, choreograph, n_phrases};
+use crate::motion::{Beats, BeatsPerBarSource};
+use crate::stages::extract;
+use crate::stages::failure::{Failure, FailureKind};
+use crate::stages::ingest::read_beats;
+use crate::store::{ClientOptions, Content, Source, SourceFile, StoreError, digest};
+use crate::units::{frames_to_s, s_to_frames};
+
+/// Longest time for one song's features.
+const TIMEOUT: Duration = Duration::from_secs(900);
+/// Longest song, in seconds.
+const MAX_DURATION_S: f64 = 24.0 * 3600.0;
+
+/// A song as it is danced to.
+pub struct Music {
+    /// [T, 163], relative to the whole song.
+    pub features: Array2<f32>,
+    pub beats: Beats,
+    /// `beats_file` or `beat_tracker`.
+    pub tempo_source: &'static str,
+    /// Digest of the files that it was read from, or of what stands for them.
+    pub input_hash: String,
+}
+
+/// A phrase as it goes into the tables.
+pub struct Constructed {
+    pub id: String,
+    /// [n, 25].
+    pub motion: Array2<f32>,
+    /// [n, 163].
+    pub features: Array2<f32>,
+    /// Time from the begin of the phrase, and number in the bar, of every beat in it.
+    pub beats: Vec<(f64, u32)>,
+    /// The beats after it, up to a downbeat.
+    pub later_beats: Vec<(f64, u32)>,
+}
+
+impl Music {
+    /// Returns where the number of beats in a bar came from, as `phrases` spells it.
+    pub fn beats_per_bar_source(&self) -> &'static str {
+        match self.beats.beats_per_bar_source() {
+            BeatsPerBarSource::Given | BeatsPerBarSource::Numbers => "beats_file",
+            BeatsPerBarSource::Default => "default",
+        }
+    }
+}
+
+/// Reads a song.
+///
+/// # Errors
+/// A [`Failure`] that names the file.
+pub fn read(song: &Song, input: Input, options: &ClientOptions) -> Result<Music, Failure> {
+    match (&song.files, input) {
+        (Files::Store { tracked_s, beat_list, .. }, Input::Features(features)) => {
+            let list = beat_list.as_ref().map(|list| recorded_beats(list, options)).transpose()?;
+            let input_hash = digest(song.fingerprint.as_bytes());
+            music(song, features?, tracked_s.clone(), list, input_hash)
+        }
+        (
+            Files::Folder { audio, beat_list },
+            Input::Files { audio: content, beat_list: list, .. },
+        ) => {
+            let mut lines = String::new();
+            let rules =
+                extract::Rules { tuning: None, max_duration_s: MAX_DURATION_S, timeout: TIMEOUT };
+            let list = match (beat_list, list) {
+                (Some(file), Some(content)) => {
+                    let bytes = small_bytes(file, content)?;
+                    lines += &format!("beats {}\n", digest(&bytes));
+                    Some(read_beats(&file.path, &bytes)?)
+                }
+                _ => None,
+            };
+            let see = |hash: &str| {
+                lines += &format!("audio {hash}\n");
+                true
+            };
+            let found = extract::extract(extract::Origin::Audio, audio, content, see, &rules)?;
+            let tracked_s = found.beats.iter().map(|beat| beat.1).collect();
+            music(song, found.frames, tracked_s, list, digest(lines.as_bytes()))
+        }
+        _ => Err(Failure::new(FailureKind::Unreadable, &song.id, "was not read")),
+    }
+}
+
+fn music(
+    song: &Song,
+    features: Array2<f32>,
+    tracked_s: Vec<f64>,
+    list: Option<Beats>,
+    input_hash: String,
+) -> Result<Music, Failure> {
+    let tempo_source = if list.is_some() { "beats_file" } else { "beat_tracker" };
+    let beats = match list {
+        Some(beats) => beats,
+        None => {
+            let (n_beats, duration_s) = (tracked_s.len(), frames_to_s(features.nrows()));
+            let none = |_| refused(song, &SongError::NoBeats { n_beats, duration_s });
+            Beats::new(tracked_s, None, None).map_err(none)?
+        }
+    };
+    Ok(Music { features, beats, tempo_source, input_hash })
+}
+
+/// Reads the beat list beside the audio of a phrase of the store.
+fn recorded_beats(list: &BeatList, options: &ClientOptions) -> Result<Beats, Failure> {
+    let failed = |e: StoreError| unreadable(&list.url, &e);
+    let source = Source::open(&list.source, options, None).map_err(failed)?;
+    let gone = || StoreError::NotFound { place: list.url.clone(), hint: "" };
+    let file = source.recorded(&list.url, list.size_bytes, "").ok_or_else(gone).map_err(failed)?;
+    let content = source.read_in_order(vec![file.clone()]).next();
+    let (content, _permit) = content.ok_or_else(gone).map_err(failed)?;
+    let bytes = small_bytes(&file, content)?;
+    if bytes.len() as u64 != list.size_bytes {
+        let message = format!(
+            "{}: has {} bytes but had {} when it was looked at; run ingest again, then extract and \
+             library",
+            file.path,
+            bytes.len(),
+            list.size_bytes
+        );
+        return Err(Failure::new(FailureKind::Changed, &file.path, message));
+    }
+    read_beats(&file.path, &bytes)
+}
+
+fn small_bytes(
+    file: &SourceFile,
+    content: Result<Content, StoreError>,
+) -> Result<bytes::Bytes, Failure> {
+    match content.map_err(|e| unreadable(&file.path, &e))? {
+        Content::Bytes(bytes) => Ok(bytes),
+        Content::File(mut open) => {
+            let mut bytes = Vec::new();
+            open.read_to_end(&mut bytes)
+                .map_err(|e| Failure::new(FailureKind::Unreadable, &file.path, e))?;
+            Ok(bytes.into())
+        }
+    }
+}
+
+fn refused(song: &Song, error: &SongError) -> Failure {
+    let kind = match error {
+        SongError::Empty => FailureKind::TooShort,
+        SongError::NoBeats { .. } => FailureKind::NoBeats,
+        SongError::Tempo { .. } => FailureKind::Tempo,
+    };
+    Failure::new(kind, &song.id, format!("{}: {error}", song.id))
+}
+
+/// Returns the failure of a song that has no room for a phrase.
+pub fn too_short(song: &Song, n_frames: usize, phrase_frames: usize) -> Failure {
+    let message = format!(
+        "{}: has {n_frames} frames ({:.1} s), and a phrase takes {phrase_frames} ({:.1} s); lower \
+         --phrase-frames or leave the song out",
+        song.id,
+        frames_to_s(n_frames),
+        frames_to_s(phrase_frames)
+    );
+    Failure::new(FailureKind::TooShort, &song.id, message)
+}
+
+/// Returns the name of a phrase: names of one song sort by take, then by place.
+pub fn phrase_id(song: &Song, rules: &Rules, take: u32, index: usize) -> String {
+    let digits = (rules.takes.get() - 1).to_string().len().max(2);
+    format!("{}.t{take:0digits$}.{index:04}", song.slug)
+}
+
+/// Dances to a song, take by take, and calls `visit` with every phrase, in the order of their names;
+/// returns how many there are.
+///
+/// The dance of a take depends on the seed, the song's name and the number of the take.
+///
+/// # Errors
+/// A [`Failure`] of the song before the first phrase, or what `visit` says.
+pub fn dance<E: From<Failure>>(
+    song: &Song,
+    music: &Music,
+    repertoire: &Repertoire,
+    rules: &Rules,
+    mut visit: impl FnMut(Constructed) -> Result<(), E>,
+) -> Result<usize, E> {
+    let n_frames = music.features.nrows();
+    let (length, hop) = (rules.phrase_frames.get(), rules.hop_frames.get());
+    let per_take = n_phrases(n_frames, length, hop);
+    if per_take == 0 {
+        return Err(too_short(song, n_frames, length).into());
+    }
+    let curve = |name: &str| column(&music.features, name).to_vec();
+    let heard = choreography::Song::new(&music.beats, &curve("rms"), &curve("onset_strength"))
+        .map_err(|e| refused(song, &e))?;
+    let grid = heard.grid();
+    for take in 0..rules.takes.get() {
+        let seed = xxh3_64_with_seed(format!("{}\n{take}", song.id).as_bytes(), rules.seed);
+        let danced = choreograph(&heard, repertoire, seed);
+        for index in 0..per_take {
+            let first = index * hop;
+            let (beats, later_beats) = beats_of(&grid, first, length);
+            visit(Constructed {
+                id: phrase_id(song, rules, take, index),
+                motion: choreography::phrase(danced.frames.view(), first, length),
+                features: music.features.slice(s![first..first + length, ..]).to_owned(),
+                beats,
+                later_beats,
+            })?;
+        }
+    }
+    Ok(per_take * rules.takes.get() as usize)
+}
+
+/// Beats by their time from the begin of a phrase and their number in the bar.
+type Numbered = Vec<(f64, u32)>;
+
+/// Returns the beats of a phrase, and those after it up to the next downbeat, at least one.
+fn beats_of(grid: &BeatGrid, first: usize, n_frames: usize) -> (Numbered, Numbered) {
+    let (start_s, end_s) = (frames_to_s(first), frames_to_s(first + n_frames));
+    let beats = grid.beats();
+    let begin = beats.partition_point(|beat| beat.time_s < start_s);
+    let end = beats.partition_point(|beat| beat.time_s < end_s);
+    let numbered = |beats: &[choreography::Beat]| -> Numbered {
+        beats.iter().map(|beat| (beat.time_s - start_s, beat.number)).collect()
+    };
+    let later = beats[end..].iter().position(|beat| beat.number == 1).map_or(0, |i| i + 1);
+    (numbered(&beats[begin..end]), numbered(&beats[end..end + later]))
+}
+
+/// Returns the nearest frame of a phrase to a time in it.
+pub fn nearest_frame(time_s: f64, n_frames: usize) -> usize {
+    (s_to_frames(time_s).round() as usize).min(n_frames.saturating_sub(1))
+}
+
+/// Returns the column of a feature that has one.
+fn column<'a>(features: &'a Array2<f32>, name: &str) -> ArrayView1<'a, f32> {
+    let first: usize = BLOCKS.iter().take_while(|b| b.name != name).map(|b| b.len).sum();
+    features.column(first)
+}

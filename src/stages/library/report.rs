@@ -1,0 +1,127 @@
+//! What library did, in sentences.
+
+use std::collections::BTreeMap;
+use std::io::{self, Write};
+use std::path::PathBuf;
+
+use super::songs::Song;
+use super::write::Written;
+use crate::stages::Summary;
+use crate::stages::failure::Failure;
+
+/// Failures that the summary spells out; the rest are in the table.
+const N_SHOWN: usize = 10;
+
+/// What became of songs and captures.
+#[derive(Debug, Default)]
+pub struct Tally {
+    pub n_todo: usize,
+    pub n_done: usize,
+    /// Songs whose phrases the store has.
+    pub n_unchanged: usize,
+    pub n_captures: usize,
+    pub n_primitives: usize,
+    /// New phrases by split.
+    pub phrases: BTreeMap<&'static str, usize>,
+    /// Phrases of songs that are gone.
+    pub n_forgotten: usize,
+    pub failed: Vec<(String, Failure)>,
+}
+
+impl Tally {
+    pub fn add(&mut self, song: &Song, written: Written) {
+        match written {
+            Written::Phrases(n) => {
+                self.n_done += 1;
+                *self.phrases.entry(song.split).or_default() += n;
+            }
+            Written::Unchanged(_) => self.n_unchanged += 1,
+        }
+    }
+}
+
+pub struct Place {
+    pub store: String,
+    pub output: Option<PathBuf>,
+}
+
+pub struct Report {
+    pub place: Place,
+    pub dry_run: bool,
+    /// Songs of every split.
+    pub splits: [(usize, &'static str); 3],
+    pub n_without_features: usize,
+    pub tally: Tally,
+    pub took_s: f64,
+}
+
+impl Summary for Report {
+    fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
+        let Report { place, tally, took_s, .. } = self;
+        let Place { store, output } = place;
+        let n_failed = tally.failed.len();
+        writeln!(out, "library → {store}")?;
+        let splits: Vec<String> =
+            self.splits.iter().map(|(n, split)| format!("{n} {split}")).collect();
+        let splits = splits.join(", ");
+        if self.dry_run {
+            writeln!(
+                out,
+                "  would dance to {} songs, leave {} as they are ({splits})",
+                tally.n_todo, tally.n_unchanged
+            )?;
+            return Ok(());
+        }
+        if tally.n_todo == 0 {
+            writeln!(
+                out,
+                "  nothing to do: {} songs are up to date ({splits})",
+                tally.n_unchanged
+            )?;
+        } else {
+            let n_phrases: usize = tally.phrases.values().sum();
+            writeln!(
+                out,
+                "  {} songs danced to ({n_phrases} phrases), {} up to date, {n_failed} failed; \
+                 {took_s:.1} s",
+                tally.n_done, tally.n_unchanged
+            )?;
+            writeln!(
+                out,
+                "  {} primitives of {} captures; songs split into {splits}",
+                tally.n_primitives, tally.n_captures
+            )?;
+        }
+        if tally.n_forgotten > 0 {
+            writeln!(out, "  {} phrases left with their songs", tally.n_forgotten)?;
+        }
+        if self.n_without_features > 0 {
+            let n = self.n_without_features;
+            writeln!(
+                out,
+                "  {n} phrases with audio have no features; run extract to dance to them"
+            )?;
+        }
+        if let Some(output) = output {
+            writeln!(out, "  files: {}", output.display())?;
+        }
+        for (name, failure) in tally.failed.iter().take(N_SHOWN) {
+            writeln!(out, "  failed [{}] {name}: {}", failure.kind.name(), failure.message)?;
+        }
+        if n_failed > N_SHOWN {
+            writeln!(out, "  … and {} more", n_failed - N_SHOWN)?;
+        }
+        if n_failed > 0 {
+            writeln!(
+                out,
+                "  all of them: motiongen query --store {store} \
+                 \"select phrase_id, kind, message from failures\""
+            )?;
+        }
+        Ok(())
+    }
+
+    fn n_failed(&self) -> u64 {
+        if self.dry_run { 0 } else { self.tally.failed.len() as u64 }
+    }
+}

@@ -1,0 +1,286 @@
+//! The music that is danced to: songs of a folder, or those that a store has features of.
+
+use std::collections::{BTreeMap, HashMap};
+use std::ops::ControlFlow;
+use std::sync::mpsc::SyncSender;
+
+use anyhow::bail;
+use ndarray::Array2;
+
+use super::Known;
+use crate::stages::failure::{Failure, FailureKind};
+use crate::stages::ingest::{Layout, Role, plan};
+use crate::store::{
+    ClientOptions, Content, Location, Snapshot, Source, SourceFile, StoreError, digest, tables,
+    visit_frames,
+};
+
+/// Longest name of a song within the name of a phrase, in bytes; a folder's name may have 255.
+const MAX_SLUG_BYTES: usize = 180;
+
+/// A song that was found, not yet read.
+#[derive(Clone, Debug)]
+pub struct Song {
+    /// Its name: the phrase of the store, or the path below the folder.
+    pub id: String,
+    /// What stands for it in the names of its phrases.
+    pub slug: String,
+    /// The audio file, as `source` of its phrases.
+    pub url: String,
+    /// What is known of its files without reading them.
+    pub fingerprint: String,
+    pub split: &'static str,
+    /// What keeps it from being danced to, where that is known already.
+    pub problem: Option<Failure>,
+    pub files: Files,
+}
+
+/// Where a song's data lie.
+#[derive(Clone, Debug)]
+pub enum Files {
+    /// Features in the store; beats there, too, or in a beat list beside the audio.
+    Store {
+        n_frames: usize,
+        tracked_s: Vec<f64>,
+        beat_list: Option<BeatList>,
+    },
+    Folder {
+        audio: SourceFile,
+        beat_list: Option<SourceFile>,
+    },
+}
+
+/// A beat list that ingest saw.
+#[derive(Clone, Debug)]
+pub struct BeatList {
+    pub source: String,
+    pub url: String,
+    pub size_bytes: u64,
+}
+
+/// What was read of a song.
+pub enum Input {
+    Features(Result<Array2<f32>, Failure>),
+    Files {
+        audio: Result<Content, StoreError>,
+        beat_list: Option<Result<Content, StoreError>>,
+        /// The read-ahead budget of the files, given back when the song is done.
+        _permits: Vec<Box<dyn Send>>,
+    },
+}
+
+/// Songs that were found.
+pub struct Songs {
+    /// Where they come from, as commits name it.
+    pub origin: String,
+    pub songs: Vec<Song>,
+    /// Phrases with audio, but without features.
+    pub n_without_features: usize,
+    place: Place,
+}
+
+enum Place {
+    Store(Location),
+    Folder(Source),
+}
+
+impl Songs {
+    /// Finds the songs of a store: phrases with audio whose features extract has.
+    ///
+    /// # Errors
+    /// When there is none.
+    pub fn of_store(store: &Location, known: &mut Known) -> anyhow::Result<Self> {
+        if known.songs.is_empty() {
+            let hint = match known.n_without_features {
+                0 => {
+                    format!("run first: motiongen ingest --source MUSIC --store {store}, and then")
+                }
+                n => format!("{n} phrases with audio wait for"),
+            };
+            bail!(
+                "store {store} has no songs: no phrase has audio and features; {hint} motiongen \
+                 extract --store {store}; or name a folder of music with --songs"
+            );
+        }
+        let songs = std::mem::take(&mut known.songs);
+        Ok(Self {
+            origin: super::FROM_STORE.to_owned(),
+            songs: songs.into_values().collect(),
+            n_without_features: known.n_without_features,
+            place: Place::Store(store.clone()),
+        })
+    }
+
+    /// Finds every audio file below a folder, and the beat lists beside them.
+    ///
+    /// # Errors
+    /// When the folder cannot be listed or has no audio.
+    pub fn of_folder(url: &str, options: &ClientOptions) -> anyhow::Result<Self> {
+        let source = Source::open(url, options, None)?;
+        let plan = plan(source.list()?, Layout::Library);
+        if plan.phrases.is_empty() {
+            bail!(
+                "songs folder {}: no audio among {} files; name the folder of your music (WAV, AIFF, \
+                 FLAC, MP3, Ogg Vorbis, M4A or AAC)",
+                source.location(),
+                plan.ignored.len()
+            );
+        }
+        let mut songs = Vec::with_capacity(plan.phrases.len());
+        for planned in plan.phrases {
+            let file = |role: Role| planned.files.iter().find(|(r, _)| *r == role);
+            let file = |role: Role| file(role).map(|(_, file)| file.clone());
+            let mut problem = planned.problem.clone();
+            let audio = file(Role::Audio).unwrap_or_else(|| {
+                let message = format!("{} is no audio file; remove it", planned.id);
+                let failure = Failure::new(FailureKind::NotAFile, &planned.id, message);
+                problem.get_or_insert(failure);
+                SourceFile { path: planned.id.clone(), size_bytes: 0, fingerprint: String::new() }
+            });
+            let beat_list = file(Role::Beats);
+            let list_fingerprint = beat_list.as_ref().map_or("none", |f| &f.fingerprint);
+            songs.push(Song {
+                url: source.location().url_of(&planned.id),
+                slug: slug(&planned.id),
+                fingerprint: format!("files {} {list_fingerprint}", audio.fingerprint),
+                split: super::split::TRAIN,
+                problem,
+                files: Files::Folder { audio, beat_list },
+                id: planned.id,
+            });
+        }
+        let origin = source.location().url().to_owned();
+        Ok(Self { origin, songs, n_without_features: 0, place: Place::Folder(source) })
+    }
+
+    /// Gives songs a problem whose phrases would be called like those of another one.
+    pub fn refuse_namesakes(&mut self) {
+        let mut taken: HashMap<String, String> = HashMap::new();
+        for song in &mut self.songs {
+            // Some file systems take both cases for one.
+            if let Some(other) = taken.insert(song.slug.to_lowercase(), song.id.clone()) {
+                let message = format!(
+                    "phrases of {} and of {other} would both be called {}.t…; rename one of them",
+                    song.id, song.slug
+                );
+                let failure = Failure::new(FailureKind::DuplicateId, &song.id, message);
+                song.problem.get_or_insert(failure);
+            }
+        }
+    }
+
+    /// Splits off what reads the songs `todo`.
+    pub fn feeding(&self, todo: Vec<Song>) -> Feeding {
+        match &self.place {
+            Place::Store(store) => Feeding::Store { store: store.clone(), songs: todo },
+            Place::Folder(source) => Feeding::Folder { source: source.clone(), songs: todo },
+        }
+    }
+}
+
+/// Songs on their way to the workers.
+pub enum Feeding {
+    Store { store: Location, songs: Vec<Song> },
+    Folder { source: Source, songs: Vec<Song> },
+}
+
+impl Feeding {
+    /// Sends every song with its input until nobody receives any more.
+    ///
+    /// # Errors
+    /// [`StoreError`] when the table of features cannot be read.
+    pub fn run(self, sender: &SyncSender<(Song, Input)>) -> Result<(), StoreError> {
+        match self {
+            Feeding::Folder { source, songs } => {
+                send_files(&source, songs, sender);
+                Ok(())
+            }
+            Feeding::Store { store, songs } => send_features(&store, songs, sender),
+        }
+    }
+}
+
+fn send_files(source: &Source, songs: Vec<Song>, sender: &SyncSender<(Song, Input)>) {
+    let files = songs.iter().flat_map(|song| match &song.files {
+        Files::Folder { audio, beat_list } => vec![Some(audio.clone()), beat_list.clone()],
+        Files::Store { .. } => Vec::new(),
+    });
+    let mut reader = source.read_in_order(files.flatten().collect());
+    for song in songs {
+        let Files::Folder { beat_list, .. } = &song.files else { continue };
+        let mut permits: Vec<Box<dyn Send>> = Vec::new();
+        let mut next = || {
+            let gone = || StoreError::NotFound { place: song.url.clone(), hint: "" };
+            let (content, permit) = reader.next().unwrap_or_else(|| (Err(gone()), None));
+            permits.extend(permit.map(|permit| Box::new(permit) as Box<dyn Send>));
+            content
+        };
+        let audio = next();
+        let beat_list = beat_list.as_ref().map(|_| next());
+        let input = Input::Files { audio, beat_list, _permits: permits };
+        if sender.send((song, input)).is_err() {
+            break;
+        }
+    }
+}
+
+fn send_features(
+    store: &Location,
+    songs: Vec<Song>,
+    sender: &SyncSender<(Song, Input)>,
+) -> Result<(), StoreError> {
+    let table = tables::features();
+    let snapshot = Snapshot::take(store, table.clone())?;
+    let wanted: BTreeMap<String, Song> =
+        songs.into_iter().map(|song| (song.id.clone(), song)).collect();
+    let mut missing = wanted.clone();
+    visit_frames(
+        &snapshot,
+        &table,
+        |id| wanted.contains_key(id),
+        |id, frames| {
+            let Some(song) = missing.remove(id) else { return ControlFlow::Continue(()) };
+            match sender.send((song, Input::Features(Ok(frames)))) {
+                Ok(()) => ControlFlow::Continue(()),
+                Err(_) => ControlFlow::Break(()),
+            }
+        },
+    )?;
+    for (id, song) in missing {
+        let message = format!("{id}: its features are gone from the store; run extract again");
+        let failure = Failure::new(FailureKind::Unreadable, &id, message);
+        if sender.send((song, Input::Features(Err(failure)))).is_err() {
+            break;
+        }
+    }
+    Ok(())
+}
+
+/// Returns what stands for a song in the names of its phrases: one name of a folder, no path.
+pub fn slug(song: &str) -> String {
+    let mut slug: String = song.chars().map(|c| if c == '/' { '-' } else { c }).collect();
+    if slug.starts_with('.') {
+        // A hidden beat list would be passed over by ingest.
+        slug.replace_range(0..1, "_");
+    }
+    if slug.len() > MAX_SLUG_BYTES {
+        let end = (0..=MAX_SLUG_BYTES).rev().find(|&i| slug.is_char_boundary(i)).unwrap_or(0);
+        slug.truncate(end);
+        slug = format!("{slug}-{}", &digest(song.as_bytes())[..16]);
+    }
+    slug
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn slugs_are_names_of_folders() {
+        assert_eq!(slug("album/a b/ü.ogg"), "album-a b-ü.ogg");
+        assert_eq!(slug(".x/y.ogg"), "_x-y.ogg");
+        let long = slug(&"ü".repeat(200));
+        assert!(long.len() <= MAX_SLUG_BYTES + 17 && long.starts_with("üü"), "{long}");
+        assert_ne!(long, slug(&"ü".repeat(201)));
+    }
+}
