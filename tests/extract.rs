@@ -23,7 +23,7 @@ use crate::ingest_kill::Contents;
 use crate::support::{Output, finish, motiongen, rows};
 
 /// The features of one frame.
-type Values = [f32; FEATURE_DIM];
+pub type Values = [f32; FEATURE_DIM];
 
 /// A file below `tests/golden`.
 fn golden(path: &str) -> PathBuf {
@@ -77,7 +77,7 @@ fn features_in(batches: impl Iterator<Item = RecordBatch>) -> BTreeMap<String, V
 }
 
 /// Returns the table `features` of a store.
-fn features(store: &Path) -> BTreeMap<String, Vec<Values>> {
+pub fn features(store: &Path) -> BTreeMap<String, Vec<Values>> {
     let location = Location::local(store).unwrap();
     let snapshot = Snapshot::take(&location, tables::features()).unwrap();
     features_in(snapshot.batches().map(Result::unwrap))

@@ -8,6 +8,7 @@ mod ingest_bad_input;
 mod ingest_kill;
 mod ingest_local;
 mod ingest_remote;
+mod library;
 mod motion_capture;
 mod npy_files;
 mod object_store_conformance;

@@ -268,3 +268,63 @@ mod tests {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::store::{Commit, Item, Ledger, Location, tables};
+    use std::collections::BTreeMap;
+
+    fn frames(n: usize, start: f32) -> Array2<f32> {
+        Array2::from_shape_fn((n, 25), |(t, i)| start + t as f32 + 0.01 * i as f32)
+    }
+
+    fn commit(store: &Location, items: &[(&str, Array2<f32>)]) {
+        let ledger = Ledger::read(store, "ingest").unwrap();
+        let mut commit = Commit::new(store, "ingest", "rules", "source");
+        for (id, frames) in items {
+            let part = commit.part(tables::MOTION, tables::motion).unwrap();
+            part.write_frames(id, frames.view()).unwrap();
+            let input_hash = format!("{id} of {}", frames[[0, 0]]);
+            let fingerprint = String::new();
+            commit.settle(
+                Item { id: (*id).to_owned(), fingerprint, input_hash, failure: None },
+                &ledger,
+            );
+        }
+        commit.publish().unwrap();
+    }
+
+    fn visit(store: &Location, wanted: &[&str], n: usize) -> BTreeMap<String, Array2<f32>> {
+        let table = tables::motion();
+        let snapshot = Snapshot::take(store, table.clone()).unwrap();
+        let mut found = BTreeMap::new();
+        visit_frames(
+            &snapshot,
+            &table,
+            |id| wanted.contains(&id),
+            |id, frames| {
+                assert!(found.insert(id.to_owned(), frames).is_none(), "{id} comes twice");
+                if found.len() < n { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+            },
+        )
+        .unwrap();
+        found
+    }
+
+    #[test]
+    fn items_come_whole_once_and_as_they_are_now() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = Location::local(folder.path()).unwrap();
+        // Longer than what is read at once, between shorter ones.
+        let long = frames(3000, 5.0);
+        commit(&store, &[("a", frames(2, 1.0)), ("b", long.clone()), ("c", frames(1, 3.0))]);
+        commit(&store, &[("a", frames(4, 9.0)), ("d", frames(7, 2.0))]);
+        let found = visit(&store, &["a", "b", "d", "e"], 9);
+        let expected = [("a", frames(4, 9.0)), ("b", long), ("d", frames(7, 2.0))];
+        let expected = expected.map(|(id, frames)| (id.to_owned(), frames));
+        assert!(found == BTreeMap::from(expected), "{:?}", found.keys());
+        assert_eq!(visit(&store, &["a", "b", "c", "d"], 2).len(), 2);
+        assert!(visit(&store, &[], 9).is_empty());
+    }
+}

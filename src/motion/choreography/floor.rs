@@ -29,7 +29,7 @@ const MIN_TURN_S_PER_RAD: f64 = 2.0 / PI;
 /// Height of the root at rest, m.
 pub const ROOT_HEIGHT_M: f64 = 0.95;
 /// Share of the captures' own rise and fall that is kept.
-pub const KEPT_HEIGHT: f64 = 0.25;
+pub const KEPT_HEIGHT: f64 = 0.2;
 /// Amplitude of the first and the second harmonic of the bar and of its beats, m, at activity 0.5.
 const RISE_M: [f64; 3] = [0.03, 0.02, 0.012];
 /// Above this frequency an amplitude falls with the square of the frequency, so that no fast song asks

@@ -1,8 +1,8 @@
 //! What a store knows: songs, captures, and the phrases that were constructed before.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, HashMap};
 
-use super::songs::{BeatList, Files, Song, slug};
+use super::songs::{BeatList, Files, Song, slug, slug_of};
 use super::split::TRAIN;
 use crate::stages::Stage as _;
 use crate::stages::extract::Extract;
@@ -18,8 +18,9 @@ pub struct Known {
     pub n_without_features: usize,
     /// Phrases with motion and without audio that nobody constructed, and their digests.
     pub captures: BTreeMap<String, String>,
-    /// Constructed phrases by the URL of their song.
-    pub constructed: BTreeMap<String, BTreeSet<String>>,
+    /// Constructed phrases with the URLs of their songs, by the part of their name that stands for the
+    /// song.
+    pub constructed: BTreeMap<String, BTreeMap<String, String>>,
     /// Names of all other phrases, and their sources.
     pub others: HashMap<String, String>,
 }
@@ -34,7 +35,8 @@ impl Known {
         let mut with_audio: BTreeMap<String, PhraseRow> = BTreeMap::new();
         each(store, |row: PhraseRow| {
             if row.is_constructed() {
-                known.constructed.entry(row.source).or_default().insert(row.phrase_id);
+                let of_song = known.constructed.entry(slug_of(&row.phrase_id).to_owned());
+                of_song.or_default().insert(row.phrase_id, row.source);
                 return;
             }
             known.others.insert(row.phrase_id.clone(), row.source.clone());

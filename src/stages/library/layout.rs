@@ -67,8 +67,10 @@ impl Output {
         let listed = || beats.iter().chain(later_beats);
         // A beat list is two beats or more, one of them a downbeat.
         if listed().count() >= 2 && listed().any(|beat| beat.1 == 1) {
+            // Nanoseconds: the rest is rounding of differences.
+            let rounded = |time_s: &f64| (time_s * 1e9).round() / 1e9;
             let lines: String =
-                listed().map(|(time_s, number)| format!("{time_s} {number}\n")).collect();
+                listed().map(|(t, number)| format!("{} {number}\n", rounded(t))).collect();
             write_file(&self.folder.join(format!("beats/{id}.beats.txt")), |out| {
                 out.write_all(lines.as_bytes())
             })?;

@@ -35,7 +35,7 @@ impl Tally {
                 self.n_done += 1;
                 *self.phrases.entry(song.split).or_default() += n;
             }
-            Written::Unchanged(_) => self.n_unchanged += 1,
+            Written::Unchanged => self.n_unchanged += 1,
         }
     }
 }

@@ -271,6 +271,12 @@ pub fn slug(song: &str) -> String {
     slug
 }
 
+/// Returns what stands for the song in the name of a phrase, `SLUG.tTAKE.NUMBER`.
+pub fn slug_of(phrase: &str) -> &str {
+    let take = phrase.rsplit_once('.').map_or(phrase, |(take, _)| take);
+    take.rsplit_once(".t").map_or(take, |(slug, _)| slug)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -282,5 +288,6 @@ mod tests {
         let long = slug(&"ü".repeat(200));
         assert!(long.len() <= MAX_SLUG_BYTES + 17 && long.starts_with("üü"), "{long}");
         assert_ne!(long, slug(&"ü".repeat(201)));
+        assert_eq!(slug_of("a.t1.t00.wav.t07.0012"), "a.t1.t00.wav");
     }
 }

@@ -3,15 +3,15 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use super::layout::Output;
-use super::one::{self, Constructed, Music, dance, nearest_frame};
+use super::one::{self, Music, dance};
+use super::rows::{beat_rows, phrase_row};
 use super::songs::Song;
 use super::{Library, Rules};
 use crate::motion::choreography::Repertoire;
 use crate::stages::Stage as _;
 use crate::stages::failure::{Failure, FailureKind};
-use crate::store::tables::{self, BeatRow, CONSTRUCTED, FailureRow, PhraseRow};
+use crate::store::tables::{self, BeatRow, FailureRow, PhraseRow};
 use crate::store::{Commit, Item, Ledger, Location, Row as _, StoreError, TimestampUs, digest};
-use crate::units::frames_to_s;
 
 /// Writes songs and failures.
 pub struct Writer<'a> {
@@ -26,8 +26,8 @@ pub struct Writer<'a> {
     pub captures_hash: &'a str,
     /// What the storage says of the captures.
     pub captures_fingerprint: &'a str,
-    /// Constructed phrases that the store has, by the URL of their song.
-    pub constructed: &'a BTreeMap<String, BTreeSet<String>>,
+    /// Constructed phrases that the store has, with the URLs of their songs, by slug.
+    pub constructed: &'a BTreeMap<String, BTreeMap<String, String>>,
     /// All other phrases of the store, and their sources.
     pub others: &'a HashMap<String, String>,
     pub output: Option<&'a Output>,
@@ -39,8 +39,8 @@ pub struct Writer<'a> {
 pub enum Written {
     /// So many new phrases.
     Phrases(usize),
-    /// So many phrases that the store has already.
-    Unchanged(usize),
+    /// The store has its phrases already.
+    Unchanged,
 }
 
 /// Why a song was not written.
@@ -73,7 +73,7 @@ pub fn fingerprint(song: &Song, captures_fingerprint: &str) -> String {
 pub fn is_settled(
     song: &Song,
     ledger: &Ledger,
-    params_hash: &str,
+    (origin, params_hash): (&str, &str),
     rules: &Rules,
     fingerprint: &str,
 ) -> bool {
@@ -82,6 +82,7 @@ pub fn is_settled(
     !is_refused
         && first.is_some_and(|known| {
             known.params_hash == params_hash
+                && known.origin == origin
                 && known.item.succeeded()
                 && known.item.fingerprint == fingerprint
         })
@@ -102,12 +103,16 @@ impl Writer<'_> {
         let is_there = !self.force
             && first.is_some_and(|known| {
                 known.params_hash == self.params_hash
+                    && known.origin == self.origin
                     && known.item.succeeded()
                     && known.item.input_hash == input_hash
             });
-        if is_there && self.output.is_none() {
-            let n_phrases = self.constructed.get(&song.url).map_or(0, BTreeSet::len);
-            return Ok(Written::Unchanged(n_phrases));
+        if is_there {
+            // A song that was out of reach for a while kept its phrases, and is not failed any more.
+            self.settle(self.start(self.origin), self.recovered(song).into_iter().collect())?;
+            if self.output.is_none() {
+                return Ok(Written::Unchanged);
+            }
         }
         let mut commit = self.start(self.origin);
         let fingerprint = fingerprint(song, self.captures_fingerprint);
@@ -134,11 +139,11 @@ impl Writer<'_> {
             Ok::<(), Refusal>(())
         })?;
         if is_there {
-            return Ok(Written::Unchanged(n_phrases));
+            return Ok(Written::Unchanged);
         }
         let made: BTreeSet<&str> = items.iter().map(|item| item.id.as_str()).collect();
-        let mut old: Vec<Item> = self.former(song, &made);
-        items.append(&mut old);
+        let old = self.former(song, &made);
+        items.extend(old.into_iter().chain(self.recovered(song)));
         let schema = PhraseRow::schema;
         commit.part(schema().name, schema)?.write_rows(&phrases)?;
         if !beats.is_empty() {
@@ -215,7 +220,8 @@ impl Writer<'_> {
         self.settle(commit, items)
     }
 
-    /// Removes the phrases and failures of what is no longer among the songs and captures.
+    /// Removes the phrases and failures of what is no longer among the songs and captures; returns how
+    /// many phrases. Without `slugs`, phrases are left alone.
     ///
     /// # Errors
     /// [`StoreError`] of the store.
@@ -223,34 +229,39 @@ impl Writer<'_> {
         &self,
         origin: &str,
         names: &BTreeSet<String>,
-        urls: Option<&BTreeSet<&str>>,
+        slugs: Option<&BTreeSet<&str>>,
     ) -> Result<usize, StoreError> {
         let failed = self.ledger.failed(origin).into_iter().filter(|id| !names.contains(*id));
         let mut items: Vec<Item> = failed.map(Item::forgotten).collect();
-        let is_ours = |id: &&String| {
-            let known = self.ledger.get(id);
-            known.is_some_and(|known| known.origin == origin && known.item.succeeded())
-        };
         let n_failures = items.len();
-        if let Some(urls) = urls {
-            let gone = self.constructed.iter().filter(|(url, _)| !urls.contains(url.as_str()));
-            let ids = gone.flat_map(|(_, ids)| ids).filter(is_ours);
-            items.extend(ids.map(|id| Item::forgotten(id)));
+        if let Some(slugs) = slugs {
+            let gone = self.constructed.iter().filter(|(slug, _)| !slugs.contains(slug.as_str()));
+            let ids = gone.flat_map(|(_, phrases)| phrases.keys());
+            items.extend(ids.filter(|id| self.is_ours(id)).map(|id| Item::forgotten(id)));
         }
         let n_phrases = items.len() - n_failures;
         self.settle(self.start(origin), items)?;
         Ok(n_phrases)
     }
 
-    /// Returns the phrases that the store has of a song and that were not made again, and the song's
-    /// failure, as items to be forgotten.
+    /// Returns whether a phrase comes from where the songs of this run come from.
+    fn is_ours(&self, id: &str) -> bool {
+        self.ledger.get(id).is_some_and(|known| known.origin == self.origin)
+    }
+
+    /// Returns the phrases that the store has of a song and that were not made again, as items to be
+    /// forgotten.
     fn former(&self, song: &Song, made: &BTreeSet<&str>) -> Vec<Item> {
-        let has_failed =
-            self.ledger.get(&song.id).is_some_and(|known| known.item.failure.is_some());
-        let failure = (has_failed && !made.is_empty()).then_some(&song.id);
-        let phrases = self.constructed.get(&song.url).into_iter().flatten();
-        let phrases = phrases.filter(|id| !made.contains(id.as_str()));
-        phrases.chain(failure).map(|id| Item::forgotten(id)).collect()
+        let phrases = self.constructed.get(&song.slug).into_iter().flatten();
+        let ours = phrases.filter(|(id, url)| **url == song.url || self.is_ours(id));
+        let left = ours.filter(|(id, _)| !made.contains(id.as_str()));
+        left.map(|(id, _)| Item::forgotten(id)).collect()
+    }
+
+    /// Returns the failure of a song, to be forgotten.
+    fn recovered(&self, song: &Song) -> Option<Item> {
+        let known = self.ledger.get(&song.id)?;
+        known.item.failure.is_some().then(|| Item::forgotten(&song.id))
     }
 
     fn settle(&self, mut commit: Commit<'_>, mut items: Vec<Item>) -> Result<(), StoreError> {
@@ -270,7 +281,8 @@ impl Writer<'_> {
     /// Refuses a name that stands for something else in the store.
     fn refuse_taken(&self, song: &Song, id: &str) -> Result<(), Failure> {
         // The same song may be named by a folder now and by the store before.
-        let is_same = self.constructed.get(&song.url).is_some_and(|ids| ids.contains(id));
+        let former = self.constructed.get(&song.slug).and_then(|phrases| phrases.get(id));
+        let is_same = former.is_some_and(|url| *url == song.url);
         let of_another = || {
             let known = self.ledger.get(id).filter(|known| known.item.succeeded())?;
             (known.origin != self.origin && !is_same && !self.force).then_some(&known.origin)
@@ -283,56 +295,4 @@ impl Writer<'_> {
         );
         Err(Failure::new(FailureKind::DuplicateId, &song.id, message))
     }
-}
-
-fn phrase_row(song: &Song, music: &Music, phrase: &Constructed) -> PhraseRow {
-    let n_frames = phrase.motion.nrows();
-    PhraseRow {
-        phrase_id: phrase.id.clone(),
-        source: song.url.clone(),
-        motion_url: None,
-        features_url: None,
-        audio_url: None,
-        beats_url: None,
-        motion_bytes: None,
-        features_bytes: None,
-        audio_bytes: None,
-        beats_bytes: None,
-        content_hash: content_hash(phrase),
-        has_motion: true,
-        has_features: true,
-        has_audio: false,
-        has_beats: !phrase.beats.is_empty(),
-        motion_format: Some(CONSTRUCTED.to_owned()),
-        audio_codec: None,
-        sample_rate_hz: None,
-        n_channels: None,
-        duration_s: frames_to_s(n_frames),
-        n_frames: Some(n_frames as i64),
-        n_feature_frames: Some(n_frames as i64),
-        split: song.split.to_owned(),
-        tempo_bpm: Some(music.beats.tempo_bpm()),
-        tempo_source: Some(music.tempo_source.to_owned()),
-        beats_per_bar: Some(music.beats.beats_per_bar() as i32),
-        beats_per_bar_source: Some(music.beats_per_bar_source().to_owned()),
-    }
-}
-
-/// Digest over one line `role digest` for features and motion, as for the files of a phrase.
-fn content_hash(phrase: &Constructed) -> String {
-    let of = |values: &ndarray::Array2<f32>| {
-        let bytes: Vec<u8> = values.iter().flat_map(|x| x.to_le_bytes()).collect();
-        digest(&bytes)
-    };
-    let lines = format!("features {}\nmotion {}\n", of(&phrase.features), of(&phrase.motion));
-    digest(lines.as_bytes())
-}
-
-fn beat_rows(phrase: &Constructed) -> impl Iterator<Item = BeatRow> + '_ {
-    phrase.beats.iter().enumerate().map(|(beat, &(time_s, _))| BeatRow {
-        phrase_id: phrase.id.clone(),
-        beat: beat as i32,
-        frame: nearest_frame(time_s, phrase.motion.nrows()) as i32,
-        time_s,
-    })
 }

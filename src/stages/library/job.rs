@@ -1,0 +1,229 @@
+//! The work itself: captures are read, songs danced to and committed side by side.
+
+use std::collections::BTreeSet;
+use std::sync::Mutex;
+use std::sync::mpsc::sync_channel;
+
+use anyhow::{Context as _, bail};
+
+use super::captures::{Captures, Loaded};
+use super::known::Known;
+use super::layout::Output;
+use super::report::{Report, Tally};
+use super::songs::{Input, Song, Songs};
+use super::write::{Refusal, Writer, fingerprint, is_settled};
+use super::{Params, one, params_hash};
+use crate::stages::Progress;
+use crate::stages::extract::needed_bytes;
+use crate::stages::extract::pool::{self, Budget, lock};
+use crate::stages::failure::guarded;
+use crate::store::{ClientOptions, Ledger, Location};
+
+/// Memory that songs under way may take while their audio is decoded.
+const MEMORY_BYTES: u64 = 2_000_000_000;
+
+/// Everything that the songs of a run share.
+pub struct Job<'a> {
+    pub store: &'a Location,
+    pub ledger: Ledger,
+    pub known: Known,
+    pub options: ClientOptions,
+    pub params: &'a Params,
+    pub progress: &'a dyn Progress,
+}
+
+impl Job<'_> {
+    /// Reads the captures, dances to every song that is not done, and tells `report`.
+    ///
+    /// # Errors
+    /// When there is no usable capture or song, or the store cannot be read or written; what was
+    /// committed stays.
+    pub fn run(
+        &self,
+        captures: Captures,
+        songs: &Songs,
+        report: &mut Report,
+    ) -> anyhow::Result<()> {
+        let Params { rules, output, force, dry_run, .. } = self.params;
+        let params_hash = params_hash(rules);
+        let capture_names = captures.names();
+        let (captures_origin, captures_print) =
+            (captures.origin.clone(), captures.fingerprint.clone());
+        let is_done = |song: &Song| {
+            let print = fingerprint(song, &captures_print);
+            !force
+                && output.is_none()
+                && is_settled(song, &self.ledger, (&songs.origin, &params_hash), rules, &print)
+        };
+        let (sound, problems): (Vec<Song>, Vec<Song>) =
+            songs.songs.iter().cloned().partition(|song| song.problem.is_none());
+        let (done, todo): (Vec<Song>, Vec<Song>) = sound.into_iter().partition(is_done);
+        report.tally.n_todo = todo.len();
+        report.tally.n_unchanged = done.len();
+        for song in &problems {
+            report.tally.failed.extend(song.problem.clone().map(|f| (song.id.clone(), f)));
+        }
+        if *dry_run {
+            return Ok(());
+        }
+        self.store.sweep()?;
+        let failed_before =
+            |name: &String| self.ledger.get(name).is_some_and(|k| k.item.failure.is_some());
+        // Captures are read where they are danced, or where one may have been mended.
+        let loaded = if todo.is_empty() && !capture_names.iter().any(failed_before) {
+            None
+        } else {
+            Some(captures.load()?)
+        };
+        let folder = output
+            .as_ref()
+            .map(|path| {
+                Output::new(path).with_context(|| format!("while making {}", path.display()))
+            })
+            .transpose()?;
+        let empty = Loaded::default();
+        let loaded = loaded.as_ref().unwrap_or(&empty);
+        let writer = Writer {
+            store: self.store,
+            ledger: &self.ledger,
+            params_hash: &params_hash,
+            origin: &songs.origin,
+            rules,
+            repertoire: &loaded.repertoire,
+            captures_hash: &loaded.content_hash,
+            captures_fingerprint: &captures_print,
+            constructed: &self.known.constructed,
+            others: &self.known.others,
+            output: folder.as_ref(),
+            force: *force,
+        };
+        writer.captures(&captures_origin, &capture_names, &loaded.failed)?;
+        for song in &problems {
+            if let Some(failure) = &song.problem {
+                writer.failed_song(song, failure)?;
+            }
+        }
+        let failed = loaded.failed.iter().map(|(name, _, f)| (name.clone(), f.clone()));
+        report.tally.failed.extend(failed);
+        report.tally.n_captures = loaded.repertoire.n_captures();
+        report.tally.n_primitives = loaded.repertoire.primitives().len();
+        if !todo.is_empty() && loaded.repertoire.primitives().is_empty() {
+            let first = loaded.failed.first().map_or(String::new(), |(_, _, f)| f.message.clone());
+            bail!(
+                "none of the {} captures can be danced ({first}); name others with --captures; all \
+                 of them: motiongen query --store {} \"select phrase_id, kind, message from failures\"",
+                capture_names.len(),
+                self.store
+            );
+        }
+        self.dance(songs, todo, &writer, report)?;
+        self.forget(songs, &writer, &captures_origin, capture_names, report)?;
+        if let Some(folder) = folder {
+            folder.finish().context("while writing --output")?;
+        }
+        if report.tally.n_done + report.tally.n_unchanged == 0 {
+            let first = report.tally.failed.first().map_or("", |(_, f)| f.message.as_str());
+            bail!(
+                "none of the {} songs can be danced to ({first}); all of them: motiongen query --store \
+                 {} \"select phrase_id, kind, message from failures\"",
+                songs.songs.len(),
+                self.store
+            );
+        }
+        Ok(())
+    }
+
+    /// Reads and dances the songs `todo`, on several threads.
+    fn dance(
+        &self,
+        songs: &Songs,
+        todo: Vec<Song>,
+        writer: &Writer<'_>,
+        report: &mut Report,
+    ) -> anyhow::Result<()> {
+        if todo.is_empty() {
+            return Ok(());
+        }
+        self.progress.start("library", "songs", todo.len() as u64);
+        let feeding = songs.feeding(todo);
+        let (sender, receiver) = sync_channel::<(Song, Input)>(1);
+        let tally = Mutex::new(std::mem::take(&mut report.tally));
+        let budget = Budget::new(MEMORY_BYTES);
+        let outcome = std::thread::scope(|scope| {
+            let reader = scope.spawn(move || feeding.run(&sender));
+            let worked = pool::run(
+                self.params.workers,
+                // The receiver goes with the pool, and then the reader stops, too.
+                move || receiver.recv().ok(),
+                |(song, input)| self.song(&song, input, writer, &budget, &tally),
+            );
+            let read = reader.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+            worked.and(read.map_err(anyhow::Error::from))
+        });
+        self.progress.finish();
+        report.tally = tally.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
+        outcome
+    }
+
+    fn song(
+        &self,
+        song: &Song,
+        input: Input,
+        writer: &Writer<'_>,
+        budget: &Budget,
+        tally: &Mutex<Tally>,
+    ) -> anyhow::Result<()> {
+        let danced = guarded(&song.id, || {
+            let music = {
+                let _share = budget.take(input.needed_bytes());
+                one::read(song, input, &self.options)?
+            };
+            Ok(writer.song(song, &music))
+        });
+        let failure = match danced {
+            Ok(Ok(written)) => {
+                lock(tally).add(song, written);
+                None
+            }
+            Ok(Err(Refusal::Store(error))) => return Err(error),
+            Ok(Err(Refusal::Song(failure))) | Err(failure) => Some(failure),
+        };
+        if let Some(failure) = failure {
+            writer.failed_song(song, &failure)?;
+            lock(tally).failed.push((song.id.clone(), failure));
+        }
+        self.progress.advance(1);
+        Ok(())
+    }
+
+    /// Removes what is no longer among the songs and captures.
+    fn forget(
+        &self,
+        songs: &Songs,
+        writer: &Writer<'_>,
+        captures_origin: &str,
+        mut capture_names: BTreeSet<String>,
+        report: &mut Report,
+    ) -> anyhow::Result<()> {
+        let mut names: BTreeSet<String> = songs.songs.iter().map(|s| s.id.clone()).collect();
+        let slugs: BTreeSet<&str> = songs.songs.iter().map(|s| s.slug.as_str()).collect();
+        if captures_origin == songs.origin {
+            names.append(&mut capture_names);
+        } else {
+            writer.forget(captures_origin, &capture_names, None)?;
+        }
+        report.tally.n_forgotten = writer.forget(&songs.origin, &names, Some(&slugs))?;
+        Ok(())
+    }
+}
+
+impl Input {
+    /// Returns an estimate of the memory that reading takes.
+    fn needed_bytes(&self) -> u64 {
+        match self {
+            Input::Features(_) => 0,
+            // Its length is not known before it is decoded: room for what is held of the longest.
+            Input::Files { .. } => needed_bytes(360.0, 0),
+        }
+    }
+}

@@ -1,0 +1,61 @@
+//! A constructed phrase as rows of `phrases` and `beats`.
+
+use super::one::{Constructed, Music, nearest_frame};
+use super::songs::Song;
+use crate::store::digest;
+use crate::store::tables::{BeatRow, CONSTRUCTED, PhraseRow};
+use crate::units::frames_to_s;
+
+/// Returns the row of a phrase; it has no files of its own.
+pub fn phrase_row(song: &Song, music: &Music, phrase: &Constructed) -> PhraseRow {
+    let n_frames = phrase.motion.nrows();
+    PhraseRow {
+        phrase_id: phrase.id.clone(),
+        source: song.url.clone(),
+        motion_url: None,
+        features_url: None,
+        audio_url: None,
+        beats_url: None,
+        motion_bytes: None,
+        features_bytes: None,
+        audio_bytes: None,
+        beats_bytes: None,
+        content_hash: content_hash(phrase),
+        has_motion: true,
+        has_features: true,
+        has_audio: false,
+        has_beats: !phrase.beats.is_empty(),
+        motion_format: Some(CONSTRUCTED.to_owned()),
+        audio_codec: None,
+        sample_rate_hz: None,
+        n_channels: None,
+        duration_s: frames_to_s(n_frames),
+        n_frames: Some(n_frames as i64),
+        n_feature_frames: Some(n_frames as i64),
+        split: song.split.to_owned(),
+        tempo_bpm: Some(music.beats.tempo_bpm()),
+        tempo_source: Some(music.tempo_source.to_owned()),
+        beats_per_bar: Some(music.beats.beats_per_bar() as i32),
+        beats_per_bar_source: Some(music.beats_per_bar_source().to_owned()),
+    }
+}
+
+/// Digest over one line `role digest` for features and motion, as for the files of a phrase.
+fn content_hash(phrase: &Constructed) -> String {
+    let of = |values: &ndarray::Array2<f32>| {
+        let bytes: Vec<u8> = values.iter().flat_map(|x| x.to_le_bytes()).collect();
+        digest(&bytes)
+    };
+    let lines = format!("features {}\nmotion {}\n", of(&phrase.features), of(&phrase.motion));
+    digest(lines.as_bytes())
+}
+
+/// Returns the rows of a phrase's beats.
+pub fn beat_rows(phrase: &Constructed) -> impl Iterator<Item = BeatRow> + '_ {
+    phrase.beats.iter().enumerate().map(|(beat, &(time_s, _))| BeatRow {
+        phrase_id: phrase.id.clone(),
+        beat: beat as i32,
+        frame: nearest_frame(time_s, phrase.motion.nrows()) as i32,
+        time_s,
+    })
+}
