@@ -24,7 +24,7 @@ build: ## build the executables (dev profile)
 	$(CARGO) build --locked --bins
 
 .PHONY: demo
-demo: build ## ingest and extract the music and motion of tests/data, and query the tables (build/demo)
+demo: build ## ingest and extract tests/data, construct a library of it, and query the tables (build/demo)
 	@$(MAKE) --file pipelines/demo.mk BIN=$(BIN)
 
 .PHONY: ingest

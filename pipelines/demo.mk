@@ -1,5 +1,5 @@
 # The demo: real music and real motion capture (tests/data) become tables, the music's features are
-# extracted, and queries answer.
+# extracted, phrases to train on are constructed from both, and queries answer.
 #
 #   make demo                              builds first
 #   make -f pipelines/demo.mk BIN=…        with executables that are there already
@@ -34,6 +34,11 @@ EXTRACTED := $(STAMPS)/extract.done
 $(EXTRACTED): $(INGESTED) $(CONFIG) $(MOTIONGEN)
 	$(call stage,$(MOTIONGEN) extract --config $(CONFIG) --store $(STORE))
 
+# library: phrases to train on, constructed from the songs and the captures.
+LIBRARY := $(STAMPS)/library.done
+$(LIBRARY): $(EXTRACTED) $(CONFIG) $(MOTIONGEN)
+	$(call stage,$(MOTIONGEN) library --config $(CONFIG) --store $(STORE))
+
 # query: what the tables tell.
 define SPLITS
 select split, count(*) as phrases, round(sum(duration_s), 1) as seconds
@@ -44,16 +49,24 @@ select phrase_id, round(duration_s, 1) as seconds, round(tempo_bpm, 1) as tempo_
 from phrases where has_audio order by duration_s desc, phrase_id limit 5
 endef
 define SPEEDS
-select phrase_id, count(*) as frames,
-round(avg(sqrt(velocity_x * velocity_x + velocity_y * velocity_y + velocity_z * velocity_z)), 2)
+select m.phrase_id, count(*) as frames,
+round(avg(sqrt(m.velocity_x * m.velocity_x + m.velocity_y * m.velocity_y + m.velocity_z * m.velocity_z)), 2)
 as mean_speed_m_per_s
-from motion group by phrase_id order by mean_speed_m_per_s desc, phrase_id
+from motion m join phrases p on m.phrase_id = p.phrase_id
+where not p.has_features group by m.phrase_id order by mean_speed_m_per_s desc, m.phrase_id
 endef
 define LOUDNESS
 select e.phrase_id, round(e.tempo_bpm, 1) as tempo_bpm, e.n_beats, round(avg(f.rms), 3) as mean_rms,
 round(avg(f.onset_strength), 3) as mean_onset_strength, round(avg(f.spectral_centroid), 3) as mean_centroid
 from extractions e join features f on e.phrase_id = f.phrase_id
 group by e.phrase_id, e.tempo_bpm, e.n_beats order by e.phrase_id
+endef
+define CONSTRUCTED
+select p.split, count(distinct p.source) as songs, count(distinct p.phrase_id) as phrases,
+round(avg(m.velocity_y * m.velocity_y), 4) as mean_square_of_vertical_velocity,
+round(max(sqrt(m.velocity_x * m.velocity_x + m.velocity_z * m.velocity_z)), 2) as top_speed_m_per_s
+from phrases p join motion m on p.phrase_id = m.phrase_id
+where p.has_features and not p.has_audio group by p.split order by p.split
 endef
 # Lines become spaces on the way to the shell.
 define newline
@@ -64,11 +77,12 @@ comma := ,
 ask = @{ echo; echo '$(1)'; $(MOTIONGEN) query --config $(CONFIG) --store $(STORE) \
 	'$(subst $(newline), ,$($(2)))'; } | tee --append $@.new
 
-$(ANSWERS): $(INGESTED) $(EXTRACTED)
+$(ANSWERS): $(INGESTED) $(EXTRACTED) $(LIBRARY)
 	@rm -f $@.new
 	@{ echo; echo 'What is there?'; $(MOTIONGEN) query --store $(STORE) --tables; } | tee $@.new
 	$(call ask,How much is in each split?,SPLITS)
 	$(call ask,Which songs are the longest$(comma) and what is their tempo?,LONGEST_SONGS)
 	$(call ask,How fast does each capture move?,SPEEDS)
 	$(call ask,What do the songs sound like?,LOUDNESS)
+	$(call ask,What was constructed to train on?,CONSTRUCTED)
 	@mv $@.new $@

@@ -74,9 +74,9 @@ fn the_demo_library_is_sound_and_in_time() {
         locked.push(at(1.0));
         wrong.push(others[others.len() / 2]);
     }
-    // Measured: 0.30 to 0.85, mean 0.54; at wrong tempi mean 0.08, most in songs of a few bars.
+    // Measured over 8 takes: mean 0.58, at wrong tempi 0.07, most in songs of a few bars.
     let mean = |x: &[f64]| x.iter().sum::<f64>() / x.len() as f64;
-    assert!(locked.iter().all(|r2| *r2 > 0.2) && mean(&locked) > 0.45, "{locked:?}");
+    assert!(locked.iter().all(|r2| *r2 > 0.25) && mean(&locked) > 0.5, "{locked:?}");
     assert!(mean(&wrong) < 0.12, "{wrong:?}");
 }
 
