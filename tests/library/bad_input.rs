@@ -164,8 +164,14 @@ fn a_song_that_breaks_loses_its_phrases() {
     let flags = from(&songs, &captures, &["--takes", "1"]);
     assert_eq!(library(&store, &flags).code, 0);
     let whole = motion(&store);
+    let constructed_splits: BTreeMap<String, String> =
+        constructed(&store).into_iter().map(|(id, row)| (id, row.split)).collect();
     dir.write("songs/tracked.wav", "no longer a song");
-    assert_eq!(library(&store, &flags).code, 1);
+    let output = library(&store, &flags);
+    assert_eq!(output.code, 1, "{output:?}");
+    let split = &constructed_splits["tracked.wav.t00.0000"];
+    let warning = format!("no song of the {split} split could be danced to, so it has no phrases");
+    assert!(output.stderr.contains(&warning), "{}", output.stderr);
     let left = motion(&store);
     assert_eq!(left.len(), 7);
     assert!(left.iter().all(|(id, frames)| whole[id] == *frames));

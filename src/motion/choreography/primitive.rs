@@ -116,9 +116,10 @@ impl Repertoire {
         }
         self.captures.push(Capture::fit(&poses)?);
         let n_found = found.len();
-        self.primitives.extend(found);
-        self.energies = self.primitives.iter().map(|p| p.energy).collect();
+        // Two runs, of which the first is sorted: the sort merges them.
+        self.energies.extend(found.iter().map(|p| p.energy));
         self.energies.sort_by(f64::total_cmp);
+        self.primitives.extend(found);
         Ok(n_found)
     }
 

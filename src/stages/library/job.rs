@@ -117,6 +117,7 @@ impl Job<'_> {
             );
         }
         self.dance(songs, todo, &writer, report)?;
+        warn_of_empty_splits(&songs.songs, report);
         self.forget(songs, &writer, &captures_origin, capture_names, report)?;
         if let Some(folder) = folder {
             folder.finish().context("while writing --output")?;
@@ -214,6 +215,18 @@ impl Job<'_> {
         }
         report.tally.n_forgotten = writer.forget(&songs.origin, &names, Some(&slugs))?;
         Ok(())
+    }
+}
+
+/// Tells of a split that has songs of which none could be danced to.
+fn warn_of_empty_splits(songs: &[Song], report: &Report) {
+    let failed: BTreeSet<&str> =
+        report.tally.failed.iter().map(|(name, _)| name.as_str()).collect();
+    for (n, split) in report.splits {
+        let mut of_split = songs.iter().filter(|s| s.problem.is_none() && s.split == split);
+        if n > 0 && of_split.all(|song| failed.contains(song.id.as_str())) {
+            tracing::warn!("no song of the {split} split could be danced to, so it has no phrases");
+        }
     }
 }
 
