@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Which rooms a room may use.
-const MAY_USE: [(&str, &[&str]); 11] = [
+const MAY_USE: [(&str, &[&str]); 12] = [
     ("units", &[]),
     ("audio", &["units"]),
     ("autodiff", &["model"]),
@@ -13,13 +13,31 @@ const MAY_USE: [(&str, &[&str]); 11] = [
     ("motion", &["units"]),
     ("plot", &["units"]),
     ("store", &["audio", "motion", "units"]),
+    (
+        "training",
+        &["audio", "autodiff", "diffusion", "model", "motion", "store", "units", "weights"],
+    ),
     ("weights", &["autodiff", "model"]),
-    ("stages", &["audio", "model", "motion", "plot", "store", "units"]),
+    (
+        "stages",
+        &[
+            "audio",
+            "autodiff",
+            "diffusion",
+            "model",
+            "motion",
+            "plot",
+            "store",
+            "training",
+            "units",
+            "weights",
+        ],
+    ),
     ("cli", &["stages"]),
 ];
 
 /// Crates that only one place may name: crate, where.
-const KEPT_TO: [(&str, &str); 11] = [
+const KEPT_TO: [(&str, &str); 12] = [
     ("polars", "store/query.rs"),
     ("object_store", "store/"),
     ("parquet", "store/"),
@@ -29,6 +47,7 @@ const KEPT_TO: [(&str, &str); 11] = [
     ("tiny_skia", "plot/"),
     ("ab_glyph", "plot/"),
     ("indicatif", "cli/"),
+    ("signal_hook", "cli/"),
     ("rayon", "autodiff/"),
     ("safetensors", "weights.rs"),
 ];

@@ -250,7 +250,9 @@ fn read_at(file: &File, bytes: &mut [u8], offset: u64) -> std::io::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::store::{Commit, Item, Ledger, Location, tables};
     use ndarray::array;
+    use std::collections::BTreeMap;
 
     #[test]
     fn rows_come_back_from_where_they_were_put() {
@@ -267,13 +269,6 @@ mod tests {
             assert_eq!(error.to_string(), format!("{place}: could not read"));
         }
     }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::store::{Commit, Item, Ledger, Location, tables};
-    use std::collections::BTreeMap;
 
     fn frames(n: usize, start: f32) -> Array2<f32> {
         Array2::from_shape_fn((n, 25), |(t, i)| start + t as f32 + 0.01 * i as f32)
@@ -296,19 +291,17 @@ mod tests {
     }
 
     fn visit(store: &Location, wanted: &[&str], n: usize) -> BTreeMap<String, Array2<f32>> {
-        let table = tables::motion();
-        let snapshot = Snapshot::take(store, table.clone()).unwrap();
+        let snapshot = Snapshot::take(store, tables::motion()).unwrap();
+        let wanted = wanted.iter().map(|&id| id.to_owned()).collect();
         let mut found = BTreeMap::new();
-        visit_frames(
-            &snapshot,
-            &table,
-            |id| wanted.contains(&id),
-            |id, frames| {
-                assert!(found.insert(id.to_owned(), frames).is_none(), "{id} comes twice");
-                if found.len() < n { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
-            },
-        )
-        .unwrap();
+        let visited = snapshot.visit_items(&wanted, |id, frames| {
+            assert!(found.insert(id.to_owned(), frames).is_none(), "{id} comes twice");
+            if found.len() < n {
+                return Ok(());
+            }
+            Err(StoreError::Query("enough".to_owned()))
+        });
+        assert_eq!(visited.is_err(), found.len() == n);
         found
     }
 

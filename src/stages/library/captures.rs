@@ -2,7 +2,6 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::Read as _;
-use std::ops::ControlFlow;
 
 use anyhow::bail;
 use ndarray::Array2;
@@ -14,7 +13,7 @@ use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::ingest::{read_bvh, read_trajectory};
 use crate::store::{
     ClientOptions, Content, Listing, Location, Snapshot, Source, SourceFile, SourceProblemKind,
-    StoreError, digest, tables, visit_frames,
+    StoreError, digest, tables,
 };
 
 /// Endings of the files that are read.
@@ -125,17 +124,11 @@ impl Captures {
                     );
                 }
                 let mut frames: BTreeMap<String, Array2<f32>> = BTreeMap::new();
-                let table = tables::motion();
-                let snapshot = Snapshot::take(&place, table.clone())?;
-                visit_frames(
-                    &snapshot,
-                    &table,
-                    |id| ids.contains_key(id),
-                    |id, found| {
-                        frames.insert(id.to_owned(), found);
-                        ControlFlow::Continue(())
-                    },
-                )?;
+                let wanted = ids.keys().cloned().collect();
+                Snapshot::take(&place, tables::motion())?.visit_items(&wanted, |id, found| {
+                    frames.insert(id.to_owned(), found);
+                    Ok::<_, StoreError>(())
+                })?;
                 let mut reading = Reading::default();
                 for (id, frames) in frames {
                     let added = guarded(&id, || {

@@ -1,7 +1,6 @@
 //! The music that is danced to: songs of a folder, or those that a store has features of.
 
 use std::collections::{BTreeMap, HashMap};
-use std::ops::ControlFlow;
 use std::sync::mpsc::SyncSender;
 
 use anyhow::bail;
@@ -12,7 +11,6 @@ use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::ingest::{Layout, Role, plan};
 use crate::store::{
     ClientOptions, Content, Location, Snapshot, Source, SourceFile, StoreError, digest, tables,
-    visit_frames,
 };
 
 /// Longest name of a song within the name of a phrase, in bytes; a folder's name may have 255.
@@ -229,23 +227,16 @@ fn send_features(
     songs: Vec<Song>,
     sender: &SyncSender<(Song, Input)>,
 ) -> Result<(), StoreError> {
-    let table = tables::features();
-    let snapshot = Snapshot::take(store, table.clone())?;
-    let wanted: BTreeMap<String, Song> =
+    let mut missing: BTreeMap<String, Song> =
         songs.into_iter().map(|song| (song.id.clone(), song)).collect();
-    let mut missing = wanted.clone();
-    visit_frames(
-        &snapshot,
-        &table,
-        |id| wanted.contains_key(id),
-        |id, frames| {
-            let Some(song) = missing.remove(id) else { return ControlFlow::Continue(()) };
-            match sender.send((song, Input::Features(Ok(frames)))) {
-                Ok(()) => ControlFlow::Continue(()),
-                Err(_) => ControlFlow::Break(()),
-            }
-        },
-    )?;
+    let wanted = missing.keys().cloned().collect();
+    Snapshot::take(store, tables::features())?.visit_items(&wanted, |id, frames| {
+        if let Some(song) = missing.remove(id) {
+            // Nobody listens any more when the job has failed; it says so itself.
+            sender.send((song, Input::Features(Ok(frames)))).ok();
+        }
+        Ok::<_, StoreError>(())
+    })?;
     for (id, song) in missing {
         let message = format!("{id}: its features are gone from the store; run extract again");
         let failure = Failure::new(FailureKind::Unreadable, &id, message);
