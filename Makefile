@@ -83,6 +83,12 @@ bench-engine: build/engine-venv/ready ## measure the engine beside PyTorch and o
 	build/engine-venv/bin/python benches/engine.py --profile release \
 	  --bin $(TARGET)/release/examples/engine-bench $(BENCH_ARGS)
 
+.PHONY: bench-training
+bench-training: build/engine-venv/ready ## measure training and fine-tuning beside PyTorch [BENCH_ARGS=--quick]
+	$(CARGO) build --locked --bin motiongen
+	$(CARGO) build --locked --release --no-default-features --bin motiongen --example training-bench
+	build/engine-venv/bin/python benches/training.py --bin $(TARGET)/release $(BENCH_ARGS)
+
 .PHONY: bench-room
 bench-room: ## build the room autodiff alone, from nothing
 	$(PYTHON) benches/room.py
