@@ -214,6 +214,42 @@ impl Dataset {
         Ok((Self { phrases, motion, features, fingerprint }, left_out))
     }
 
+    /// Makes a dataset of phrases that are at hand: name, split, motion `[n_frames, 25]` and features
+    /// `[n_frames, 163]`.
+    ///
+    /// Frames are taken as they are; a phrase has as many as the shorter of its two.
+    ///
+    /// # Errors
+    /// [`StoreError`] when the frames cannot be kept.
+    ///
+    /// # Panics
+    /// When frames have another width.
+    pub fn in_memory<'a>(
+        phrases: impl IntoIterator<Item = (&'a str, Split, Array2<f32>, Array2<f32>)>,
+    ) -> Result<Self, StoreError> {
+        let (motion, features) =
+            (FrameSpool::in_memory(MOTION_DIM), FrameSpool::in_memory(FEATURE_DIM));
+        let mut given: Vec<_> = phrases.into_iter().collect();
+        given.sort_by_key(|&(id, ..)| id);
+        let (mut phrases, mut digests) = (Vec::new(), Vec::new());
+        for (id, split, of_motion, of_features) in given {
+            let digest_of = |frames: &Array2<f32>| {
+                digest(&frames.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<_>>())
+            };
+            let (a, b) = (digest_of(&of_motion), digest_of(&of_features));
+            digests.push(format!("{id}\n{}\n{a}\n{b}", split.name()));
+            phrases.push(Phrase {
+                id: id.into(),
+                split,
+                n_frames: of_motion.nrows().min(of_features.nrows()),
+                motion_row: motion.append(of_motion.view())?,
+                feature_row: features.append(of_features.view())?,
+            });
+        }
+        let fingerprint = digest(digests.join("\n").as_bytes());
+        Ok(Self { phrases, motion, features, fingerprint })
+    }
+
     /// Refuses a dataset without training or validation phrases.
     ///
     /// # Errors

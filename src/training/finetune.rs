@@ -194,6 +194,11 @@ impl FinetuneLearner {
         })
     }
 
+    /// Returns the parameters of both networks; names begin with `unet.` and `decoder.`.
+    pub fn parameters(&self) -> &Parameters<f32> {
+        &self.parameters
+    }
+
     /// Returns all losses of a batch.
     ///
     /// # Errors

@@ -32,7 +32,7 @@ pub use diffusion::{DiffusionLearner, Given, Withhold};
 pub use drive::{Alone, Drive, End, Learner, Losses, Plan, Reducer, Step, Validation, Watch};
 pub use ema::{Ema, EmaConfig};
 pub use error::TrainingError;
-pub use finetune::FinetuneLearner;
+pub use finetune::{EndToEnd, FinetuneLearner};
 pub use journal::{Journal, RowKind};
 pub use learning_rate::{Course, LearningRate};
 pub use loader::Loader;
