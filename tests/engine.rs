@@ -1,7 +1,7 @@
 //! The engine and the networks against PyTorch.
 
 mod determinism;
-mod golden;
+pub mod golden;
 mod golden_values;
 mod messages;
 mod networks;

@@ -20,3 +20,4 @@ mod servers;
 mod store_suite;
 mod support;
 mod train;
+mod training;

@@ -1,4 +1,4 @@
-//! Golden files of `tests/golden/engine`.
+//! Golden files of `tests/golden/engine`, and of others that are made alike.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -18,8 +18,13 @@ pub struct Golden {
 
 impl Golden {
     pub fn open(name: &str) -> Self {
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/engine");
-        let bytes = std::fs::read(folder.join(name)).expect("a golden file");
+        Self::open_in("engine", name)
+    }
+
+    /// Opens a file of `tests/golden/<folder>`.
+    pub fn open_in(folder: &str, name: &str) -> Self {
+        let all = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden");
+        let bytes = std::fs::read(all.join(folder).join(name)).expect("a golden file");
         let file = SafeTensors::deserialize(&bytes).expect("a safetensors file");
         let tensors = file
             .iter()
