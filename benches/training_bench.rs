@@ -81,7 +81,8 @@ impl Bench {
         let windows =
             Arc::new(Windows::new(dataset, normalizer, Augmentation::default(), frames, 1));
         let threads = Threads::start(NonZeroUsize::new(number("threads")?).context("threads")?)?;
-        let (unet, decoder) = (UNet1D::new(&network.unet).1, MotionDecoder::new(&network.decoder).1);
+        let (unet, decoder) =
+            (UNet1D::new(&network.unet).1, MotionDecoder::new(&network.decoder).1);
         let n_parameters = unet.n_elements() + decoder.n_elements();
         let learner = threads.run(|| {
             let (unet, decoder) = (Parameters::new(unet, 1), Parameters::new(decoder, 1));

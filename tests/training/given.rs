@@ -84,7 +84,7 @@ pub fn begin_with(learner: &mut impl Learner, weights: &Parameters<f32>) {
         .map(|section| Section { values: values(section.prefix), ..section })
         .collect();
     let file = tempfile::NamedTempFile::new().expect("a temporary file");
-    save_to_file(&sections, Precision::F32, &BTreeMap::new(), &file).expect("written");
+    let file = save_to_file(&sections, Precision::F32, &BTreeMap::new(), file).expect("written");
     let bytes = std::fs::read(file.path()).expect("what was written");
     let archive = Archive::open(&bytes).expect("a safetensors file");
     learner.restore(&archive, "here", &Progress::default()).expect("weights that fit");
