@@ -1,12 +1,8 @@
 //! `motiongen train` and `motiongen finetune`, as a user runs them.
 
-#[path = "train/bad_input.rs"]
 mod bad_input;
-#[path = "train/finetune.rs"]
 mod finetune;
-#[path = "train/kill.rs"]
 mod kill;
-#[path = "train/learns.rs"]
 mod learns;
 
 use std::path::{Path, PathBuf};

@@ -1,7 +1,8 @@
-//! Training and fine-tuning: losses, gradients and steps against PyTorch.
+//! Training and fine-tuning: data, and losses, gradients and steps against PyTorch.
 
 mod dataset;
 mod finetune;
 mod given;
 mod losses;
 mod step;
+mod windows;

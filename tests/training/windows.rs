@@ -1,0 +1,182 @@
+//! Windows and batches: what is cut, what is padded, and that nobody is left out.
+
+use std::collections::BTreeMap;
+use std::num::NonZeroUsize;
+use std::sync::Arc;
+
+use motiongen::motion::{Channel, MOTION_DIM, Normalizer};
+use motiongen::training::{Augmentation, Dataset, Loader, Split, Windows, fit_normalizer};
+use ndarray::{Array2, s};
+use proptest::prelude::*;
+
+use crate::support::files::coherent;
+
+const PLAIN: Augmentation =
+    Augmentation { condition_noise: 0.0, mirror: false, yaw_deg: 0.0, stretch: 0.0 };
+
+/// Phrases of these lengths; features of frame t are t, so that they tell where a window begins.
+fn dataset(lengths: &[usize], split: Split) -> Arc<Dataset> {
+    let names: Vec<String> = (0..lengths.len()).map(|i| format!("{i:02}")).collect();
+    let phrases = names.iter().zip(lengths).enumerate().map(|(i, (name, &n))| {
+        let motion: Vec<f32> = coherent(n, i as u32).into_iter().flatten().collect();
+        let motion = Array2::from_shape_vec((n, MOTION_DIM), motion).expect("n × 25");
+        let features = Array2::from_shape_fn((n, 163), |(t, _)| t as f32);
+        (name.as_str(), split, motion, features)
+    });
+    Arc::new(Dataset::in_memory(phrases).expect("in memory"))
+}
+
+fn windows(lengths: &[usize], augmentation: Augmentation, n_frames: usize) -> Windows {
+    let dataset = dataset(lengths, Split::Train);
+    Windows::new(dataset, Normalizer::identity(), augmentation, n_frames, 7)
+}
+
+#[test]
+fn longer_phrases_have_several_windows_and_shorter_ones_are_held() {
+    let windows = windows(&[10, 24, 49, 73], PLAIN, 24);
+    assert_eq!(windows.n_train(), 1 + 1 + 2 + 3);
+    let batch = windows.train(&[(0, 0), (1, 3)]).expect("at hand");
+    assert_eq!((batch.n_windows, batch.n_frames), (2, 24));
+    // The short phrase: its last frame is held, and does not count.
+    let mask: Vec<f32> = (0..24).map(|t| if t < 10 { 1.0 } else { 0.0 }).collect();
+    assert_eq!(batch.mask[..24], mask);
+    let frame = |t: usize| &batch.motion[t * MOTION_DIM..(t + 1) * MOTION_DIM];
+    for t in 10..24 {
+        assert_eq!(frame(t), frame(9));
+        assert_eq!(batch.audio[t * 163], 9.0);
+    }
+    // The long one: a run of frames from within it, placed over the origin and facing +Z.
+    assert_eq!(batch.mask[24..], [1.0; 24]);
+    let audio: Vec<f32> = (24..48).map(|t| batch.audio[t * 163]).collect();
+    let first = audio[0];
+    assert!((0.0..=49.0).contains(&first), "{first}");
+    for (t, x) in audio.iter().enumerate() {
+        assert_eq!(*x, first + t as f32);
+    }
+    let begin = frame(24);
+    let q = Channel::Quaternion.range().start;
+    assert!(begin[0].abs() + begin[2].abs() < 1e-6);
+    assert!((begin[q] - 1.0).abs() < 1e-6 && begin[q + 2].abs() < 1e-6, "{:?}", &begin[q..q + 4]);
+    // Noise of either window, and of both: standard normal within five standard errors.
+    let n = batch.noise.len() as f32;
+    let mean = batch.noise.iter().sum::<f32>() / n;
+    let square = batch.noise.iter().map(|z| z * z).sum::<f32>() / n;
+    assert!(mean.abs() < 5.0 / n.sqrt() && (square - 1.0).abs() < 5.0 * (2.0 / n).sqrt());
+}
+
+#[test]
+fn validation_windows_follow_each_other_and_come_again_with_other_noise() {
+    let dataset = dataset(&[49, 10, 24], Split::Validation);
+    let windows = Windows::new(dataset, Normalizer::identity(), PLAIN, 24, 7);
+    assert_eq!(windows.n_validation(), 2 + 1 + 1);
+    let batch = windows.validation(0..9).expect("at hand");
+    let firsts: Vec<f32> = (0..9).map(|i| batch.audio[i * 24 * 163]).collect();
+    assert_eq!(firsts, [0.0, 24.0, 0.0, 0.0, 0.0, 24.0, 0.0, 0.0, 0.0]);
+    assert_eq!(batch.motion[..24 * 25], batch.motion[4 * 24 * 25..5 * 24 * 25]);
+    assert_ne!(batch.noise[..24 * 25], batch.noise[4 * 24 * 25..5 * 24 * 25]);
+    // Steps are spread: of nine, three in each third.
+    let thirds = batch.chances.iter().map(|c| (c.step * 3.0) as usize);
+    let mut count = [0; 3];
+    thirds.for_each(|third| count[third] += 1);
+    assert_eq!(count, [3, 3, 3]);
+    assert!(batch.chances.iter().all(|c| c.no_audio == 1.0 && c.no_style == 1.0));
+    let again = windows.validation(4..5).expect("at hand");
+    assert_eq!(again, batch.windows(4..5));
+}
+
+#[test]
+fn every_augmentation_leaves_motion_coherent() {
+    let all = Augmentation { condition_noise: 0.3, mirror: true, yaw_deg: 90.0, stretch: 0.2 };
+    for augmentation in [
+        all.clone(),
+        Augmentation { mirror: true, ..PLAIN },
+        Augmentation { yaw_deg: 45.0, ..PLAIN },
+        Augmentation { stretch: 0.25, ..PLAIN },
+    ] {
+        let windows = windows(&[90, 41], augmentation.clone(), 32);
+        let numbers: Vec<_> = (0..40).map(|i| (i, (i % 2) as u32)).collect();
+        let batch = windows.train(&numbers).expect("at hand");
+        let mut turned = 0;
+        for window in 0..40 {
+            let n = batch.mask[window * 32..(window + 1) * 32].iter().sum::<f32>() as usize;
+            assert!(n >= 28, "{n} frames");
+            let at = |t: usize, i: usize| batch.motion[(window * 32 + t) * MOTION_DIM + i];
+            for t in 0..n - 1 {
+                for i in 0..3 {
+                    let v = at(t, 3 + i) - 30.0 * (at(t + 1, i) - at(t, i));
+                    let a = at(t, 6 + i) - 30.0 * (at(t + 1, 3 + i) - at(t, 3 + i));
+                    // Single precision of positions of 3 m, 30 and 900 times.
+                    assert!(v.abs() < 3e-5 && a.abs() < 2e-3, "{augmentation:?}: {v}, {a}");
+                }
+            }
+            // Walks turn to the left; in the mirror to the right.
+            turned += i32::from(at(0, 14) < 0.0);
+        }
+        if augmentation.mirror {
+            assert!((8..=32).contains(&turned), "{turned} of 40 were mirrored");
+        } else {
+            assert_eq!(turned, 0);
+        }
+    }
+    let noisy = windows(&[90], Augmentation { condition_noise: 0.5, ..PLAIN }, 32);
+    let plain = windows(&[90], PLAIN, 32);
+    let [noisy, plain] = [noisy, plain].map(|w| w.train(&[(3, 0)]).expect("at hand"));
+    assert_eq!(noisy.motion, plain.motion);
+    let n = plain.audio.len() as f32;
+    let square: f32 =
+        noisy.audio.iter().zip(&plain.audio).map(|(a, b)| (a - b).powi(2)).sum::<f32>() / n;
+    assert!((square.sqrt() - 0.5).abs() < 0.5 * 5.0 / (2.0 * n).sqrt(), "{}", square.sqrt());
+}
+
+#[test]
+fn the_normalizer_sees_the_training_split_alone() {
+    let mut phrases = Vec::new();
+    for (i, (split, factor)) in
+        [(Split::Train, 1.0), (Split::Validation, 50.0), (Split::Test, 9.0)].into_iter().enumerate()
+    {
+        let motion: Vec<f32> = coherent(60, 3).into_iter().flatten().collect();
+        let mut motion = Array2::from_shape_vec((60, MOTION_DIM), motion).expect("60 × 25");
+        motion.slice_mut(s![.., 3..9]).map_inplace(|x| *x *= factor);
+        phrases.push((["a", "b", "c"][i], split, motion, Array2::zeros((60, 163))));
+    }
+    let train = phrases[..1].to_vec();
+    let fit = |phrases: Vec<(&str, Split, Array2<f32>, Array2<f32>)>| {
+        let dataset = Dataset::in_memory(phrases).expect("in memory");
+        fit_normalizer(&dataset, 24).expect("at hand")
+    };
+    assert_eq!(fit(phrases), fit(train));
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+
+    #[test]
+    fn every_window_comes_once_an_epoch_whoever_loads(
+        lengths in prop::collection::vec(5usize..60, 1..9),
+        batch_size in 1usize..12, n_threads in 1usize..5, first in 0u64..9
+    ) {
+        let windows = Arc::new(windows(&lengths, PLAIN, 16));
+        let n = windows.n_train();
+        let threads = NonZeroUsize::new(n_threads).expect("above 0");
+        let n_batches = 3 * n / batch_size + 3;
+        let load = |first: u64, threads: NonZeroUsize| {
+            let mut loader = Loader::start(&windows, batch_size, first, threads);
+            (0..n_batches).map(|_| loader.next_batch().expect("at hand")).collect::<Vec<_>>()
+        };
+        let one = load(0, NonZeroUsize::MIN);
+        let ids: Vec<_> = one.iter().flat_map(|batch| batch.phrase_ids.clone()).collect();
+        for epoch in ids.chunks_exact(n) {
+            let mut count: BTreeMap<&str, usize> = BTreeMap::new();
+            epoch.iter().for_each(|id| *count.entry(id).or_default() += 1);
+            for (i, length) in lengths.iter().enumerate() {
+                let wanted = (length / 16).max(1);
+                prop_assert_eq!(count.get(format!("{i:02}").as_str()), Some(&wanted));
+            }
+        }
+        // Another number of threads, and a start in the middle: the same batches.
+        let first = first.min(n_batches as u64 - 1);
+        let other = load(first, threads);
+        let rest = n_batches - first as usize;
+        prop_assert!(other[..rest] == one[first as usize..]);
+    }
+}
