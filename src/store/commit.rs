@@ -123,7 +123,6 @@ impl Ledger {
     }
 
     /// Returns the items that anything is known of, in no order.
-    #[expect(clippy::iter_over_hash_type, reason = "whoever asks sorts")]
     pub fn ids(&self) -> impl Iterator<Item = &str> {
         self.items.keys().map(String::as_str)
     }
