@@ -6,6 +6,8 @@
 //! follow the bar (R² of a regression on four harmonics of the bar's phase, against the same at wrong
 //! tempi)? A control gets the music of another song. See docs/training.md.
 
+#![allow(clippy::print_stdout, clippy::print_stderr, reason = "a program of its own")]
+
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 
