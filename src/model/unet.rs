@@ -2,7 +2,9 @@
 //!
 //! Drawn as in the reference's diagram: an encoder that halves the frames level by level, a
 //! bottleneck, and a decoder that takes each level's skip. At the lower levels attention looks over
-//! all frames and at the music.
+//! all frames and at the music. The music is also added to the first level, frame by frame: attention
+//! alone sees it as a set of frames, since neither keys nor queries know their place, and could never
+//! tell when a beat falls (the reference's network cannot).
 
 mod config;
 
@@ -25,6 +27,8 @@ pub struct UNet1D {
     style_proj: Option<Linear>,
     audio_proj: Linear,
     null_context: ParameterId,
+    /// The context, at the width of the first level.
+    audio_in: Option<Linear>,
     conv_in: Conv1d,
     encoder: Vec<EncoderLevel>,
     bottleneck: Bottleneck,
@@ -117,6 +121,8 @@ impl UNet1D {
         let audio_proj = Linear::new(&mut root.at("audio_proj"), c.audio_cond_dim, c.context_dim);
         let null_context =
             root.parameter("null_context", &[c.context_dim], Init::Zeros, Role::Vector);
+        let audio_in =
+            c.add_audio.then(|| Linear::new(&mut root.at("audio_in"), c.context_dim, c.widths[0]));
         let last = c.widths.len() - 1;
         let conv_in = Conv1d::new(&mut root.at("conv_in"), c.in_channels, c.widths[0], 3, 1);
 
@@ -173,6 +179,7 @@ impl UNet1D {
             style_proj,
             audio_proj,
             null_context,
+            audio_in,
             conv_in,
             encoder,
             bottleneck,
@@ -195,6 +202,11 @@ impl UNet1D {
         let x = g.hold_frames(inputs.x, multiple)?;
         let mut mask = g.frame_mask(inputs.x, inputs.mask, multiple)?;
         let mut x = self.conv_in.forward(g, &x)?;
+        if let Some(audio_in) = &self.audio_in {
+            let audio = audio_in.forward(g, &conditions.context)?;
+            let audio = g.hold_frames(&audio, multiple)?;
+            x = g.add(&x, &audio)?;
+        }
 
         let mut skips = Vec::new();
         for level in &self.encoder {
@@ -360,10 +372,14 @@ mod tests {
 
     #[test]
     fn presets_have_the_sizes_that_the_reference_states() {
-        // Counted by PyTorch (tests/golden/engine/network.py), and the null context on top.
+        // Counted by PyTorch (tests/golden/engine/network.py) as the reference draws them; the null
+        // context and the music at the first level come on top.
         let count = |preset: Preset| UNet1D::new(&preset.config()).1.n_elements();
-        assert_eq!(count(Preset::Large), 225_084_697 + 256);
-        assert_eq!(count(Preset::Base), 116_651_673 + 256);
+        let more = 256 + (256 * 256 + 256);
+        assert_eq!(count(Preset::Large), 225_084_697 + more);
+        assert_eq!(count(Preset::Base), 116_651_673 + more);
+        let drawn = UNetConfig { add_audio: false, ..Preset::Base.config() };
+        assert_eq!(UNet1D::new(&drawn).1.n_elements(), 116_651_673 + 256);
         assert!((116e6 * 0.99..116e6 * 1.01).contains(&(count(Preset::Base) as f64)));
         assert!((3_000_000..6_000_000).contains(&count(Preset::Small)), "{}", count(Preset::Small));
         assert!(count(Preset::Tiny) < 500_000, "{}", count(Preset::Tiny));

@@ -145,9 +145,10 @@ fn checkpoints_change_no_gradient() {
 }
 
 #[test]
-fn style_added_time_and_channels_per_head_are_pytorchs() {
+fn style_added_time_channels_per_head_and_music_by_attention_alone_are_pytorchs() {
     let config = UNetConfig {
         widths: vec![40, 48, 80],
+        add_audio: false,
         style_dim: 8,
         use_scale_shift_norm: false,
         num_head_channels: Some(8),

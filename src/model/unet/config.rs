@@ -27,6 +27,8 @@ pub struct UNetConfig {
     pub audio_cond_dim: usize,
     pub time_embed_dim: usize,
     pub context_dim: usize,
+    /// Whether the music is added to the first level, frame by frame; the reference draws it without.
+    pub add_audio: bool,
     /// Numbers of a style that is given as a condition; 0 for a network without.
     pub style_dim: usize,
     pub dropout: f64,
@@ -84,6 +86,7 @@ impl Preset {
             audio_cond_dim: FEATURE_DIM,
             time_embed_dim: dim,
             context_dim: dim,
+            add_audio: true,
             style_dim: 0,
             dropout: 0.1,
             n_steps: 1000,

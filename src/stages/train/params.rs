@@ -44,6 +44,10 @@ pub struct NetworkParams {
     /// Compute inner values of the UNet again for their gradient: less memory, a third more time.
     #[arg(long, help_heading = "Networks")]
     pub use_checkpoint: bool,
+    /// Let the music in by attention alone, as the reference draws it; such a network cannot tell when a
+    /// beat falls.
+    #[arg(long, help_heading = "Networks")]
+    pub attention_only: bool,
     /// Let the UNet take a style (the mean of the style channels) beside the music.
     #[arg(long, help_heading = "Networks")]
     pub style: bool,
@@ -207,6 +211,7 @@ impl NetworkParams {
             num_head_channels: self.num_head_channels.or(preset.num_head_channels),
             time_embed_dim: self.time_embed_dim.unwrap_or(preset.time_embed_dim),
             context_dim: self.context_dim.unwrap_or(preset.context_dim),
+            add_audio: !self.attention_only,
             style_dim: if self.style { STYLE_DIM } else { 0 },
             dropout: self.dropout.unwrap_or(preset.dropout),
             n_steps: timesteps,

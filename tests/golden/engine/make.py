@@ -205,7 +205,12 @@ def main() -> None:
     tiny, small, base = (network.unet(name).config for name in ("tiny", "small", "base"))
     # Widths with several channels in a group of a norm: a group of one forgets what is added to it.
     options = replace(
-        tiny, widths=(40, 48, 80), style_dim=8, use_scale_shift_norm=False, num_head_channels=8
+        tiny,
+        widths=(40, 48, 80),
+        add_audio=False,
+        style_dim=8,
+        use_scale_shift_norm=False,
+        num_head_channels=8,
     )
     cases = {
         "unet_tiny": lambda: unet_case(tiny, 21, [3, 500, 999], [0, 1, 0], [21, 17, 21]),

@@ -30,6 +30,7 @@ class UNetConfig:
     audio_cond_dim: int = 163
     time_embed_dim: int = 256
     context_dim: int = 256
+    add_audio: bool = True
     style_dim: int = 0
     dropout: float = 0.1
     n_steps: int = 1000
@@ -44,7 +45,7 @@ PRESETS = {
     "base": UNetConfig((256, 512, 1024, 1152), (1, 2, 3)),
     "large": UNetConfig((256, 512, 1024, 2048), (1, 2, 3)),
 }
-# Without the null context, which the reference does not have.
+# Without the null context and the music at the first level, which the reference does not have.
 COUNTS = {"base": 116_651_673, "large": 225_084_697}
 
 
@@ -170,6 +171,8 @@ class UNet1D(nn.Module):
             self.style_proj = nn.Linear(config.style_dim, time_dim)
         self.audio_proj = nn.Linear(config.audio_cond_dim, config.context_dim)
         self.null_context = nn.Parameter(torch.zeros(config.context_dim))
+        if config.add_audio:
+            self.audio_in = nn.Linear(config.context_dim, widths[0])
         self.conv_in = nn.Conv1d(config.in_channels, widths[0], 3, padding=1)
 
         self.encoder, self.decoder = nn.ModuleList(), nn.ModuleList()
@@ -209,7 +212,7 @@ class UNet1D(nn.Module):
         x is [B, T, in_channels], t [B] whole numbers, audio [B, T, audio_cond_dim]; drop [B] is 1
         for samples without music, mask [B, T] 1 for frames that count, style [B, style_dim].
         Frames up to a multiple of 2^(levels - 1) repeat the last one, are no keys of attention, and
-        are cropped; the music keeps its own frames.
+        are cropped; attention to the music sees its own frames.
         """
         time = self.time_mlp(self.time_table[t].to(x.dtype))
         if style is not None:
@@ -217,6 +220,7 @@ class UNet1D(nn.Module):
         context = self.audio_proj(audio)
         if drop is not None:
             context = torch.where(drop[:, None, None] != 0, self.null_context, context)
+        added = self.audio_in(context) if self.config.add_audio else None
         context = context.transpose(1, 2)
 
         batch, frames, _ = x.shape
@@ -224,11 +228,15 @@ class UNet1D(nn.Module):
         n_held = -frames % 2 ** (len(self.encoder) - 1)
         if n_held:
             x = torch.cat([x, x[:, -1:].expand(-1, n_held, -1)], dim=1)
+            if added is not None:
+                added = torch.cat([added, added[:, -1:].expand(-1, n_held, -1)], dim=1)
             keys = torch.ones(batch, frames, dtype=torch.bool) if keys is None else keys
             keys = F.pad(keys, (0, n_held))
         masks = [None if keys is None else keys[:, :: 2**i] for i in range(len(self.encoder))]
 
         x = self.conv_in(x.transpose(1, 2))
+        if added is not None:
+            x = x + added.transpose(1, 2)
         skips = []
         for level, keys in zip(self.encoder, masks, strict=True):
             x = level(x, time, keys, context, context_mask)
@@ -293,7 +301,7 @@ def count(module: nn.Module) -> int:
 def unet(preset: str) -> UNet1D:
     """Makes a UNet of a size with a name, and makes sure that it is that size."""
     network = UNet1D(PRESETS[preset])
-    n_parameters = count(network) - network.null_context.numel()
+    n_parameters = count(network) - network.null_context.numel() - count(network.audio_in)
     expected = COUNTS.get(preset, n_parameters)
     assert n_parameters == expected, f"{preset} has {n_parameters} parameters, not {expected}"
     return network
