@@ -18,7 +18,7 @@ use crate::support::files::{Member, coherent, npz, trajectory};
 use crate::support::{Dir, Output, finish, motiongen, rows, run};
 
 /// A network that learns in milliseconds.
-const SMALL: [&str; 14] = [
+const SMALL: [&str; 15] = [
     "--preset=tiny",
     "--widths=8,12",
     "--num-heads=2",
@@ -27,6 +27,7 @@ const SMALL: [&str; 14] = [
     "--decoder-hidden-dim=12",
     "--decoder-blocks=1",
     "--window-frames=24",
+    "--prediction=epsilon",
     "--batch-size=5",
     "--decoder-batch-size=3",
     "--learning-rate=3e-3",

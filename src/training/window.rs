@@ -31,7 +31,8 @@ pub struct Augmentation {
 
 impl Default for Augmentation {
     fn default() -> Self {
-        Self { condition_noise: 0.02, mirror: true, yaw_deg: 0.0, stretch: 0.0 }
+        // A handful of songs has a handful of tempi: stretched, they have all those between.
+        Self { condition_noise: 0.02, mirror: true, yaw_deg: 0.0, stretch: 0.15 }
     }
 }
 

@@ -89,9 +89,9 @@ pub struct DiffusionParams {
     #[arg(long, value_name = "X", default_value_t = DiffusionConfig::default().beta_end,
           help_heading = "Diffusion")]
     pub beta_end: f64,
-    /// What the UNet predicts.
-    #[arg(long, value_enum, default_value_t = DiffusionConfig::default().prediction,
-          help_heading = "Diffusion")]
+    /// What the UNet predicts. From a prediction of noise clean motion follows by a division by nearly 0
+    /// at the noisiest steps, which samplers of few steps do not survive.
+    #[arg(long, value_enum, default_value_t = Prediction::Sample, help_heading = "Diffusion")]
     pub prediction: Prediction,
     /// Estimates of clean motion are kept within so many standard deviations; 0 for no limit.
     #[arg(long, value_name = "X", default_value_t = 5.0, help_heading = "Diffusion")]
