@@ -13,6 +13,7 @@ mod motion_capture;
 mod npy_files;
 mod object_store_conformance;
 mod plot_features;
+mod plot_training;
 mod query_tables;
 mod rooms;
 mod schemas;

@@ -1,4 +1,4 @@
-//! Ticks and numbers of axes, and the axis of time that panels share.
+//! Ticks and numbers of axes, and the axes of time and of steps that panels share.
 
 use super::font;
 use super::style::TEXT_PX;
@@ -15,6 +15,8 @@ pub(super) struct Tick {
 const LABEL_GAP_PX: f64 = 24.0;
 /// No axis has more ticks.
 const MAX_TICKS: usize = 50;
+/// No horizontal axis has more.
+const MAX_HORIZONTAL_TICKS: usize = 20;
 
 /// Returns the ticks from `low` to `high`, both included: at most `max_ticks` (and [`MAX_TICKS`]),
 /// at multiples of 1, 2 or 5 times a power of ten.
@@ -43,6 +45,21 @@ pub(super) fn ticks(low: f64, high: f64, max_ticks: usize) -> Vec<Tick> {
     Vec::new()
 }
 
+/// Returns as many ticks from `low` to `high` as have room for their labels, at most `max_ticks`; `x`
+/// tells where a value is on a horizontal axis.
+fn fitting_ticks(low: f64, high: f64, max_ticks: usize, x: impl Fn(f64) -> f64) -> Vec<Tick> {
+    for max_ticks in (1..=max_ticks).rev() {
+        let ticks = ticks(low, high, max_ticks);
+        let widest =
+            ticks.iter().map(|tick| font::width_px(&tick.label, TEXT_PX)).fold(0.0, f64::max);
+        let fits = ticks.windows(2).all(|t| x(t[1].value) - x(t[0].value) >= widest + LABEL_GAP_PX);
+        if fits && !ticks.is_empty() {
+            return ticks;
+        }
+    }
+    Vec::new()
+}
+
 /// Writes a number with three significant figures, or all those of its whole part; very large and
 /// very small ones as powers of ten.
 pub(super) fn number(value: f64) -> String {
@@ -61,7 +78,7 @@ pub(super) fn number(value: f64) -> String {
 }
 
 /// Writes a number with a fixed number of decimals and a true minus sign.
-fn fixed(value: f64, decimals: usize) -> String {
+pub(super) fn fixed(value: f64, decimals: usize) -> String {
     if value.abs() >= 1e9 || decimals > 9 {
         return format!("{value:.1e}").replace('-', "−");
     }
@@ -111,18 +128,38 @@ impl TimeAxis {
         if self.n_frames == 0 {
             return Vec::new();
         }
-        for max_ticks in (1..=20).rev() {
-            let ticks = ticks(self.start_s, self.end_s(), max_ticks);
-            let widest =
-                ticks.iter().map(|tick| font::width_px(&tick.label, TEXT_PX)).fold(0.0, f64::max);
-            let fits = ticks
-                .windows(2)
-                .all(|t| self.x(t[1].value) - self.x(t[0].value) >= widest + LABEL_GAP_PX);
-            if fits && !ticks.is_empty() {
-                return ticks;
-            }
+        fitting_ticks(self.start_s, self.end_s(), MAX_HORIZONTAL_TICKS, |s| self.x(s))
+    }
+}
+
+/// Where steps are on the page: x = left + step width / n_steps, so that 0 steps done are at the left
+/// edge and all of them at the right.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct StepAxis {
+    pub n_steps: u64,
+    pub left: f64,
+    pub width: f64,
+}
+
+impl StepAxis {
+    /// Returns the x of a step; steps beyond the last are at the right edge.
+    pub fn x(&self, step: f64) -> f64 {
+        let n_steps = self.n_steps.max(1) as f64;
+        self.left + step.min(n_steps) * self.width / n_steps
+    }
+
+    pub fn right(&self) -> f64 {
+        self.left + self.width
+    }
+
+    /// Returns as many ticks as have room for their labels, all at whole steps; none without steps.
+    pub fn ticks(&self) -> Vec<Tick> {
+        if self.n_steps == 0 {
+            return Vec::new();
         }
-        Vec::new()
+        let n_whole = usize::try_from(self.n_steps).unwrap_or(usize::MAX).saturating_add(1);
+        let max_ticks = n_whole.min(MAX_HORIZONTAL_TICKS);
+        fitting_ticks(0.0, self.n_steps as f64, max_ticks, |step| self.x(step))
     }
 }
 
@@ -171,5 +208,25 @@ mod tests {
         assert_eq!(time.x(2.0), 11.0);
         assert!((time.x(2.5) - 41.0).abs() < 1e-9, "{}", time.x(2.5));
         assert_eq!(time.x_of_frame(60.0), time.right());
+    }
+
+    #[test]
+    fn steps_have_whole_ticks_with_room_for_their_labels() {
+        let cases: [(u64, f64, &[&str]); 6] = [
+            (0, 400.0, &[]),
+            (1, 400.0, &["0", "1"]),
+            (3, 400.0, &["0", "1", "2", "3"]),
+            (20_000, 422.0, &["0", "5000", "10000", "15000", "20000"]),
+            (123_456, 228.0, &["0", "50000", "100000"]),
+            (u64::MAX, 228.0, &["0", "1.0e19"]),
+        ];
+        for (n_steps, width, wanted) in cases {
+            let axis = StepAxis { n_steps, left: 64.0, width };
+            let labels: Vec<_> = axis.ticks().into_iter().map(|tick| tick.label).collect();
+            assert_eq!(labels, wanted, "{n_steps} steps on {width} px");
+            assert_eq!(axis.x(0.0), 64.0);
+        }
+        let axis = StepAxis { n_steps: 40, left: 10.0, width: 120.0 };
+        assert_eq!((axis.x(1.0), axis.x(40.0)), (13.0, axis.right()));
     }
 }

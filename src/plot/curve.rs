@@ -3,12 +3,10 @@
 use ndarray::ArrayView1;
 
 use super::axis::{self, TimeAxis};
-use super::heatmap::no_frames;
+use super::frame;
 use super::reduce::{self, Extent};
-use super::scene::{Anchor, Item, Point, Rect, Scene};
-use super::style::{
-    BLUE, CAP_HEIGHT, CURVE_PX, GRID, HAIRLINE_PX, INK, SCALE, TEXT_PX, TICK_GAP_PX, VERMILLION,
-};
+use super::scene::{Item, Point, Rect, Scene};
+use super::style::{BLUE, CURVE_PX, GRID, HAIRLINE_PX, SCALE, VERMILLION};
 
 /// How dark the area under a curve is, and the band from the least to the greatest value of each
 /// column.
@@ -16,8 +14,8 @@ const AREA_OPACITY: f64 = 0.12;
 const BAND_OPACITY: f64 = 0.35;
 /// Distance of the means where frames are closer than device pixels.
 const MEANS_PX: f64 = 2.0;
-/// Width of a frame without neighbours.
-const DOT_PX: f64 = 5.0;
+/// Width of a value without neighbours.
+pub(super) const DOT_PX: f64 = 5.0;
 /// Most ticks on the vertical axis.
 const MAX_TICKS: usize = 4;
 
@@ -30,7 +28,7 @@ pub(super) fn draw(
     marks: &[f64],
 ) {
     if values.is_empty() {
-        return no_frames(scene, rect);
+        return frame::nothing(scene, rect, "no frames");
     }
     let columns = reduce::extents(values, n_columns(values.len(), rect.width));
     let low = columns.iter().flatten().map(|e| e.min).fold(0.0, f64::min);
@@ -40,12 +38,7 @@ pub(super) fn draw(
     for tick in time.ticks() {
         scene.vertical(time.x(tick.value), rect.top, rect.bottom(), HAIRLINE_PX, GRID);
     }
-    for tick in axis::ticks(low, high, MAX_TICKS) {
-        let y = (y(tick.value) * 2.0).round() / 2.0;
-        scene.horizontal(rect.left, rect.right(), y - HAIRLINE_PX / 2.0, HAIRLINE_PX, GRID);
-        let at = [rect.left - TICK_GAP_PX * 2.0, y + CAP_HEIGHT * TEXT_PX / 2.0];
-        scene.text(at, Anchor::End, &tick.label, TEXT_PX, INK);
-    }
+    frame::value_grid(scene, rect, &axis::ticks(low, high, MAX_TICKS), y);
 
     let is_reduced = columns.len() < values.len();
     let x = |column: usize| {
@@ -64,13 +57,11 @@ pub(super) fn draw(
         scene.vertical(mark, rect.top, rect.bottom(), HAIRLINE_PX, VERMILLION);
     }
     for run in &runs {
-        let mut points: Vec<Point> = run.iter().map(|&(i, e)| [x(i), y(e.mean)]).collect();
-        if let &[[x, y]] = points.as_slice() {
-            // One frame alone is a dot: a thick line with round ends that hardly goes anywhere.
-            points = vec![[x - 0.01, y], [x + 0.01, y]];
+        let points: Vec<Point> = run.iter().map(|&(i, e)| [x(i), y(e.mean)]).collect();
+        match points.as_slice() {
+            &[alone] => scene.dot(alone, DOT_PX, BLUE),
+            _ => scene.items.push(Item::Polyline { points, color: BLUE, width_px: CURVE_PX }),
         }
-        let width_px = if run.len() == 1 { DOT_PX } else { CURVE_PX };
-        scene.items.push(Item::Polyline { points, color: BLUE, width_px });
     }
 }
 
@@ -82,7 +73,7 @@ pub(super) fn n_columns(n_frames: usize, width_px: f64) -> usize {
 }
 
 /// Returns the stretches of columns without a gap.
-fn runs(columns: &[Option<Extent>]) -> Vec<Vec<(usize, Extent)>> {
+pub(super) fn runs(columns: &[Option<Extent>]) -> Vec<Vec<(usize, Extent)>> {
     let mut runs = vec![Vec::new()];
     for (i, column) in columns.iter().enumerate() {
         match (column, runs.last_mut()) {

@@ -1,17 +1,15 @@
 //! What can keep a plot from being made, each as one sentence.
 
-use super::panel::Panel;
-
 /// Why a plot could not be made.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum PlotError {
     /// A name that no panel has.
-    #[error("panel \"{name}\" is unknown; the panels are {}", Panel::ALL.map(Panel::name).join(", "))]
-    UnknownPanel { name: String },
+    #[error("panel \"{name}\" is unknown; the panels are {known}")]
+    UnknownPanel { name: String, known: String },
     /// An empty list of panels.
-    #[error("no panels to plot; ask for one of {}", Panel::ALL.map(Panel::name).join(", "))]
-    NoPanels,
+    #[error("no panels to plot; ask for one of {known}")]
+    NoPanels { known: String },
     /// An array of another width.
     #[error("features have {found} values per frame; a plot needs {wanted}")]
     Columns { found: usize, wanted: usize },

@@ -3,11 +3,11 @@
 use ndarray::ArrayView2;
 
 use super::axis::TimeAxis;
-use super::page::{self, Page};
+use super::page::Page;
 use super::panel::{FEATURE_DIM, N_MEL, Panel};
 use super::scene::{Rect, Scene};
-use super::style::MARGIN_PX;
-use super::{Format, Picture, PlotError, heatmap, write};
+use super::style::{LEFT_PX, MARGIN_PX};
+use super::{Format, Picture, PlotError, check_width, frame, header, heatmap, write};
 
 /// Features of a file, or of an excerpt, and what is known of its beats.
 #[derive(Clone, Copy, Debug)]
@@ -27,14 +27,8 @@ pub struct FeaturesPlot<'a> {
     pub start_s: f64,
 }
 
-/// Widths in CSS pixels that a plot can have.
-pub const MIN_WIDTH_PX: u32 = 320;
-pub const MAX_WIDTH_PX: u32 = 8192;
 /// Times on which the axis stays exact.
 const MAX_START_S: f64 = 1e7;
-
-/// Left edge of the panels: margin, labels, ticks.
-const LEFT_PX: f64 = MARGIN_PX + 36.0;
 
 /// Returns a plot of features: one panel below the other over a common axis of time, `width_px` CSS
 /// pixels wide (a PNG has two pixels for each).
@@ -68,18 +62,18 @@ pub(super) fn scene(
     };
     let mut page = Page::new(plot, time);
     page.header(plot, panels);
-    let mut top = page::HEADER_PX;
+    let mut top = header::HEADER_PX;
     let mut bottom = top;
     for &panel in panels {
         let rect = Rect {
             left: time.left,
-            top: top + page::PLOT_TOP_PX,
+            top: top + frame::PLOT_TOP_PX,
             width: time.width,
             height: panel.height_px(is_alone),
         };
         page.panel(panel, rect, plot);
         bottom = rect.bottom();
-        top = bottom + page::PANEL_GAP_PX;
+        top = bottom + frame::PANEL_GAP_PX;
     }
     page.time_labels(bottom);
     Ok(page.into_scene(f64::from(width_px), bottom))
@@ -87,12 +81,9 @@ pub(super) fn scene(
 
 fn check(plot: &FeaturesPlot<'_>, panels: &[Panel], width_px: u32) -> Result<(), PlotError> {
     if panels.is_empty() {
-        return Err(PlotError::NoPanels);
+        return Err(PlotError::NoPanels { known: Panel::known() });
     }
-    if !(MIN_WIDTH_PX..=MAX_WIDTH_PX).contains(&width_px) {
-        let (min_px, max_px) = (MIN_WIDTH_PX, MAX_WIDTH_PX);
-        return Err(PlotError::Width { width_px, min_px, max_px });
-    }
+    check_width(width_px)?;
     if plot.values.ncols() != FEATURE_DIM {
         let found = plot.values.ncols();
         return Err(PlotError::Columns { found, wanted: FEATURE_DIM });

@@ -4,9 +4,9 @@ use ndarray::{Array2, ArrayView2};
 
 use super::axis::number;
 use super::colormap::{self, Palette};
-use super::reduce;
 use super::scene::{Anchor, Image, Item, Rect, Scene};
-use super::style::{CAP_HEIGHT, GRID, INK, MUTED, SCALE, TEXT_PX};
+use super::style::{CAP_HEIGHT, INK, SCALE, TEXT_PX};
+use super::{frame, reduce};
 
 /// Space between a heat map and its bar, width of the bar, space between the bar and its labels.
 const BAR_GAP_PX: f64 = 12.0;
@@ -42,7 +42,7 @@ pub(super) fn draw(scene: &mut Scene, rect: Rect, values: ArrayView2<'_, f32>, s
         Scale::Deviation => (colormap::deviations(), deviation_ends(&columns)),
     };
     if columns.is_empty() {
-        no_frames(scene, rect);
+        frame::nothing(scene, rect, "no frames");
     } else {
         let image = image(&columns, &palette, &ends);
         scene.items.push(Item::Image { rect, image });
@@ -53,13 +53,6 @@ pub(super) fn draw(scene: &mut Scene, rect: Rect, values: ArrayView2<'_, f32>, s
 /// Returns how many columns stand for `n_frames` frames: at most one per device pixel.
 pub(super) fn n_columns(n_frames: usize, width_px: f64) -> usize {
     n_frames.min((width_px * f64::from(SCALE)) as usize)
-}
-
-/// Draws what stands in place of a panel without frames.
-pub(super) fn no_frames(scene: &mut Scene, rect: Rect) {
-    scene.area(rect, GRID, 0.5);
-    let y = rect.top + (rect.height + CAP_HEIGHT * TEXT_PX) / 2.0;
-    scene.text([rect.left + rect.width / 2.0, y], Anchor::Middle, "no frames", TEXT_PX, MUTED);
 }
 
 fn finite(columns: &Array2<f32>) -> impl Iterator<Item = f64> {

@@ -5,11 +5,14 @@
 //! house's (`style`, `colormap`). The same scene gives the same bytes.
 
 mod axis;
+mod chart;
 mod colormap;
 mod curve;
 mod error;
 mod features;
 mod font;
+mod frame;
+mod header;
 mod heatmap;
 mod page;
 mod panel;
@@ -21,10 +24,19 @@ mod style;
 mod svg;
 #[cfg(test)]
 mod tests;
+mod training;
+mod training_panel;
+mod value_axis;
 
 pub use error::PlotError;
-pub use features::{FeaturesPlot, MAX_WIDTH_PX, MIN_WIDTH_PX, features};
+pub use features::{FeaturesPlot, features};
 pub use panel::Panel;
+pub use training::{PanelCurves, StageCurves, TrainingPlot, training};
+pub use training_panel::{TrainingPanel, TrainingStage};
+
+/// Widths in CSS pixels that a plot can have.
+pub const MIN_WIDTH_PX: u32 = 320;
+pub const MAX_WIDTH_PX: u32 = 8192;
 
 /// The file formats of a plot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -54,6 +66,13 @@ pub struct Picture {
     /// Size in pixels: of the device for PNG, of CSS for SVG.
     pub width_px: u32,
     pub height_px: u32,
+}
+
+fn check_width(width_px: u32) -> Result<(), PlotError> {
+    if (MIN_WIDTH_PX..=MAX_WIDTH_PX).contains(&width_px) {
+        return Ok(());
+    }
+    Err(PlotError::Width { width_px, min_px: MIN_WIDTH_PX, max_px: MAX_WIDTH_PX })
 }
 
 /// Writes a scene in a format.

@@ -4,30 +4,16 @@ use ndarray::s;
 
 use super::axis::TimeAxis;
 use super::features::FeaturesPlot;
+use super::header::{self, Fact};
 use super::heatmap::{self, Scale};
 use super::panel::Panel;
 use super::scene::{Anchor, Rect, Scene};
 use super::style::{
-    AXIS, CAP_HEIGHT, HAIRLINE_PX, HEADING_PX, INK, MARGIN_PX, MISSING, MUTED, Rgb, TEXT_PX,
-    TICK_GAP_PX, TICK_PX, TITLE_PX, VERMILLION,
+    AXIS, CAP_HEIGHT, HAIRLINE_PX, INK, MARGIN_PX, MISSING, TEXT_PX, TICK_GAP_PX, TICK_PX,
+    VERMILLION,
 };
-use super::{curve, font};
+use super::{curve, frame};
 use crate::units::{FPS, frames_to_s};
-
-/// Baselines of the title and of the line below it.
-const TITLE_BASE_PX: f64 = 38.0;
-const FACTS_BASE_PX: f64 = 58.0;
-/// Where the first panel's room begins.
-pub(super) const HEADER_PX: f64 = 76.0;
-/// Within a panel's room: baseline of the heading, upper edge of the plot; and space below it.
-const HEADING_BASE_PX: f64 = 14.0;
-pub(super) const PLOT_TOP_PX: f64 = 26.0;
-pub(super) const PANEL_GAP_PX: f64 = 18.0;
-/// Below the last panel: baselines of the labels and of the axis title.
-const TIME_LABEL_PX: f64 = 19.0;
-const TIME_TITLE_PX: f64 = 37.0;
-/// Space between two facts, in which a dot stands.
-const FACT_GAP_PX: f64 = 24.0;
 
 /// Beats closer than this on average are not drawn: they would be a veil.
 const MIN_BEAT_GAP_PX: f64 = 5.0;
@@ -71,43 +57,21 @@ impl Page {
     /// Ends the page below a last panel that ends at `bottom`.
     pub fn into_scene(mut self, width_px: f64, bottom: f64) -> Scene {
         self.scene.width_px = width_px;
-        self.scene.height_px = bottom + TIME_TITLE_PX + MARGIN_PX;
+        self.scene.height_px = bottom + frame::X_TITLE_PX + MARGIN_PX;
         self.scene
     }
 
     /// Writes the title and, below it, as many facts as there is room for.
     pub fn header(&mut self, plot: &FeaturesPlot<'_>, panels: &[Panel]) {
-        let left = self.time.left;
-        let title = font::elide(plot.title, TITLE_PX, self.time.width);
-        self.scene.text([left, TITLE_BASE_PX], Anchor::Start, &title, TITLE_PX, INK);
-
-        let mut x = left;
-        for (i, fact) in self.facts(plot, panels).into_iter().enumerate() {
-            let gap_px = if i == 0 { 0.0 } else { FACT_GAP_PX };
-            let key_px = if fact.key.is_some() { TICK_PX * 2.0 } else { 0.0 };
-            let start = x + gap_px;
-            let end = start + key_px + font::width_px(&fact.text, TEXT_PX);
-            if end > self.time.right() {
-                break;
-            }
-            if i > 0 {
-                let middle = [x + gap_px / 2.0, FACTS_BASE_PX];
-                self.scene.text(middle, Anchor::Middle, "·", TEXT_PX, MUTED);
-            }
-            if let Some((color, width)) = fact.key {
-                let height = CAP_HEIGHT * TEXT_PX + 2.0;
-                let top = FACTS_BASE_PX - height + 1.0;
-                self.scene.area(Rect { left: start, top, width, height }, color, 1.0);
-            }
-            let at = [start + key_px, FACTS_BASE_PX];
-            self.scene.text(at, Anchor::Start, &fact.text, TEXT_PX, MUTED);
-            x = end;
-        }
+        let (left, right) = (self.time.left, self.time.right());
+        header::title(&mut self.scene, left, right, plot.title);
+        let facts = self.facts(plot, panels);
+        header::facts(&mut self.scene, left, right, header::FACTS_BASE_PX, facts, 1);
     }
 
     fn facts(&self, plot: &FeaturesPlot<'_>, panels: &[Panel]) -> Vec<Fact> {
         let n_frames = plot.values.nrows();
-        let counted = |n: usize, one: &str| format!("{n} {one}{}", if n == 1 { "" } else { "s" });
+        let counted = |n: usize, one: &str| header::counted(n as u64, one);
         let duration_s = frames_to_s(n_frames);
         let decimals = if duration_s < 1000.0 { 2 } else { 0 };
         let mut facts = vec![
@@ -187,20 +151,13 @@ impl Page {
     }
 
     fn heading(&mut self, panel: Panel, rect: Rect) {
-        let base = rect.top - PLOT_TOP_PX + HEADING_BASE_PX;
-        self.scene.text([rect.left, base], Anchor::Start, panel.heading(), HEADING_PX, INK);
-        let left = rect.left + font::width_px(panel.heading(), HEADING_PX) + 10.0;
-        let fits = |text: &&str| left + font::width_px(text, TEXT_PX) <= self.time.right();
-        if let Some(meaning) = panel.meanings().into_iter().find(fits) {
-            self.scene.text([left, base], Anchor::Start, meaning, TEXT_PX, MUTED);
-        }
         let unit = match panel {
             Panel::Mel => "Hz",
             Panel::Mfcc => "no.",
             _ => "",
         };
-        let at = [rect.left - TICK_GAP_PX - TICK_PX, base];
-        self.scene.text(at, Anchor::End, unit, TEXT_PX, MUTED);
+        let right = self.time.right();
+        frame::heading(&mut self.scene, rect, right, panel.heading(), &panel.meanings(), unit);
     }
 
     /// Puts a tick at each frequency, and its label where it does not touch one that is there.
@@ -228,35 +185,15 @@ impl Page {
     }
 
     fn time_ticks(&mut self, bottom: f64) {
-        for tick in self.time.ticks() {
-            let x = self.time.x(tick.value);
-            let top = bottom + HAIRLINE_PX;
-            self.scene.vertical(x, top, top + TICK_PX, HAIRLINE_PX, AXIS);
-        }
+        let ticks = self.time.ticks();
+        let x = ticks.iter().map(|tick| self.time.x(tick.value));
+        frame::x_ticks(&mut self.scene, x, bottom);
     }
 
     pub fn time_labels(&mut self, bottom: f64) {
-        for tick in self.time.ticks() {
-            // Long labels at the right end move left to stay on the page.
-            let half_px = font::width_px(&tick.label, TEXT_PX) / 2.0;
-            let max_x = self.time.right() + MARGIN_PX - TICK_GAP_PX - half_px;
-            let at = [self.time.x(tick.value).min(max_x), bottom + TIME_LABEL_PX];
-            self.scene.text(at, Anchor::Middle, &tick.label, TEXT_PX, INK);
-        }
-        let at = [self.time.left + self.time.width / 2.0, bottom + TIME_TITLE_PX];
-        self.scene.text(at, Anchor::Middle, "time (s)", TEXT_PX, MUTED);
-    }
-}
-
-/// A piece of the line below the title; `key` is the colour and width of a mark before it.
-struct Fact {
-    key: Option<(Rgb, f64)>,
-    text: String,
-}
-
-impl Fact {
-    fn plain(text: String) -> Self {
-        Self { key: None, text }
+        let (time, ticks) = (self.time, self.time.ticks());
+        let labels = ticks.iter().map(|tick| (time.x(tick.value), tick.label.as_str()));
+        frame::x_labels(&mut self.scene, labels, [time.left, time.right()], bottom, "time (s)");
     }
 }
 

@@ -44,6 +44,11 @@ impl Panel {
         }
     }
 
+    /// Returns the names of every panel, as messages list them.
+    pub(super) fn known() -> String {
+        Self::ALL.map(Self::name).join(", ")
+    }
+
     /// Returns where the block is in a frame.
     pub(super) fn columns(self) -> Range<usize> {
         match self {
@@ -118,7 +123,7 @@ impl FromStr for Panel {
         Self::ALL
             .into_iter()
             .find(|panel| panel.name() == name)
-            .ok_or_else(|| PlotError::UnknownPanel { name: name.to_owned() })
+            .ok_or_else(|| PlotError::UnknownPanel { name: name.to_owned(), known: Self::known() })
     }
 }
 

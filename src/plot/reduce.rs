@@ -50,21 +50,63 @@ pub(super) struct Extent {
     pub max: f64,
 }
 
+/// The values of a column, as far as they were counted.
+#[derive(Clone, Copy, Debug)]
+struct Tally {
+    n: u64,
+    sum: f64,
+    min: f64,
+    max: f64,
+}
+
+impl Tally {
+    const NONE: Self = Self { n: 0, sum: 0.0, min: f64::INFINITY, max: f64::NEG_INFINITY };
+
+    /// Counts a value in, if it is finite.
+    fn add(&mut self, value: f64) {
+        if value.is_finite() {
+            self.n += 1;
+            self.sum += value;
+            self.min = self.min.min(value);
+            self.max = self.max.max(value);
+        }
+    }
+
+    fn extent(self) -> Option<Extent> {
+        let Self { n, sum, min, max } = self;
+        (n > 0).then(|| Extent { min, mean: sum / n as f64, max })
+    }
+}
+
 /// Returns the extent of the finite values in each column; `None` where there are none.
 pub(super) fn extents(values: ArrayView1<'_, f32>, max_columns: usize) -> Vec<Option<Extent>> {
     let n_columns = n_columns(values.len(), max_columns);
     (0..n_columns)
         .map(|column| {
-            let frames = frames_of(column, n_columns, values.len());
-            let finite = || frames.clone().map(|t| f64::from(values[t])).filter(|v| v.is_finite());
-            let n = finite().count();
-            (n > 0).then(|| Extent {
-                min: finite().fold(f64::INFINITY, f64::min),
-                mean: finite().sum::<f64>() / n as f64,
-                max: finite().fold(f64::NEG_INFINITY, f64::max),
-            })
+            let mut tally = Tally::NONE;
+            frames_of(column, n_columns, values.len()).for_each(|t| tally.add(values[t].into()));
+            tally.extent()
         })
         .collect()
+}
+
+/// Returns the extent of the finite values at steps, counted from 1 to `n_steps`, that share a column;
+/// `None` where there are none. Step s is in the column in which frame s - 1 of as many frames is.
+pub(super) fn extents_of_steps(
+    points: impl IntoIterator<Item = (u64, f64)>,
+    n_steps: u64,
+    n_columns: usize,
+) -> Vec<Option<Extent>> {
+    let mut tallies = vec![Tally::NONE; n_columns];
+    for (step, value) in points {
+        let step = step.clamp(1, n_steps.max(1));
+        let column = (u128::from(step) * n_columns as u128).saturating_sub(1);
+        let column = column / u128::from(n_steps.max(1));
+        if let Some(tally) = tallies.get_mut(column as usize) {
+            tally.add(value);
+        }
+    }
+    tallies.into_iter().map(Tally::extent).collect()
 }
 
 #[cfg(test)]
@@ -113,5 +155,28 @@ mod tests {
         assert_eq!(extents(values.view(), 2), wanted);
         assert_eq!(extents(values.view(), 3)[2], None);
         assert_eq!(extents(values.slice(ndarray::s![..0]), 3), []);
+    }
+
+    #[test]
+    fn steps_are_in_the_columns_of_their_frames() {
+        for (n_steps, n_columns) in [(7_u64, 7), (7, 3), (20_000, 454), (1, 1), (2, 5)] {
+            let points = (1..=n_steps).map(|step| (step, step as f64));
+            let found = extents_of_steps(points, n_steps, n_columns);
+            assert_eq!(found.len(), n_columns);
+            for (column, extent) in found.into_iter().enumerate() {
+                let frames = frames_of(column, n_columns, n_steps as usize);
+                let wanted =
+                    (!frames.is_empty()).then(|| (frames.start as f64 + 1.0, frames.end as f64));
+                assert_eq!(extent.map(|e| (e.min, e.max)), wanted, "column {column}");
+            }
+        }
+        let points = [(1, f64::NAN), (3, 4.0), (4, 8.0), (0, 1.0), (9, 2.0), (5, f64::INFINITY)];
+        let wanted = [
+            Some(Extent { min: 1.0, mean: 1.0, max: 1.0 }),
+            Some(Extent { min: 2.0, mean: 14.0 / 3.0, max: 8.0 }),
+        ];
+        assert_eq!(extents_of_steps(points, 4, 2), wanted);
+        assert_eq!(extents_of_steps(points, 0, 0), []);
+        assert!(extents_of_steps([(u64::MAX, 1.0)], u64::MAX, 3)[2].is_some());
     }
 }

@@ -106,6 +106,13 @@ impl Scene {
         self.area(rect, color, 1.0);
     }
 
+    /// Adds a dot of `width_px` around a place.
+    pub fn dot(&mut self, [x, y]: Point, width_px: f64, color: Rgb) {
+        // A thick line with round ends that hardly goes anywhere.
+        let points = vec![[x - 0.01, y], [x + 0.01, y]];
+        self.items.push(Item::Polyline { points, color, width_px });
+    }
+
     pub fn text(&mut self, at: Point, anchor: Anchor, text: &str, size_px: f64, color: Rgb) {
         if !text.is_empty() {
             self.items.push(Item::Text { at, anchor, text: text.to_owned(), size_px, color });

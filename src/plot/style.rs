@@ -2,8 +2,8 @@
 //!
 //! White paper, dark text, no boxes; light grid lines only where a curve is read off. Colours of
 //! curves are from Okabe and Ito, Color Universal Design, 2008: they stay apart for colour-blind
-//! readers, and blue and vermillion also in grey print. Text in these colours and in `MUTED` has a
-//! contrast of at least 4.5 to 1 on white, except on heat maps, which carry no text.
+//! readers, and blue and vermillion also in grey print. Text is `INK` or `MUTED`, which have a contrast
+//! of at least 4.5 to 1 on white.
 
 /// A colour: red, green and blue in sRGB.
 pub(super) type Rgb = [u8; 3];
@@ -23,9 +23,14 @@ pub(super) const MISSING: Rgb = [0x9a, 0xa0, 0xa6];
 pub(super) const BLUE: Rgb = [0x00, 0x72, 0xb2];
 /// Marks over a curve.
 pub(super) const VERMILLION: Rgb = [0xd5, 0x5e, 0x00];
+/// Further curves.
+pub(super) const GREEN: Rgb = [0x00, 0x9e, 0x73];
+pub(super) const PURPLE: Rgb = [0xcc, 0x79, 0xa7];
 
-/// Text sizes in CSS pixels: of a plot's title, a panel's heading, and all else.
+/// Text sizes in CSS pixels: of a plot's title, a part's with several panels, a panel's heading, and
+/// all else.
 pub(super) const TITLE_PX: f64 = 18.0;
+pub(super) const PART_PX: f64 = 15.0;
 pub(super) const HEADING_PX: f64 = 13.0;
 pub(super) const TEXT_PX: f64 = 11.0;
 /// Height of a figure or capital relative to the text size (DejaVu Sans: 1493 of 2048 units).
@@ -37,6 +42,8 @@ pub(super) const HAIRLINE_PX: f64 = 1.0;
 pub(super) const CURVE_PX: f64 = 1.5;
 /// Free space at the edges of the page.
 pub(super) const MARGIN_PX: f64 = 28.0;
+/// Left edge of panels: margin, labels, ticks.
+pub(super) const LEFT_PX: f64 = MARGIN_PX + 36.0;
 /// Length of a tick line, and its distance to the label.
 pub(super) const TICK_PX: f64 = 4.0;
 pub(super) const TICK_GAP_PX: f64 = 4.0;

@@ -1,5 +1,7 @@
 //! Tests of whole plots: what is on the page, and what is in the bytes.
 
+mod training;
+
 use ndarray::{Array2, ArrayView2};
 
 use super::features::scene;

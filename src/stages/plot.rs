@@ -1,6 +1,9 @@
 //! `plot`: pictures of what files and tables hold.
 
 mod features;
+mod nearest;
+mod output;
+mod training;
 
 use super::{Contract, Progress, Stage, Summary};
 
@@ -19,13 +22,15 @@ pub struct Params {
 pub enum Kind {
     /// draw the audio features of a file or a phrase over time
     Features(features::Params),
+    /// draw the losses of a training run over its steps
+    Training(training::Params),
 }
 
 impl Stage for Plot {
     const NAME: &'static str = "plot";
-    const ABOUT: &'static str = "draw features as PNG or SVG";
+    const ABOUT: &'static str = "draw features and training as PNG or SVG";
     const CONTRACT: Contract = Contract {
-        reads: "an audio file, or features, extractions and beats",
+        reads: "an audio file, or features, extractions and beats; training_log",
         writes: "an image file",
     };
     type Params = Params;
@@ -33,6 +38,7 @@ impl Stage for Plot {
     fn run(params: Params, _progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
         match params.kind {
             Kind::Features(params) => features::run(&params),
+            Kind::Training(params) => training::run(&params),
         }
     }
 }

@@ -117,12 +117,27 @@ impl Snapshot {
     /// # Panics
     /// When `R` is a row of another table.
     pub fn rows<R: Row>(&self) -> Result<Vec<R>, StoreError> {
+        self.rows_where(|_| true)
+    }
+
+    /// Reads the table, and keeps the rows of which `is_wanted` says so; one batch of the others is in
+    /// memory at a time.
+    ///
+    /// # Errors
+    /// [`StoreError`] when a part cannot be read or has other columns.
+    ///
+    /// # Panics
+    /// When `R` is a row of another table.
+    pub fn rows_where<R: Row>(
+        &self,
+        mut is_wanted: impl FnMut(&R) -> bool,
+    ) -> Result<Vec<R>, StoreError> {
         assert_eq!(R::schema().name, self.schema.name, "rows of another table");
         let mut rows = Vec::new();
         for batch in self.batches() {
             let batch = batch?;
             let read = R::from_batch(&batch).ok_or_else(|| self.columns_error(&batch, ""))?;
-            rows.extend(read);
+            rows.extend(read.into_iter().filter(&mut is_wanted));
         }
         Ok(rows)
     }

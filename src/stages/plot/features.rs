@@ -1,26 +1,25 @@
 //! `plot features`: the blocks of features of a file or a phrase, one panel each.
 
 use std::fs::File;
-use std::io::{self, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, anyhow, bail};
+use anyhow::{anyhow, bail};
 use ndarray::{Array2, s};
 
 use crate::audio::recording::{MAX_HELD_SAMPLES, Options, Recording};
 use crate::audio::spectral::MEL_RANGE_HZ;
 use crate::audio::{Tuning, mel};
-use crate::plot::{self, FeaturesPlot, Format, MAX_WIDTH_PX, MIN_WIDTH_PX, Panel};
+use crate::plot::{self, FeaturesPlot, Panel};
 use crate::stages::extract::Extract;
 use crate::stages::failure::{Failure, guarded};
 use crate::stages::{ClientParams, Stage as _, Summary};
 use crate::store::tables::{self, BeatRow, ExtractionRow, FailureRow, PhraseRow};
-use crate::store::{self, ItemTables, Location, Row as _, Snapshot, StoreError};
+use crate::store::{ItemTables, Location, Row as _, Snapshot, StoreError};
 use crate::units::{frames_to_s, s_to_frames};
 
-/// Names that an unknown phrase is told.
-const N_NEAREST: usize = 3;
+use super::nearest::nearest;
+use super::output::{Drawn, WIDTHS_PX, format_of, write_picture};
 
 /// What the user asks for.
 #[derive(Clone, Debug, clap::Args)]
@@ -59,8 +58,6 @@ pub struct Params {
     pub client: ClientParams,
 }
 
-const WIDTHS_PX: std::ops::RangeInclusive<i64> = MIN_WIDTH_PX as i64..=MAX_WIDTH_PX as i64;
-
 /// Draws the plot.
 ///
 /// # Errors
@@ -95,14 +92,10 @@ pub fn run(params: &Params) -> anyhow::Result<Box<dyn Summary>> {
         start_s: frames_to_s(frames.start),
     };
     let picture = plot::features(&features, &params.panels, params.width, format)?;
-    store::write_file(output, |out| out.write_all(&picture.bytes))
-        .with_context(|| format!("while writing {}", output.display()))?;
-    Ok(Box::new(Drawn {
-        output: output.clone(),
-        width_px: picture.width_px,
-        height_px: picture.height_px,
-        n_frames: frames.len(),
-    }))
+    write_picture(output, &picture)?;
+    let unit = if frames.len() == 1 { "frame" } else { "frames" };
+    let what = format!("{} {unit} ({:.2} s)", frames.len(), frames_to_s(frames.len()));
+    Ok(Box::new(Drawn::new(what, output, &picture)))
 }
 
 /// What is drawn.
@@ -112,20 +105,6 @@ struct Subject {
     frames: Array2<f32>,
     tempo_bpm: Option<f64>,
     beat_times_s: Vec<f64>,
-}
-
-fn format_of(output: &Path) -> anyhow::Result<Format> {
-    let extension = output.extension().map(|e| e.to_string_lossy()).unwrap_or_default();
-    Format::of_path_extension(&extension).ok_or_else(|| {
-        let found = match extension.as_ref() {
-            "" => "has no extension".to_owned(),
-            other => format!("has the extension .{other}"),
-        };
-        anyhow!(
-            "--output {} {found}, which is no format of plots; name it .png or .svg",
-            output.display()
-        )
-    })
 }
 
 fn check_excerpt(start_s: f64, duration_s: Option<f64>) -> anyhow::Result<()> {
@@ -245,33 +224,6 @@ fn missing(store: &Location, phrase: &str, rows: &ItemTables) -> Result<anyhow::
              {store} first"
         ));
     }
-    let likeness = |name: &String| strsim::jaro_winkler(phrase, name);
-    names.sort_by(|a, b| likeness(b).total_cmp(&likeness(a)).then_with(|| a.cmp(b)));
-    names.truncate(N_NEAREST);
-    Ok(anyhow!("store {store} has no phrase \"{phrase}\"; nearest: {}", names.join(", ")))
-}
-
-/// What was drawn.
-struct Drawn {
-    output: PathBuf,
-    width_px: u32,
-    height_px: u32,
-    n_frames: usize,
-}
-
-impl Summary for Drawn {
-    fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        let Drawn { output, width_px, height_px, n_frames } = self;
-        let seconds = frames_to_s(*n_frames);
-        let unit = if *n_frames == 1 { "frame" } else { "frames" };
-        writeln!(
-            out,
-            "{n_frames} {unit} ({seconds:.2} s) → {} ({width_px} × {height_px} px)",
-            output.display()
-        )
-    }
-
-    fn n_failed(&self) -> u64 {
-        0
-    }
+    let nearest = nearest(phrase, names);
+    Ok(anyhow!("store {store} has no phrase \"{phrase}\"; nearest: {nearest}"))
 }

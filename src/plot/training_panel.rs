@@ -1,0 +1,230 @@
+//! The stages of a training run and the panels of their plots.
+
+use std::str::FromStr;
+
+use super::PlotError;
+use super::value_axis::Scale;
+
+/// A stage of training.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, clap::ValueEnum)]
+pub enum TrainingStage {
+    /// the UNet
+    Diffusion,
+    /// the motion decoder
+    Decoder,
+    /// both, end to end
+    Finetune,
+}
+
+impl TrainingStage {
+    /// Every stage, in the order in which they are trained.
+    pub const ALL: [Self; 3] = [Self::Diffusion, Self::Decoder, Self::Finetune];
+
+    /// Returns the stage's name, as in the log of training.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Diffusion => "diffusion",
+            Self::Decoder => "decoder",
+            Self::Finetune => "finetune",
+        }
+    }
+
+    /// Returns the panels that are drawn unless others are asked for: of fine-tuning the six of the
+    /// reference's `plot_losses`.
+    pub fn usual_panels(self) -> &'static [TrainingPanel] {
+        use TrainingPanel as P;
+        match self {
+            Self::Diffusion | Self::Decoder => &[P::Loss, P::GradientNorm, P::LearningRate],
+            Self::Finetune => &[
+                P::Loss,
+                P::Diffusion,
+                P::DecoderPosition,
+                P::VelocityCoherence,
+                P::AccelerationCoherence,
+                P::Jerk,
+            ],
+        }
+    }
+
+    /// Returns every panel that the stage has. What would only repeat the loss is none.
+    pub fn panels(self) -> &'static [TrainingPanel] {
+        use TrainingPanel as P;
+        match self {
+            Self::Diffusion => self.usual_panels(),
+            Self::Decoder => &[
+                P::Loss,
+                P::DecoderPosition,
+                P::DecoderQuaternion,
+                P::GradientNorm,
+                P::LearningRate,
+            ],
+            Self::Finetune => &TrainingPanel::ALL,
+        }
+    }
+
+    pub(super) fn heading(self) -> &'static str {
+        match self {
+            Self::Diffusion => "Diffusion",
+            Self::Decoder => "Decoder",
+            Self::Finetune => "Fine-tuning",
+        }
+    }
+
+    /// Returns what the stage trains.
+    pub(super) fn meaning(self) -> &'static str {
+        match self {
+            Self::Diffusion => "the UNet",
+            Self::Decoder => "the motion decoder",
+            Self::Finetune => "the UNet and the decoder, end to end",
+        }
+    }
+}
+
+/// A panel of a plot of training, which shows one quantity over the steps of a stage.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum TrainingPanel {
+    Loss,
+    Diffusion,
+    DecoderPosition,
+    VelocityCoherence,
+    AccelerationCoherence,
+    Jerk,
+    DecoderQuaternion,
+    QuaternionDelta,
+    PhaseMonotonic,
+    PositionSmoothness,
+    GradientNorm,
+    LearningRate,
+}
+
+impl TrainingPanel {
+    /// Every panel, in the order in which they are drawn.
+    pub const ALL: [Self; 12] = [
+        Self::Loss,
+        Self::Diffusion,
+        Self::DecoderPosition,
+        Self::VelocityCoherence,
+        Self::AccelerationCoherence,
+        Self::Jerk,
+        Self::DecoderQuaternion,
+        Self::QuaternionDelta,
+        Self::PhaseMonotonic,
+        Self::PositionSmoothness,
+        Self::GradientNorm,
+        Self::LearningRate,
+    ];
+
+    /// Returns the quantity's name, as in the log of training.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Loss => "loss",
+            Self::Diffusion => "diffusion",
+            Self::DecoderPosition => "decoder_position",
+            Self::VelocityCoherence => "velocity_coherence",
+            Self::AccelerationCoherence => "acceleration_coherence",
+            Self::Jerk => "jerk",
+            Self::DecoderQuaternion => "decoder_quaternion",
+            Self::QuaternionDelta => "quaternion_delta",
+            Self::PhaseMonotonic => "phase_monotonic",
+            Self::PositionSmoothness => "position_smoothness",
+            Self::GradientNorm => "gradient_norm",
+            Self::LearningRate => "learning_rate",
+        }
+    }
+
+    pub(super) fn heading(self, stage: TrainingStage) -> &'static str {
+        match self {
+            Self::Loss if stage == TrainingStage::Finetune => "Total loss",
+            Self::Loss => "Loss",
+            Self::Diffusion => "Diffusion",
+            Self::DecoderPosition => "Decoder position",
+            Self::VelocityCoherence => "Velocity coherence",
+            Self::AccelerationCoherence => "Acceleration coherence",
+            Self::Jerk => "Jerk",
+            Self::DecoderQuaternion => "Decoder quaternion",
+            Self::QuaternionDelta => "Quaternion delta",
+            Self::PhaseMonotonic => "Phase",
+            Self::PositionSmoothness => "Position smoothness",
+            Self::GradientNorm => "Gradient norm",
+            Self::LearningRate => "Learning rate",
+        }
+    }
+
+    /// Returns what the values mean, shown where it has room.
+    pub(super) fn meaning(self) -> &'static str {
+        match self {
+            Self::Loss => "what is minimised",
+            Self::Diffusion => "error of the UNet’s prediction",
+            Self::DecoderPosition => "squared error of decoded positions",
+            Self::VelocityCoherence => "velocities against steps of the position",
+            Self::AccelerationCoherence => "accelerations against steps of the velocity",
+            Self::Jerk => "steps of the acceleration",
+            Self::DecoderQuaternion => "squared error of decoded quaternions",
+            Self::QuaternionDelta => "turns that are too far for one frame",
+            Self::PhaseMonotonic => "falls of the phase within bars",
+            Self::PositionSmoothness => "steps of the position beyond 0.5 m",
+            Self::GradientNorm => "before it is clipped",
+            Self::LearningRate => "",
+        }
+    }
+
+    pub(super) fn unit(self) -> &'static str {
+        match self {
+            Self::DecoderPosition => "m²",
+            Self::PositionSmoothness => "m",
+            _ => "",
+        }
+    }
+
+    /// Returns how values become heights: losses differ by factors.
+    pub(super) fn scale(self) -> Scale {
+        match self {
+            Self::GradientNorm | Self::LearningRate => Scale::Linear,
+            _ => Scale::Log,
+        }
+    }
+
+    /// Returns the names of every panel, as messages list them.
+    pub fn known() -> String {
+        Self::ALL.map(Self::name).join(", ")
+    }
+}
+
+impl FromStr for TrainingPanel {
+    type Err = PlotError;
+
+    fn from_str(name: &str) -> Result<Self, PlotError> {
+        Self::ALL
+            .into_iter()
+            .find(|panel| panel.name() == name)
+            .ok_or_else(|| PlotError::UnknownPanel { name: name.to_owned(), known: Self::known() })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_read_back() {
+        for panel in TrainingPanel::ALL {
+            assert_eq!(panel.name().parse::<TrainingPanel>().unwrap(), panel);
+        }
+        assert_eq!(
+            "total".parse::<TrainingPanel>().unwrap_err().to_string(),
+            "panel \"total\" is unknown; the panels are loss, diffusion, decoder_position, \
+             velocity_coherence, acceleration_coherence, jerk, decoder_quaternion, \
+             quaternion_delta, phase_monotonic, position_smoothness, gradient_norm, learning_rate"
+        );
+    }
+
+    #[test]
+    fn usual_panels_are_panels_of_the_stage() {
+        for stage in TrainingStage::ALL {
+            let all = stage.panels();
+            assert!(stage.usual_panels().iter().all(|panel| all.contains(panel)), "{stage:?}");
+            let order = |panel: &TrainingPanel| TrainingPanel::ALL.iter().position(|p| p == panel);
+            assert!(all.is_sorted_by_key(order), "{stage:?}");
+        }
+    }
+}

@@ -1,0 +1,67 @@
+//! The picture that every kind of plot writes.
+
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, anyhow};
+
+use crate::plot::{Format, MAX_WIDTH_PX, MIN_WIDTH_PX, Picture};
+use crate::stages::Summary;
+use crate::store;
+
+/// Widths that a plot can have, as a flag takes them.
+pub const WIDTHS_PX: std::ops::RangeInclusive<i64> = MIN_WIDTH_PX as i64..=MAX_WIDTH_PX as i64;
+
+/// Returns the format that the name of the output asks for.
+///
+/// # Errors
+/// When it is no format of plots.
+pub fn format_of(output: &Path) -> anyhow::Result<Format> {
+    let extension = output.extension().map(|e| e.to_string_lossy()).unwrap_or_default();
+    Format::of_path_extension(&extension).ok_or_else(|| {
+        let found = match extension.as_ref() {
+            "" => "has no extension".to_owned(),
+            other => format!("has the extension .{other}"),
+        };
+        anyhow!(
+            "--output {} {found}, which is no format of plots; name it .png or .svg",
+            output.display()
+        )
+    })
+}
+
+/// Writes the picture, whole or not at all.
+///
+/// # Errors
+/// What the file system says.
+pub fn write_picture(output: &Path, picture: &Picture) -> anyhow::Result<()> {
+    store::write_file(output, |out| out.write_all(&picture.bytes))
+        .with_context(|| format!("while writing {}", output.display()))
+}
+
+/// What was drawn.
+pub struct Drawn {
+    what: String,
+    output: PathBuf,
+    width_px: u32,
+    height_px: u32,
+}
+
+impl Drawn {
+    /// Returns the account of a picture of `what`.
+    pub fn new(what: String, output: &Path, picture: &Picture) -> Self {
+        let (width_px, height_px) = (picture.width_px, picture.height_px);
+        Self { what, output: output.to_owned(), width_px, height_px }
+    }
+}
+
+impl Summary for Drawn {
+    fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
+        let Drawn { what, output, width_px, height_px } = self;
+        writeln!(out, "{what} → {} ({width_px} × {height_px} px)", output.display())
+    }
+
+    fn n_failed(&self) -> u64 {
+        0
+    }
+}
