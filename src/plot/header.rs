@@ -99,7 +99,8 @@ mod tests {
 
     #[test]
     fn pieces_flow_over_lines() {
-        let cases: [(&[f64], &[(f64, usize)]); 4] = [
+        type Case = (&'static [f64], &'static [(f64, usize)]);
+        let cases: [Case; 4] = [
             (&[], &[]),
             (&[20.0, 30.0, 10.0], &[(10.0, 0), (34.0, 0), (68.0, 0)]),
             (&[20.0, 70.0, 10.0], &[(10.0, 0), (10.0, 1), (84.0, 1)]),

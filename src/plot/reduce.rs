@@ -166,7 +166,7 @@ mod tests {
             for (column, extent) in found.into_iter().enumerate() {
                 let frames = frames_of(column, n_columns, n_steps as usize);
                 let wanted =
-                    (!frames.is_empty()).then(|| (frames.start as f64 + 1.0, frames.end as f64));
+                    (!frames.is_empty()).then_some((frames.start as f64 + 1.0, frames.end as f64));
                 assert_eq!(extent.map(|e| (e.min, e.max)), wanted, "column {column}");
             }
         }
