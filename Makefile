@@ -24,7 +24,7 @@ build: ## build the executables (dev profile)
 	$(CARGO) build --locked --bins
 
 .PHONY: demo
-demo: build ## ingest and extract tests/data, construct a library of it, and query the tables (build/demo)
+demo: build ## from tests/data to tables, a library, trained networks, a plot and answers (build/demo)
 	@$(MAKE) --file pipelines/demo.mk BIN=$(BIN)
 
 .PHONY: ingest

@@ -1,5 +1,6 @@
 # The demo: real music and real motion capture (tests/data) become tables, the music's features are
-# extracted, phrases to train on are constructed from both, and queries answer.
+# extracted, phrases to train on are constructed from both, small networks are trained on them and
+# fine-tuned, and queries answer.
 #
 #   make demo                              builds first
 #   make -f pipelines/demo.mk BIN=…        with executables that are there already
@@ -8,6 +9,7 @@ DATA   ?= tests/data
 OUT    ?= build/demo
 STORE  ?= $(OUT)/store
 CONFIG ?= pipelines/demo.toml
+RUN    ?= demo
 
 .DEFAULT_GOAL := demo
 include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
@@ -21,6 +23,7 @@ demo:
 	@echo
 	@echo "tables   $(STORE)"
 	@echo "answers  $(ANSWERS)"
+	@echo "plot     $(PLOT)"
 	@echo "ask on   $(MOTIONGEN) query --store $(STORE) \"select …\""
 
 # ingest: both sources into one store.
@@ -38,6 +41,17 @@ $(EXTRACTED): $(INGESTED) $(CONFIG) $(MOTIONGEN)
 LIBRARY := $(STAMPS)/library.done
 $(LIBRARY): $(EXTRACTED) $(CONFIG) $(MOTIONGEN)
 	$(call stage,$(MOTIONGEN) library --config $(CONFIG) --store $(STORE))
+
+# train, finetune: a network that is small enough to learn in a minute.
+TRAINED := $(STAMPS)/train-$(RUN).done
+$(TRAINED): $(LIBRARY) $(CONFIG) $(MOTIONGEN)
+	$(call stage,$(MOTIONGEN) train --config $(CONFIG) --store $(STORE) --run $(RUN))
+FINETUNED := $(STAMPS)/finetune-$(RUN).done
+$(FINETUNED): $(TRAINED) $(CONFIG) $(MOTIONGEN)
+	$(call stage,$(MOTIONGEN) finetune --config $(CONFIG) --store $(STORE) --run $(RUN))
+PLOT := $(OUT)/training-$(RUN).png
+$(PLOT): $(FINETUNED)
+	$(MOTIONGEN) plot training --store $(STORE) --run $(RUN) --output $@
 
 # query: what the tables tell.
 define SPLITS
@@ -68,6 +82,12 @@ round(max(sqrt(m.velocity_x * m.velocity_x + m.velocity_z * m.velocity_z)), 2) a
 from phrases p join motion m on p.phrase_id = m.phrase_id
 where p.has_features and not p.has_audio group by p.split order by p.split
 endef
+define TRAINING
+select stage, kind, count(*) as rows, max(step) as steps, round(max(elapsed_s), 1) as seconds,
+round(min(loss), 4) as lowest_loss from training_log where run = 'RUN_NAME'
+group by stage, kind order by stage, kind
+endef
+TRAINING := $(subst RUN_NAME,$(RUN),$(value TRAINING))
 # Lines become spaces on the way to the shell.
 define newline
 
@@ -77,7 +97,7 @@ comma := ,
 ask = @{ echo; echo '$(1)'; $(MOTIONGEN) query --config $(CONFIG) --store $(STORE) \
 	'$(subst $(newline), ,$($(2)))'; } | tee --append $@.new
 
-$(ANSWERS): $(INGESTED) $(EXTRACTED) $(LIBRARY)
+$(ANSWERS): $(INGESTED) $(EXTRACTED) $(LIBRARY) $(FINETUNED) $(PLOT)
 	@rm -f $@.new
 	@{ echo; echo 'What is there?'; $(MOTIONGEN) query --store $(STORE) --tables; } | tee $@.new
 	$(call ask,How much is in each split?,SPLITS)
@@ -85,4 +105,5 @@ $(ANSWERS): $(INGESTED) $(EXTRACTED) $(LIBRARY)
 	$(call ask,How fast does each capture move?,SPEEDS)
 	$(call ask,What do the songs sound like?,LOUDNESS)
 	$(call ask,What was constructed to train on?,CONSTRUCTED)
+	$(call ask,What did training bring?,TRAINING)
 	@mv $@.new $@

@@ -9,7 +9,7 @@ use super::StoreError;
 pub struct Patience {
     /// Time after which the last error is final.
     pub limit: Duration,
-    /// Pause before the second try; each next one is twice as long, up to [`LONGEST_PAUSE`].
+    /// Pause before the second try; each next one is twice as long, up to 15 s.
     pub first_pause: Duration,
 }
 

@@ -17,8 +17,11 @@ use super::window::Batch;
 
 /// Steps in a row that may be skipped because something is not finite.
 const MAX_SKIPPED_IN_A_ROW: u32 = 10;
-/// Steps that are tried, without effect, to see how many fit into a time.
-const N_TRIED: u32 = 3;
+/// How long steps are tried, without effect, to see how many fit into a time: at least so many, and for so
+/// long, but not more than a share of the time.
+const MIN_TRIED: u64 = 3;
+const TRIED_S: f64 = 8.0;
+const SHARE_TRIED: f64 = 0.02;
 /// Share of the time that steps may take when their number is chosen; the optimizer and
 /// validations take the rest.
 const SHARE_OF_TIME: f64 = 0.92;
@@ -312,10 +315,13 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
         // The first asks the system for memory; those after it are like all others.
         self.threads.run(|| learner.rehearse(batch))?;
         let started = Instant::now();
-        for _ in 0..N_TRIED {
+        let enough_s = TRIED_S.min(SHARE_TRIED * time.as_secs_f64());
+        let mut n_tried = 0;
+        while n_tried < MIN_TRIED || started.elapsed().as_secs_f64() < enough_s {
             self.threads.run(|| learner.rehearse(batch))?;
+            n_tried += 1;
         }
-        let n_tried = u64::from(N_TRIED) * learner.steps_of_rehearsal();
+        let n_tried = n_tried * learner.steps_of_rehearsal();
         let step_s = started.elapsed().as_secs_f64() / n_tried as f64;
         let fitting = (SHARE_OF_TIME * time.as_secs_f64() / step_s.max(1e-6)).floor() as u64;
         Ok(named.unwrap_or(u64::MAX).min(fitting.max(1)))
