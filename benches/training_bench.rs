@@ -45,7 +45,6 @@ fn main() -> anyhow::Result<()> {
 struct Bench {
     learner: FinetuneLearner,
     batch: Batch,
-    threads: Threads,
     n_parameters: usize,
     n_steps: u64,
 }
@@ -80,15 +79,18 @@ impl Bench {
         let normalizer = Normalizer { centre: [0.0; MOTION_DIM], scale: [0.5; MOTION_DIM] };
         let windows =
             Arc::new(Windows::new(dataset, normalizer, Augmentation::default(), frames, 1));
-        let threads = Threads::start(NonZeroUsize::new(number("threads")?).context("threads")?)?;
+        let n_threads = NonZeroUsize::new(number("threads")?).context("threads")?;
+        let threads = Arc::new(Threads::start(n_threads)?);
         let (unet, decoder) =
             (UNet1D::new(&network.unet).1, MotionDecoder::new(&network.decoder).1);
         let n_parameters = unet.n_elements() + decoder.n_elements();
-        let learner = threads.run(|| {
-            let (unet, decoder) = (Parameters::new(unet, 1), Parameters::new(decoder, 1));
-            let networks = [&unet, &decoder];
-            FinetuneLearner::new(&network, &Objective::default(), &config, &windows, networks)
-        })?;
+        let learner = threads
+            .run(|| {
+                let (unet, decoder) = (Parameters::new(unet, 1), Parameters::new(decoder, 1));
+                let networks = [&unet, &decoder];
+                FinetuneLearner::new(&network, &Objective::default(), &config, &windows, networks)
+            })?
+            .on(&threads);
         let random = |stream: u64, len: usize| {
             let mut values = vec![0.0; len];
             Stream::new(1, stream).normal(0, &mut values);
@@ -111,14 +113,14 @@ impl Bench {
                 .collect(),
             phrase_ids: vec!["bench".into(); n],
         };
-        Ok(Self { learner, batch, threads, n_parameters, n_steps: 0 })
+        Ok(Self { learner, batch, n_parameters, n_steps: 0 })
     }
 
     fn step(&mut self) -> anyhow::Result<Value> {
-        let Self { learner, batch, threads, n_steps, .. } = self;
+        let Self { learner, batch, n_steps, .. } = self;
         let cpu = cpu_s()?;
         let started = Instant::now();
-        let taken = threads.run(|| learner.step(batch, *n_steps, 100))?;
+        let taken = learner.step(batch, *n_steps, 100)?;
         *n_steps += 1;
         Ok(json!({
             "wall_s": started.elapsed().as_secs_f64(),

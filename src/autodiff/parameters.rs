@@ -248,6 +248,16 @@ impl<E: Element> Gradients<E> {
         values
     }
 
+    /// Adds all gradients of another part of the same batch.
+    ///
+    /// # Panics
+    /// When they are of another network.
+    pub fn add_all(&mut self, other: &mut Self) {
+        let (own, other) = (self.all(), other.all());
+        assert_eq!(own.len(), other.len(), "gradients of one network");
+        update(own, other, |x, y| x + y);
+    }
+
     /// Returns the gradient of one parameter in PyTorch's order.
     pub fn unpacked(&mut self, id: ParameterId) -> Vec<E> {
         self.all();

@@ -209,7 +209,8 @@ impl Stage for Finetune {
             &config,
             &windows,
             [&trained.unet, &trained.decoder],
-        )?;
+        )?
+        .on(&Arc::new(machine.start_threads()?));
         claim(&store, run, Self::NAME, &config, machine.patience(), &watch)?;
         let fresh = State::new(
             Self::NAME,
@@ -219,7 +220,6 @@ impl Stage for Finetune {
         );
         let state = restore(&mut learner, &checkpoints, fresh, run, &watch)?;
         let started_at = state.progress.step;
-        let threads = machine.start_threads()?;
         let plan = params.plan(&windows);
         let mut drive = Drive {
             plan,
@@ -228,7 +228,6 @@ impl Stage for Finetune {
             journal: Journal::open(&store, Self::NAME, run, Self::NAME)?,
             watch: &watch,
             anchor: claim_path(run, Self::NAME),
-            threads: &threads,
         };
         let batch_size = plan.batch_size as usize;
         let end = drive.run(&mut learner, |first| {

@@ -83,6 +83,8 @@ pub struct DiffusionTraining {
     pub batch_size: usize,
     /// Parts of a batch that are done one after the other, to save memory.
     pub accumulate: usize,
+    /// Parts of such a part that are done at once, each by its share of the threads.
+    pub side_by_side: usize,
     pub learning_rate: LearningRate,
     pub optimizer: OptimizerConfig,
     pub ema: EmaConfig,

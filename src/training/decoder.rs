@@ -5,7 +5,9 @@ use std::sync::Arc;
 
 use ndarray::Array3;
 
-use crate::autodiff::{AdamW, Arena, Eager, Gradients, Interpreter, Parameters, Stream, Tape};
+use crate::autodiff::{
+    AdamW, Arena, Eager, Gradients, Interpreter, Parameters, Stream, Tape, Threads,
+};
 use crate::diffusion::{Schedule, ddim_update};
 use crate::model::{DecoderConfig, MotionDecoder, ParameterList};
 use crate::motion::{Channel, ChannelLimits, MOTION_DIM, Normalizer};
@@ -38,6 +40,7 @@ pub struct DecoderLearner<'u> {
     optimizer: AdamW<f32>,
     ema: Ema<f32>,
     arena: Arena<f32>,
+    threads: Arc<Threads>,
     denoiser: Denoiser<'u>,
     schedule: Schedule,
     config: DecoderTraining,
@@ -65,6 +68,7 @@ impl<'u> DecoderLearner<'u> {
             ema: Ema::new(config.ema, &parameters),
             parameters,
             arena: Arena::default(),
+            threads: Arc::new(Threads::of_process()),
             denoiser,
             schedule,
             config: config.clone(),
@@ -72,6 +76,12 @@ impl<'u> DecoderLearner<'u> {
             windows: Arc::clone(windows),
             reducer: Box::new(Alone),
         }
+    }
+
+    /// Has steps run on threads; the results are the same on any.
+    pub fn on(mut self, threads: &Arc<Threads>) -> Self {
+        self.threads = Arc::clone(threads);
+        self
     }
 
     /// Returns the latents to decode: those of a batch, made noisy, or what the UNet makes of them.
@@ -235,24 +245,28 @@ impl Learner for DecoderLearner<'_> {
     const STAGE: &'static str = "decoder";
 
     fn step(&mut self, batch: &Batch, step: u64, n_steps: u64) -> Result<Step, TrainingError> {
-        let losses = self.differentiate(batch, step)?;
+        let threads = Arc::clone(&self.threads);
         let learning_rate = self.config.learning_rate.at(step, n_steps);
-        let gradient_norm = if losses.total.is_finite() {
-            self.optimizer.step(&mut self.parameters, &mut self.gradients, learning_rate)
-        } else {
-            f64::NAN
-        };
-        if gradient_norm.is_finite() {
-            self.ema.after_step(step + 1, &self.parameters);
-        }
-        Ok(Step { losses, gradient_norm, learning_rate, lr_decoder: None })
+        threads.run(|| {
+            let losses = self.differentiate(batch, step)?;
+            let gradient_norm = if losses.total.is_finite() {
+                self.optimizer.step(&mut self.parameters, &mut self.gradients, learning_rate)
+            } else {
+                f64::NAN
+            };
+            if gradient_norm.is_finite() {
+                self.ema.after_step(step + 1, &self.parameters);
+            }
+            Ok(Step { losses, gradient_norm, learning_rate, lr_decoder: None })
+        })
     }
 
     fn rehearse(&mut self, batch: &Batch) -> Result<(), TrainingError> {
         // Steps are of two kinds; what counts is how long they take on average.
         let every = self.config.sampled_every.max(1);
+        let threads = Arc::clone(&self.threads);
         for step in 0..every {
-            self.differentiate(batch, step)?;
+            threads.run(|| self.differentiate(batch, step))?;
         }
         Ok(())
     }
@@ -262,8 +276,9 @@ impl Learner for DecoderLearner<'_> {
     }
 
     fn validate(&mut self) -> Result<Validation, TrainingError> {
-        let losses = self.validation_losses(self.ema.average())?;
-        let live = self.validation_losses(&self.parameters)?.total;
+        let threads = Arc::clone(&self.threads);
+        let losses = threads.run(|| self.validation_losses(self.ema.average()))?;
+        let live = threads.run(|| self.validation_losses(&self.parameters))?.total;
         Ok(Validation { losses, live: Some(live) })
     }
 

@@ -2,7 +2,9 @@
 
 use std::sync::Arc;
 
-use crate::autodiff::{AdamW, Arena, Eager, Gradients, Interpreter, Parameters, Tape, Tensor};
+use crate::autodiff::{
+    AdamW, Arena, Eager, Gradients, Interpreter, Parameters, Tape, Tensor, Threads,
+};
 use crate::diffusion::Schedule;
 use crate::model::{UNet1D, UNetInputs};
 use crate::motion::MOTION_DIM;
@@ -32,10 +34,13 @@ pub(super) const MOMENTS: [&str; 2] = ["adam.m.", "adam.v."];
 pub struct DiffusionLearner {
     unet: Arc<UNet1D>,
     parameters: Parameters<f32>,
-    gradients: Gradients<f32>,
+    /// Of the parts that are done side by side; the first gathers all.
+    gradients: Vec<Gradients<f32>>,
     optimizer: AdamW<f32>,
     ema: Ema<f32>,
-    arena: Arena<f32>,
+    /// Of the parts that are done side by side.
+    arenas: Vec<Arena<f32>>,
+    threads: Arc<Threads>,
     schedule: Schedule,
     config: DiffusionTraining,
     takes_style: bool,
@@ -60,11 +65,14 @@ impl DiffusionLearner {
         let parameters = Parameters::new(list, seed);
         Ok(Self {
             unet: Arc::new(unet),
-            gradients: Gradients::new(&parameters),
+            gradients: (0..config.side_by_side.max(1))
+                .map(|_| Gradients::new(&parameters))
+                .collect(),
             optimizer: AdamW::new(config.optimizer.adamw(), &parameters),
             ema: Ema::new(config.ema, &parameters),
             parameters,
-            arena: Arena::default(),
+            arenas: (0..config.side_by_side.max(1)).map(|_| Arena::default()).collect(),
+            threads: Arc::new(Threads::of_process()),
             schedule: Schedule::new(&network.diffusion)?,
             config: config.clone(),
             takes_style: network.unet.style_dim > 0,
@@ -74,41 +82,62 @@ impl DiffusionLearner {
         })
     }
 
+    /// Has steps run on threads; the results are the same on any.
+    pub fn on(mut self, threads: &Arc<Threads>) -> Self {
+        self.threads = Arc::clone(threads);
+        self
+    }
+
     /// Has gradients pass through a reducer.
     pub fn reducing(mut self, reducer: Box<dyn Reducer>) -> Self {
         self.reducer = reducer;
         self
     }
 
-    fn withhold(&self) -> Withhold {
-        Withhold { audio: self.config.condition_dropout, style: self.config.style_dropout }
-    }
-
-    /// Returns the loss of a batch on a tape.
-    fn loss(&self, tape: &mut Tape<f32>, batch: &Batch) -> Result<Tensor<f32>, TrainingError> {
-        let target = Given::of(batch, &self.schedule, self.withhold(), self.takes_style);
-        target.loss(tape, &self.unet, &self.schedule, &self.config.objective)
-    }
-
-    /// Adds the gradients of a batch, part by part; returns its loss.
+    /// Computes the gradients of a batch, part by part; returns its loss.
     fn differentiate(&mut self, batch: &Batch, step: u64) -> Result<f64, TrainingError> {
-        self.gradients.clear();
-        let n_parts = self.config.accumulate.clamp(1, batch.n_windows);
+        let side_by_side = self.gradients.len();
+        let n_parts = (self.config.accumulate * side_by_side).clamp(1, batch.n_windows);
         let all: f64 = batch.mask.iter().map(|&w| f64::from(w)).sum();
+        let at = |part: usize| part * batch.n_windows / n_parts;
+        let Self {
+            gradients,
+            arenas,
+            parameters,
+            unet,
+            schedule,
+            config,
+            threads,
+            takes_style,
+            seed,
+            ..
+        } = &mut *self;
+        let (withhold, takes_style, seed) = (Withhold::of(config), *takes_style, *seed);
+        gradients.iter_mut().for_each(Gradients::clear);
         let mut loss = 0.0;
-        for part in 0..n_parts {
-            let at = |part: usize| part * batch.n_windows / n_parts;
-            let windows = batch.windows(at(part)..at(part + 1));
-            // Parts weigh as much as they have frames, so that any number of parts has one loss.
-            let share = windows.mask.iter().map(|&w| f64::from(w)).sum::<f64>() / all.max(1.0);
-            let seed = tape_seed(self.seed, step * n_parts as u64 + part as u64);
-            let mut tape = Tape::new(&self.parameters, &self.arena, Some(seed));
-            let of_part = self.loss(&mut tape, &windows)?;
-            loss += share * f64::from(of_part.scalar());
-            let weight = tape.constant(&[], &[share as f32]);
-            tape.backward_from(of_part, weight, &mut self.gradients)?;
+        for first in (0..n_parts).step_by(side_by_side) {
+            let numbers = first..(first + side_by_side).min(n_parts);
+            let parts: Vec<_> = numbers.zip(gradients.iter_mut().zip(arenas.iter())).collect();
+            let losses = threads.side_by_side(parts, |(part, (gradients, arena))| {
+                let windows = batch.windows(at(part)..at(part + 1));
+                // Parts weigh as much as they have frames, so that any number of parts has one loss.
+                let share = windows.mask.iter().map(|&w| f64::from(w)).sum::<f64>() / all.max(1.0);
+                let seed = tape_seed(seed, step * n_parts as u64 + part as u64);
+                let mut tape = Tape::new(parameters, arena, Some(seed));
+                let given = Given::of(&windows, schedule, withhold, takes_style);
+                let loss = given.loss(&mut tape, unet, schedule, &config.objective)?;
+                let value = share * f64::from(loss.scalar());
+                let weight = tape.constant(&[], &[share as f32]);
+                tape.backward_from(loss, weight, gradients)?;
+                Ok::<_, TrainingError>(value)
+            });
+            for part in losses {
+                loss += part?;
+            }
         }
-        self.reducer.reduce(&mut self.gradients);
+        let (whole, others) = gradients.split_first_mut().expect("at least one");
+        threads.run(|| others.iter_mut().for_each(|other| whole.add_all(other)));
+        self.reducer.reduce(&mut self.gradients[0]);
         Ok(loss)
     }
 
@@ -121,9 +150,12 @@ impl DiffusionLearner {
         for first in (0..n_wanted).step_by(size) {
             let batch = self.windows.validation(first..(first + size).min(n_wanted))?;
             let weight: f64 = batch.mask.iter().map(|&w| f64::from(w)).sum();
-            let mut g = Eager::new(parameters, &self.arena);
-            let given = Given::of(&batch, &self.schedule, self.withhold(), self.takes_style);
-            let loss = given.loss(&mut g, &self.unet, &self.schedule, &self.config.objective)?;
+            let given =
+                Given::of(&batch, &self.schedule, Withhold::of(&self.config), self.takes_style);
+            let loss = self.threads.run(|| {
+                let mut g = Eager::new(parameters, &self.arenas[0]);
+                given.loss(&mut g, &self.unet, &self.schedule, &self.config.objective)
+            })?;
             sum += weight * f64::from(loss.scalar());
             count += weight;
         }
@@ -135,7 +167,7 @@ impl DiffusionLearner {
         Denoiser {
             unet: &self.unet,
             parameters: self.ema.average(),
-            arena: &self.arena,
+            arena: &self.arenas[0],
             takes_style: self.takes_style,
         }
     }
@@ -155,6 +187,12 @@ pub(super) fn tape_seed(seed: u64, number: u64) -> u64 {
 pub struct Withhold {
     pub audio: f64,
     pub style: f64,
+}
+
+impl Withhold {
+    fn of(config: &DiffusionTraining) -> Self {
+        Self { audio: config.condition_dropout, style: config.style_dropout }
+    }
 }
 
 /// What the network is given of a batch, and what it should say.
@@ -258,12 +296,14 @@ impl Learner for DiffusionLearner {
         let learning_rate = self.config.learning_rate.at(step, n_steps);
         // A loss that is not finite has a gradient that is not, and then the optimizer does nothing.
         let gradient_norm = if loss.is_finite() {
-            self.optimizer.step(&mut self.parameters, &mut self.gradients, learning_rate)
+            let Self { optimizer, parameters, gradients, .. } = self;
+            self.threads.run(|| optimizer.step(parameters, &mut gradients[0], learning_rate))
         } else {
             f64::NAN
         };
         if gradient_norm.is_finite() {
-            self.ema.after_step(step + 1, &self.parameters);
+            let Self { ema, parameters, .. } = self;
+            self.threads.run(|| ema.after_step(step + 1, parameters));
         }
         let losses = Losses { total: loss, parts: vec![("diffusion", loss)] };
         Ok(Step { losses, gradient_norm, learning_rate, lr_decoder: None })

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use crate::autodiff::{Gradients, Threads};
+use crate::autodiff::Gradients;
 use crate::store::{Patience, StoreError};
 use crate::weights::{Archive, Section};
 
@@ -75,7 +75,7 @@ pub struct Validation {
 /// Gradients on their way from the tape to the optimizer.
 ///
 /// All gradients pass through here once a step. A trainer over several processes adds those of the others.
-pub trait Reducer: Send {
+pub trait Reducer: Send + Sync {
     /// Replaces the gradients of this process by those of all.
     fn reduce(&mut self, gradients: &mut Gradients<f32>);
 }
@@ -222,8 +222,6 @@ pub struct Drive<'a, C> {
     /// A file of the run, below the store. Where it is missing so is the store (a disk that is not
     /// mounted, a folder that was moved), and nothing is written in its place.
     pub anchor: String,
-    /// Threads that steps run on.
-    pub threads: &'a Threads,
 }
 
 impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
@@ -267,7 +265,7 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
                 None => loader.next_batch()?,
             };
             let step_started = Instant::now();
-            let taken = self.threads.run(|| learner.step(&batch, step, n_steps))?;
+            let taken = learner.step(&batch, step, n_steps)?;
             let took = step_started.elapsed();
             self.state.progress.elapsed_s = before_s + started.elapsed().as_secs_f64();
             self.after_step(learner, &batch, &taken, took, loader.waited())?;
@@ -313,12 +311,12 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
         let named = self.plan.named_steps();
         let Some(time) = self.plan.time else { return Ok(named.unwrap_or(u64::MAX)) };
         // The first asks the system for memory; those after it are like all others.
-        self.threads.run(|| learner.rehearse(batch))?;
+        learner.rehearse(batch)?;
         let started = Instant::now();
         let enough_s = TRIED_S.min(SHARE_TRIED * time.as_secs_f64());
         let mut n_tried = 0;
         while n_tried < MIN_TRIED || started.elapsed().as_secs_f64() < enough_s {
-            self.threads.run(|| learner.rehearse(batch))?;
+            learner.rehearse(batch)?;
             n_tried += 1;
         }
         let n_tried = n_tried * learner.steps_of_rehearsal();
@@ -382,7 +380,7 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
     }
 
     fn validate<L: Learner>(&mut self, learner: &mut L) -> Result<(), TrainingError> {
-        let found = self.threads.run(|| learner.validate())?;
+        let found = learner.validate()?;
         let progress = &mut self.state.progress;
         let epoch = self.plan.epoch(progress.step.saturating_sub(1));
         let loss = found.losses.total;

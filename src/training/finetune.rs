@@ -7,7 +7,9 @@ use std::sync::Arc;
 
 use crate::autodiff::op::binary::{Binary, Pair};
 use crate::autodiff::op::elementwise::{Function, Map};
-use crate::autodiff::{AdamW, Arena, Eager, Gradients, Interpreter, Parameters, Tape, Tensor};
+use crate::autodiff::{
+    AdamW, Arena, Eager, Gradients, Interpreter, Parameters, Tape, Tensor, Threads,
+};
 use crate::diffusion::{Schedule, Spacing, ddim_linear, steps};
 use crate::model::{Graph, MotionDecoder, Parameter, ParameterList, Scope, UNet1D, UNetInputs};
 use crate::motion::style::STYLE_DIM;
@@ -152,6 +154,7 @@ pub struct FinetuneLearner {
     gradients: Gradients<f32>,
     optimizer: AdamW<f32>,
     arena: Arena<f32>,
+    threads: Arc<Threads>,
     schedule: Schedule,
     objective: Objective,
     config: FinetuneConfig,
@@ -186,12 +189,19 @@ impl FinetuneLearner {
             optimizer: AdamW::new(config.optimizer.adamw(), &parameters),
             parameters,
             arena: Arena::default(),
+            threads: Arc::new(Threads::of_process()),
             schedule,
             objective: objective.clone(),
             config: config.clone(),
             windows: Arc::clone(windows),
             reducer: Box::new(Alone),
         })
+    }
+
+    /// Has steps run on threads; the results are the same on any.
+    pub fn on(mut self, threads: &Arc<Threads>) -> Self {
+        self.threads = Arc::clone(threads);
+        self
     }
 
     /// Returns the parameters of both networks; names begin with `unet.` and `decoder.`.
@@ -302,21 +312,25 @@ impl Learner for FinetuneLearner {
     const STAGE: &'static str = "finetune";
 
     fn step(&mut self, batch: &Batch, step: u64, _n_steps: u64) -> Result<Step, TrainingError> {
-        let losses = self.differentiate(batch, step)?;
+        let threads = Arc::clone(&self.threads);
         let FinetuneConfig { lr_diffusion, lr_decoder, .. } = self.config;
-        let gradient_norm = if losses.total.is_finite() {
-            self.optimizer.step_by(&mut self.parameters, &mut self.gradients, |parameter| {
-                if parameter.name.starts_with(UNET) { lr_diffusion } else { lr_decoder }
-            })
-        } else {
-            f64::NAN
-        };
-        let lr_decoder = Some(lr_decoder);
-        Ok(Step { losses, gradient_norm, learning_rate: lr_diffusion, lr_decoder })
+        threads.run(|| {
+            let losses = self.differentiate(batch, step)?;
+            let gradient_norm = if losses.total.is_finite() {
+                self.optimizer.step_by(&mut self.parameters, &mut self.gradients, |parameter| {
+                    if parameter.name.starts_with(UNET) { lr_diffusion } else { lr_decoder }
+                })
+            } else {
+                f64::NAN
+            };
+            let lr_decoder = Some(lr_decoder);
+            Ok(Step { losses, gradient_norm, learning_rate: lr_diffusion, lr_decoder })
+        })
     }
 
     fn rehearse(&mut self, batch: &Batch) -> Result<(), TrainingError> {
-        self.differentiate(batch, 0).map(|_| ())
+        let threads = Arc::clone(&self.threads);
+        threads.run(|| self.differentiate(batch, 0)).map(|_| ())
     }
 
     fn validate(&mut self) -> Result<Validation, TrainingError> {
@@ -325,8 +339,10 @@ impl Learner for FinetuneLearner {
         let n = N_VALIDATION.div_ceil(size);
         for i in 0..n {
             let batch = self.windows.validation(i * size..(i + 1) * size)?;
-            let mut g = Eager::new(&self.parameters, &self.arena);
-            let found = self.losses(&mut g, &batch)?;
+            let found = self.threads.run(|| {
+                let mut g = Eager::new(&self.parameters, &self.arena);
+                self.losses(&mut g, &batch)
+            })?;
             let mut losses = named(&found);
             let motions = found.decoded.data().chunks_exact(batch.n_frames * MOTION_DIM);
             let target = self.config.temporal.target_quaternion_dot;

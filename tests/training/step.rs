@@ -49,7 +49,7 @@ fn batch(golden: &Golden) -> Batch {
     batch
 }
 
-fn learner(accumulate: usize) -> DiffusionLearner {
+fn learner(accumulate: usize, side_by_side: usize) -> DiffusionLearner {
     let network = NetworkConfig {
         unet: unet_config(),
         decoder: DecoderConfig::default(),
@@ -63,6 +63,7 @@ fn learner(accumulate: usize) -> DiffusionLearner {
         style_dropout: 0.0,
         batch_size: 3,
         accumulate,
+        side_by_side,
         learning_rate: given::constant_rate(LEARNING_RATE),
         optimizer: OptimizerConfig::default(),
         ema: EmaConfig::default(),
@@ -77,8 +78,8 @@ fn learner(accumulate: usize) -> DiffusionLearner {
 fn a_step_of_the_learner_is_pytorchs() {
     let golden = given::open("step_small");
     let batch = batch(&golden);
-    for accumulate in [1, 2] {
-        let mut learner = learner(accumulate);
+    for (accumulate, side_by_side) in [(1, 1), (2, 1), (1, 2), (2, 2)] {
+        let mut learner = learner(accumulate, side_by_side);
         let start = given::section(&learner, "unet.");
         let step = learner.step(&batch, 0, 10).expect("shapes fit");
         assert_eq!(step.learning_rate, LEARNING_RATE);

@@ -10,7 +10,7 @@ use std::time::Duration;
 use anyhow::{bail, ensure};
 
 use super::{ClientParams, Contract, Progress, Stage, Summary};
-use crate::autodiff::{Arena, Parameters, Threads};
+use crate::autodiff::{Arena, Parameters};
 use crate::diffusion::Schedule;
 use crate::model::UNet1D;
 use crate::motion::Normalizer;
@@ -209,7 +209,7 @@ impl<'a> Run<'a> {
         let (params, config) = (self.params, self.config);
         let phrases =
             read_phrases(self.store, Train::NAME, &params.machine, None, progress, self.watch)?;
-        let threads = params.machine.start_threads()?;
+        let threads = Arc::new(params.machine.start_threads()?);
         let n_frames = config.network.window_frames;
         let normalizer = normalizer(&phrases.dataset, n_frames, self.watch)?;
         let windows = |augmentation: Augmentation| {
@@ -220,11 +220,12 @@ impl<'a> Run<'a> {
 
         let augmented = windows(config.diffusion.augmentation.clone());
         let mut learner =
-            DiffusionLearner::new(&config.network, &config.diffusion, &augmented, params.seed)?;
+            DiffusionLearner::new(&config.network, &config.diffusion, &augmented, params.seed)?
+                .on(&threads);
         // Only now is it certain that there is something to train and to train on.
         let patience = params.machine.patience();
         claim(self.store, &params.run, Train::NAME, config, patience, self.watch)?;
-        let end = self.stage(&mut learner, &augmented, &threads, &mut account)?;
+        let end = self.stage(&mut learner, &augmented, &mut account)?;
         drop(learner);
         if end == End::Interrupted {
             return Ok(Box::new(account.interrupted(&resume_command(params))));
@@ -245,8 +246,9 @@ impl<'a> Run<'a> {
             schedule,
             &augmented,
             params.seed,
-        );
-        let end = self.stage(&mut learner, &augmented, &threads, &mut account)?;
+        )
+        .on(&threads);
+        let end = self.stage(&mut learner, &augmented, &mut account)?;
         if end == End::Interrupted {
             return Ok(Box::new(account.interrupted(&resume_command(params))));
         }
@@ -258,7 +260,6 @@ impl<'a> Run<'a> {
         &self,
         learner: &mut L,
         windows: &Arc<Windows>,
-        threads: &Threads,
         account: &mut Account,
     ) -> anyhow::Result<End> {
         let checkpoints = self.checkpoints(L::STAGE);
@@ -278,7 +279,6 @@ impl<'a> Run<'a> {
             journal: self.journal(L::STAGE)?,
             watch: self.watch,
             anchor: claim_path(&self.params.run, Train::NAME),
-            threads,
         };
         let machine = &self.params.machine;
         let end = drive.run(learner, |first| {
