@@ -18,7 +18,8 @@ use motiongen::motion::locking::bar_locking;
 use motiongen::motion::{Channel, MOTION_DIM};
 use motiongen::store::{ClientOptions, Location, Patience};
 use motiongen::training::{
-    Checkpoints, Condition, Dataset, Denoiser, Kind, Phrase, Reading, Split, State, TrainConfig,
+    Augmentation, Checkpoints, Condition, Dataset, Denoiser, Kind, Phrase, Reading, Split, State,
+    TrainConfig, Windows,
 };
 use ndarray::Array3;
 
@@ -161,6 +162,46 @@ fn correlation(a: &[f64], b: &[f64]) -> f64 {
     dot(a, ma, b, mb) / (dot(a, ma, a, ma) * dot(b, mb, b, mb)).sqrt().max(1e-12)
 }
 
+/// Prints the validation loss beside that of the best constant and of a network that says nothing.
+fn baselines(dataset: &Arc<Dataset>, state: &State<TrainConfig>, schedule: &Schedule) {
+    const N: usize = 256;
+    let frames = state.config.network.window_frames;
+    let windows = Windows::new(
+        Arc::clone(dataset),
+        state.normalizer.clone(),
+        Augmentation::default(),
+        frames,
+        0,
+    );
+    let batch = windows.validation(0..N).expect("at hand");
+    let view = |values: &[f32]| {
+        Array3::from_shape_vec((N, frames, MOTION_DIM), values.to_vec()).expect("as its shape")
+    };
+    let t: Vec<usize> =
+        batch.chances.iter().map(|c| (c.step * schedule.len() as f64) as usize).collect();
+    let target = schedule.target(view(&batch.motion).view(), view(&batch.noise).view(), &t);
+    let (mut sums, mut squares, mut n) = ([0.0; MOTION_DIM], [0.0; MOTION_DIM], 0.0);
+    let rows = target.as_slice().expect("in order").chunks_exact(MOTION_DIM);
+    for (row, _) in rows.zip(&batch.mask).filter(|(_, w)| **w > 0.0) {
+        n += 1.0;
+        for (i, &x) in row.iter().enumerate() {
+            sums[i] += f64::from(x);
+            squares[i] += f64::from(x).powi(2);
+        }
+    }
+    let mean_square = squares.iter().sum::<f64>() / (n * MOTION_DIM as f64);
+    let explained = sums.iter().map(|s| (s / n).powi(2)).sum::<f64>() / MOTION_DIM as f64;
+    let constant = mean_square - explained;
+    let loss = state.progress.best.map_or(f64::NAN, |best| best.loss);
+    println!(
+        "validation loss {loss:.4} (averaged weights, step {}); the best constant has {constant:.4}, an \
+         untrained network {mean_square:.4}: {:.0} % and {:.0} % lower",
+        state.progress.step,
+        100.0 * (1.0 - loss / constant),
+        100.0 * (1.0 - loss / mean_square)
+    );
+}
+
 fn main() {
     let arguments = arguments();
     let store = Location::open(&arguments.store, &ClientOptions::default()).expect("a store");
@@ -215,6 +256,8 @@ fn main() {
         windows.len(),
         arguments.n_steps
     );
+
+    baselines(&dataset, &state, &schedule);
 
     let sample = |audio_of: &dyn Fn(usize) -> usize, seed: u64| -> Vec<Vec<f32>> {
         let frames = network.window_frames;

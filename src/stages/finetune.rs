@@ -81,10 +81,15 @@ pub struct Params {
     /// Weight of the losses of coherence in time.
     #[arg(long, value_name = "W", default_value_t = 10.0, help_heading = "Losses")]
     pub temporal_weight: f64,
-    /// Weight of steps longer than half a metre, within the losses of coherence.
-    #[arg(long, value_name = "W", default_value_t = TemporalConfig::default().smoothness_weight,
-          help_heading = "Losses")]
-    pub smoothness_weight: f64,
+    #[command(flatten)]
+    pub temporal: TemporalParams,
+    /// Decay of weights.
+    #[arg(long, value_name = "X", default_value_t = OptimizerConfig::default().weight_decay,
+          help_heading = "Optimizer")]
+    pub weight_decay: f64,
+    /// Largest norm of the gradient; 0 for no limit.
+    #[arg(long, value_name = "X", default_value_t = 1.0, help_heading = "Optimizer")]
+    pub gradient_clip: f64,
     /// Steps of DDIM that gradients flow through.
     #[arg(long, value_name = "N", default_value_t = 5, help_heading = "Losses")]
     pub num_steps: usize,
@@ -100,6 +105,93 @@ pub struct Params {
     pub force: bool,
 }
 
+/// Weights and targets of the losses of coherence, within --temporal-weight.
+#[derive(Clone, Debug, clap::Args)]
+pub struct TemporalParams {
+    /// Of velocity against the differences of position.
+    #[arg(long, value_name = "W", default_value_t = TemporalConfig::default().velocity_weight,
+          help_heading = "Losses")]
+    pub velocity_weight: f64,
+    /// Of acceleration against the differences of velocity.
+    #[arg(long, value_name = "W", default_value_t = TemporalConfig::default().acceleration_weight,
+          help_heading = "Losses")]
+    pub acceleration_weight: f64,
+    /// Of the differences of acceleration.
+    #[arg(long, value_name = "W", default_value_t = TemporalConfig::default().jerk_weight,
+          help_heading = "Losses")]
+    pub jerk_weight: f64,
+    /// Of large turns between frames.
+    #[arg(long, value_name = "W", default_value_t = TemporalConfig::default().quaternion_delta_weight,
+          help_heading = "Losses")]
+    pub quat_delta_weight: f64,
+    /// Of a phase that falls within a bar.
+    #[arg(long, value_name = "W", default_value_t = TemporalConfig::default().phase_weight,
+          help_heading = "Losses")]
+    pub phase_monotonic_weight: f64,
+    /// Of steps longer than half a metre between frames.
+    #[arg(long, value_name = "W", default_value_t = TemporalConfig::default().smoothness_weight,
+          help_heading = "Losses")]
+    pub smoothness_weight: f64,
+    /// By which errors of velocity are divided, m/s.
+    #[arg(long, value_name = "X", default_value_t = TemporalConfig::default().target_velocity,
+          help_heading = "Losses")]
+    pub target_vel_coherence: f64,
+    /// By which errors of acceleration are divided, m/s².
+    #[arg(long, value_name = "X", default_value_t = TemporalConfig::default().target_acceleration,
+          help_heading = "Losses")]
+    pub target_accel_coherence: f64,
+    /// By which jerk is divided, m/s³.
+    #[arg(long, value_name = "X", default_value_t = TemporalConfig::default().target_jerk,
+          help_heading = "Losses")]
+    pub target_jerk: f64,
+    /// |q · q'| above which a turn between frames costs nothing.
+    #[arg(long, value_name = "X", default_value_t = TemporalConfig::default().target_quaternion_dot,
+          help_heading = "Losses")]
+    pub target_quat_delta: f64,
+}
+
+impl TemporalParams {
+    fn config(&self) -> TemporalConfig {
+        TemporalConfig {
+            velocity_weight: self.velocity_weight,
+            acceleration_weight: self.acceleration_weight,
+            jerk_weight: self.jerk_weight,
+            quaternion_delta_weight: self.quat_delta_weight,
+            phase_weight: self.phase_monotonic_weight,
+            smoothness_weight: self.smoothness_weight,
+            target_velocity: self.target_vel_coherence,
+            target_acceleration: self.target_accel_coherence,
+            target_jerk: self.target_jerk,
+            target_quaternion_dot: self.target_quat_delta,
+            max_step_m: TemporalConfig::default().max_step_m,
+        }
+    }
+
+    fn check(&self) -> anyhow::Result<()> {
+        for (flag, x) in [
+            ("--velocity-weight", self.velocity_weight),
+            ("--acceleration-weight", self.acceleration_weight),
+            ("--jerk-weight", self.jerk_weight),
+            ("--quat-delta-weight", self.quat_delta_weight),
+            ("--phase-monotonic-weight", self.phase_monotonic_weight),
+            ("--smoothness-weight", self.smoothness_weight),
+        ] {
+            ensure!(
+                x >= 0.0 && x.is_finite(),
+                "{flag} {x} is below 0; give 0 or a positive number"
+            );
+        }
+        for (flag, x) in [
+            ("--target-vel-coherence", self.target_vel_coherence),
+            ("--target-accel-coherence", self.target_accel_coherence),
+            ("--target-jerk", self.target_jerk),
+        ] {
+            ensure!(x > 0.0 && x.is_finite(), "{flag} {x} is not above 0; give a positive number");
+        }
+        Ok(())
+    }
+}
+
 impl Params {
     fn config(&self) -> FinetuneConfig {
         FinetuneConfig {
@@ -110,12 +202,13 @@ impl Params {
             diffusion_weight: self.diffusion_weight,
             decoder_weight: self.decoder_weight,
             temporal_weight: self.temporal_weight,
-            temporal: TemporalConfig {
-                smoothness_weight: self.smoothness_weight,
-                ..TemporalConfig::default()
-            },
+            temporal: self.temporal.config(),
             num_steps: self.num_steps,
-            optimizer: OptimizerConfig::default(),
+            optimizer: OptimizerConfig {
+                weight_decay: self.weight_decay,
+                gradient_clip: (self.gradient_clip > 0.0).then_some(self.gradient_clip),
+                ..OptimizerConfig::default()
+            },
             num_phrases: self.num_phrases.map(NonZeroUsize::get),
         }
     }
@@ -128,13 +221,14 @@ impl Params {
             ("--diffusion-weight", self.diffusion_weight),
             ("--decoder-weight", self.decoder_weight),
             ("--temporal-weight", self.temporal_weight),
-            ("--smoothness-weight", self.smoothness_weight),
+            ("--weight-decay", self.weight_decay),
         ] {
             ensure!(
                 x >= 0.0 && x.is_finite(),
                 "{flag} {x} is below 0; give 0 or a positive number"
             );
         }
+        self.temporal.check()?;
         for (flag, x) in
             [("--minutes", self.minutes), ("--save-every-minutes", Some(self.save_every_minutes))]
         {

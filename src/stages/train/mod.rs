@@ -136,6 +136,16 @@ fn check_numbers(params: &Params, config: &TrainConfig) -> anyhow::Result<()> {
     share("--style-dropout", d.style_dropout)?;
     share("--time-stretch", d.augmentation.stretch)?;
     share("--decoder-dropout", config.network.decoder.dropout)?;
+    share("--decoder-noised-to", config.decoder.noised_to)?;
+    share("--decoder-sampled-from", config.decoder.sampled_from)?;
+    for beta in d.optimizer.betas {
+        share("--betas", beta)?;
+    }
+    let decoder = &config.network.decoder;
+    ensure!(
+        decoder.hidden_dim > 0 && decoder.expansion > 0,
+        "--decoder-hidden-dim and --decoder-expansion must be at least 1"
+    );
     let positive = |flag: &str, x: f64| {
         ensure!(x > 0.0 && x.is_finite(), "{flag} {x} is not above 0; give a positive number");
         Ok(())

@@ -59,6 +59,10 @@ pub struct NetworkParams {
     #[arg(long, value_name = "N", default_value_t = DecoderConfig::default().n_blocks,
           help_heading = "Networks")]
     pub decoder_blocks: usize,
+    /// Width of a decoder block's inner layer, in units of --decoder-hidden-dim.
+    #[arg(long, value_name = "N", default_value_t = DecoderConfig::default().expansion,
+          help_heading = "Networks")]
+    pub decoder_expansion: usize,
     /// Share of the decoder's numbers that training drops.
     #[arg(long, value_name = "P", default_value_t = 0.0, help_heading = "Networks")]
     pub decoder_dropout: f64,
@@ -182,6 +186,31 @@ pub struct OptimizerParams {
     pub decoder_learning_rate: f64,
 }
 
+/// What is rarely changed.
+#[derive(Clone, Debug, clap::Args)]
+pub struct RareParams {
+    /// Decays of AdamW's averages of the gradient and its square.
+    #[arg(long, value_name = "X", num_args = 2, value_delimiter = ',',
+          default_values_t = OptimizerConfig::default().betas, help_heading = "Optimizer")]
+    pub betas: Vec<f64>,
+    /// What AdamW adds to the root of the average square.
+    #[arg(long, value_name = "X", default_value_t = OptimizerConfig::default().epsilon,
+          help_heading = "Optimizer")]
+    pub epsilon: f64,
+    /// Latents for the decoder are made noisy up to this share of the diffusion's steps.
+    #[arg(long, value_name = "SHARE", default_value_t = 0.05, help_heading = "Decoder")]
+    pub decoder_noised_to: f64,
+    /// Of so many batches one has latents that the UNet sampled; 0 for none.
+    #[arg(long, value_name = "N", default_value_t = 4, help_heading = "Decoder")]
+    pub decoder_sampled_every: u64,
+    /// They are sampled from up to this share of the diffusion's steps.
+    #[arg(long, value_name = "SHARE", default_value_t = 0.5, help_heading = "Decoder")]
+    pub decoder_sampled_from: f64,
+    /// In so many steps of DDIM.
+    #[arg(long, value_name = "N", default_value_t = 5, help_heading = "Decoder")]
+    pub decoder_sampler_steps: usize,
+}
+
 /// Everything that determines what a run learns.
 #[derive(Clone, Debug, clap::Args)]
 pub struct ConfigParams {
@@ -193,6 +222,8 @@ pub struct ConfigParams {
     pub augmentation: AugmentationParams,
     #[command(flatten)]
     pub optimizer: OptimizerParams,
+    #[command(flatten)]
+    pub rare: RareParams,
 }
 
 impl NetworkParams {
@@ -229,6 +260,7 @@ impl NetworkParams {
         DecoderConfig {
             hidden_dim: self.decoder_hidden_dim,
             n_blocks: self.decoder_blocks,
+            expansion: self.decoder_expansion,
             dropout: self.decoder_dropout,
             limits: self.limits,
             ..DecoderConfig::default()
@@ -255,13 +287,16 @@ impl NetworkParams {
 impl ConfigParams {
     /// Returns the configuration that the flags make.
     pub fn config(&self, seed: u64) -> TrainConfig {
-        let Self { network, diffusion: d, augmentation: a, optimizer: o } = self;
+        let Self { network, diffusion: d, augmentation: a, optimizer: o, rare } = self;
         let positive = |x: f64| (x > 0.0).then_some(x);
         let ema = EmaConfig { decay: o.ema_decay, every: o.ema_update_every };
+        let beta =
+            |i: usize| rare.betas.get(i).copied().unwrap_or(OptimizerConfig::default().betas[i]);
         let optimizer = OptimizerConfig {
+            betas: [beta(0), beta(1)],
+            epsilon: rare.epsilon,
             weight_decay: o.weight_decay,
             gradient_clip: positive(o.gradient_clip),
-            ..OptimizerConfig::default()
         };
         let rate =
             |peak: f64| LearningRate { peak, course: o.lr_schedule, warmup_steps: o.warmup_steps };
@@ -308,10 +343,10 @@ impl ConfigParams {
                 learning_rate: rate(o.decoder_learning_rate),
                 optimizer,
                 ema,
-                noised_to: 0.05,
-                sampled_every: 4,
-                sampled_from: 0.5,
-                sampler_steps: 5,
+                noised_to: rare.decoder_noised_to,
+                sampled_every: rare.decoder_sampled_every,
+                sampled_from: rare.decoder_sampled_from,
+                sampler_steps: rare.decoder_sampler_steps,
             },
         }
     }
