@@ -74,7 +74,7 @@ fn write_source(folder: &Path) {
 }
 
 /// Makes a store of phrases that can be trained on.
-fn make_store(dir: &Dir) -> PathBuf {
+pub fn make_store(dir: &Dir) -> PathBuf {
     let (source, store) = (dir.at("source"), dir.at("store"));
     write_source(&source);
     let output = crate::support::ingest(&source, &store, &[]);
