@@ -31,6 +31,10 @@ demo: build ## from tests/data to tables, a library, trained networks, a plot an
 ingest: build ## ingest your own files: make ingest SOURCE=… STORE=… [SHARDS=8 -j4]
 	@$(MAKE) --file pipelines/ingest.mk BIN=$(BIN)
 
+.PHONY: train
+train: build ## train and fine-tune: make train STORE=… RUN=… [TRAIN='--preset base --epochs 100']
+	@$(MAKE) --file pipelines/train.mk BIN=$(BIN)
+
 .PHONY: test
 test: check-format check-data lint build check-code doc ## everything that a change must pass
 
