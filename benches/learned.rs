@@ -35,6 +35,8 @@ struct Arguments {
     n_windows: usize,
     n_steps: usize,
     threads: usize,
+    /// Whether songs that were trained on are asked instead.
+    trained: bool,
 }
 
 fn arguments() -> Arguments {
@@ -42,6 +44,7 @@ fn arguments() -> Arguments {
         store: String::new(),
         run: String::new(),
         stage: "diffusion".to_owned(),
+        trained: false,
         n_windows: 128,
         n_steps: 20,
         threads: std::thread::available_parallelism().map_or(1, NonZeroUsize::get),
@@ -53,6 +56,7 @@ fn arguments() -> Arguments {
             "--store" => found.store = value,
             "--run" => found.run = value,
             "--stage" => found.stage = value,
+            "--songs" => found.trained = value == "trained",
             "--windows" => found.n_windows = number(),
             "--steps" => found.n_steps = number(),
             "--threads" => found.threads = number(),
@@ -77,11 +81,17 @@ fn column(frames: &[f32], channel: usize) -> Vec<f64> {
     frames.chunks_exact(MOTION_DIM).map(|frame| f64::from(frame[channel])).collect()
 }
 
-fn held_out(dataset: &Dataset, n_frames: usize, n: usize) -> Vec<HeldOut> {
+fn held_out(
+    dataset: &Dataset,
+    state: &State<TrainConfig>,
+    n: usize,
+    trained: bool,
+) -> Vec<HeldOut> {
+    let n_frames = state.config.network.window_frames;
     let phrases: Vec<&Phrase> = dataset
         .phrases()
         .iter()
-        .filter(|phrase| phrase.split != Split::Train && phrase.n_frames >= n_frames)
+        .filter(|phrase| (phrase.split == Split::Train) == trained && phrase.n_frames >= n_frames)
         .collect();
     let stride = phrases.len().div_ceil(n).max(1);
     phrases
@@ -89,7 +99,8 @@ fn held_out(dataset: &Dataset, n_frames: usize, n: usize) -> Vec<HeldOut> {
         .step_by(stride)
         .map(|phrase| {
             let motion = dataset.motion(phrase, 0, n_frames).expect("frames at hand");
-            let audio = dataset.features(phrase, 0, n_frames).expect("frames at hand");
+            let mut audio = dataset.features(phrase, 0, n_frames).expect("frames at hand");
+            state.scales.features.apply(audio.view_mut());
             let frames: Vec<f32> = motion.iter().copied().collect();
             HeldOut {
                 song: phrase.id.split(".t").next().unwrap_or_default().to_owned(),
@@ -166,13 +177,8 @@ fn correlation(a: &[f64], b: &[f64]) -> f64 {
 fn baselines(dataset: &Arc<Dataset>, state: &State<TrainConfig>, schedule: &Schedule) {
     const N: usize = 256;
     let frames = state.config.network.window_frames;
-    let windows = Windows::new(
-        Arc::clone(dataset),
-        state.normalizer.clone(),
-        Augmentation::default(),
-        frames,
-        0,
-    );
+    let windows =
+        Windows::new(Arc::clone(dataset), state.scales.clone(), Augmentation::default(), frames, 0);
     let batch = windows.validation(0..N).expect("at hand");
     let view = |values: &[f32]| {
         Array3::from_shape_vec((N, frames, MOTION_DIM), values.to_vec()).expect("as its shape")
@@ -243,7 +249,7 @@ fn main() {
     let weights = read(&from_unet, "unet.", unet_list);
     let decoder_weights = read(&from_decoder, "decoder.", decoder_list);
     let schedule = Schedule::new(&network.diffusion).expect("a schedule");
-    let windows = held_out(&dataset, network.window_frames, arguments.n_windows);
+    let windows = held_out(&dataset, &state, arguments.n_windows, arguments.trained);
     let n_songs = {
         let mut songs: Vec<_> = windows.iter().map(|w| w.song.as_str()).collect();
         songs.dedup();
@@ -303,6 +309,28 @@ fn main() {
     let n = windows.len();
     let shuffled = sample(&|i| (i + n / 2) % n, 1);
 
+    // The phase that a model speaks of, against the music's: |⟨e^{2πi(φ̂ − φ)}⟩| over a phrase is 1 where it
+    // runs at the right tempo, wherever it puts the downbeat; beats are its fourth harmonic.
+    let coherence = |motions: &[Vec<f32>], harmonic: f64| {
+        let of = |(window, motion): (&HeldOut, &Vec<f32>)| {
+            let said = column(motion, Channel::Phase.range().start);
+            let angles = said.iter().zip(&window.phase);
+            let angles: Vec<f64> =
+                angles.map(|(a, b)| std::f64::consts::TAU * harmonic * (a - b)).collect();
+            let n = angles.len() as f64;
+            let (c, s): (f64, f64) =
+                (angles.iter().map(|a| a.cos()).sum(), angles.iter().map(|a| a.sin()).sum());
+            (c * c + s * s).sqrt() / n
+        };
+        windows.iter().zip(motions).map(of).sum::<f64>() / windows.len() as f64
+    };
+    for (name, motions) in [("generated", &generated), ("shuffled", &shuffled)] {
+        println!(
+            "phase channel, {name}: coherence of bars {:.3}, of beats {:.3}",
+            coherence(motions, 1.0),
+            coherence(motions, 4.0)
+        );
+    }
     println!("{:<22} {:>8} {:>12} {:>8}", "", "R²", "wrong tempi", "p");
     let show = |name: &str, signals: &[Vec<f64>]| {
         let Lock { r2, wrong_mean, p } = lock(&windows, signals);

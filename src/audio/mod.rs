@@ -17,6 +17,7 @@ pub mod mfcc;
 pub mod onset;
 pub mod recording;
 pub mod resample;
+mod scale;
 pub mod sliding_dft;
 pub mod spectral;
 pub mod stft;
@@ -34,3 +35,4 @@ pub const SAMPLE_RATE_HZ: u32 = 44_100;
 pub const HOP: usize = 1_470;
 /// Samples of a frame's transform.
 pub const N_FFT: usize = 2_048;
+pub use scale::FeatureScale;

@@ -290,7 +290,7 @@ impl Stage for Finetune {
         let network = &trained.state.config.network;
         let windows = Arc::new(Windows::new(
             Arc::clone(&phrases.dataset),
-            trained.state.normalizer.clone(),
+            trained.state.scales.clone(),
             // The phrases as they are: sampled motion is held against them.
             Augmentation { condition_noise: 0.0, mirror: false, yaw_deg: 0.0, stretch: 0.0 },
             network.window_frames,
@@ -310,7 +310,7 @@ impl Stage for Finetune {
             Self::NAME,
             config.clone(),
             windows.dataset().fingerprint(),
-            windows.normalizer().clone(),
+            windows.scales().clone(),
         );
         let state = restore(&mut learner, &checkpoints, fresh, run, &watch)?;
         let started_at = state.progress.step;

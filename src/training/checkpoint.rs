@@ -5,11 +5,11 @@ use std::collections::BTreeMap;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use crate::motion::Normalizer;
 use crate::store::{Location, Put, StoreError};
 use crate::weights::{Archive, Precision, Section, save_to_file};
 
 use super::error::TrainingError;
+use super::window::Scales;
 
 /// Layout of checkpoints; raised when a field changes its meaning.
 const FORMAT: u32 = 1;
@@ -29,7 +29,7 @@ pub struct State<C> {
     pub config: C,
     /// Digest of the phrases.
     pub data: String,
-    pub normalizer: Normalizer,
+    pub scales: Scales,
     pub progress: Progress,
 }
 
@@ -63,14 +63,14 @@ pub struct Best {
 
 impl<C: Serialize + DeserializeOwned> State<C> {
     /// Returns the state of a stage that has not begun.
-    pub fn new(stage: &str, config: C, data: &str, normalizer: Normalizer) -> Self {
+    pub fn new(stage: &str, config: C, data: &str, scales: impl Into<Scales>) -> Self {
         Self {
             format: FORMAT,
             program: format!("{} {}", env!("CARGO_PKG_NAME"), env!("CARGO_PKG_VERSION")),
             stage: stage.to_owned(),
             config,
             data: data.to_owned(),
-            normalizer,
+            scales: scales.into(),
             progress: Progress::default(),
         }
     }

@@ -39,4 +39,4 @@ pub use loader::Loader;
 pub use objective::{Objective, Reconstruction, reconstruction};
 pub use sampling::{Condition, Denoiser};
 pub use temporal::{TemporalConfig, TemporalLosses, temporal_losses};
-pub use window::{Augmentation, Batch, Chances, Windows, fit_normalizer};
+pub use window::{Augmentation, Batch, Chances, Scales, Windows, fit_scales};

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use ndarray::{Array2, s};
 use serde::{Deserialize, Serialize};
 
-use crate::audio::FEATURE_DIM;
+use crate::audio::{FEATURE_DIM, FeatureScale};
 use crate::autodiff::Stream;
 use crate::motion::augment::{
     mirror_x, rotate_yaw, stretch_features, stretch_motion, stretched_frames,
@@ -19,7 +19,7 @@ use super::dataset::{Dataset, Phrase, Split};
 /// What makes more of each phrase; zero and false leave it as it is.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Augmentation {
-    /// Standard deviation of the noise added to features, which lie in about 0 to 1 (MFCC in ± 3).
+    /// Standard deviation of the noise added to features, in units of their spread.
     pub condition_noise: f64,
     /// Whether every other window, by chance, is mirrored in x.
     pub mirror: bool,
@@ -32,7 +32,7 @@ pub struct Augmentation {
 impl Default for Augmentation {
     fn default() -> Self {
         // A handful of songs has a handful of tempi: stretched, they have all those between.
-        Self { condition_noise: 0.02, mirror: true, yaw_deg: 0.0, stretch: 0.15 }
+        Self { condition_noise: 0.1, mirror: true, yaw_deg: 0.0, stretch: 0.15 }
     }
 }
 
@@ -43,7 +43,7 @@ pub struct Batch {
     pub n_frames: usize,
     /// Normalised motion, `[n_windows, n_frames, 25]`; beyond a phrase's end its last frame is held.
     pub motion: Vec<f32>,
-    /// Features, `[n_windows, n_frames, 163]`, held likewise.
+    /// Features in units of their spread, `[n_windows, n_frames, 163]`, held likewise.
     pub audio: Vec<f32>,
     /// 1 for frames of the phrase and 0 for held ones, `[n_windows, n_frames]`.
     pub mask: Vec<f32>,
@@ -105,11 +105,25 @@ impl Batch {
     }
 }
 
+/// What networks see motion and music through.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Scales {
+    pub motion: Normalizer,
+    pub features: FeatureScale,
+}
+
+impl From<Normalizer> for Scales {
+    /// Leaves features as they are.
+    fn from(motion: Normalizer) -> Self {
+        Self { motion, features: FeatureScale::identity(FEATURE_DIM) }
+    }
+}
+
 /// Cuts windows out of the phrases of a dataset.
 #[derive(Debug)]
 pub struct Windows {
     dataset: Arc<Dataset>,
-    normalizer: Normalizer,
+    scales: Scales,
     augmentation: Augmentation,
     n_frames: usize,
     seed: u64,
@@ -134,7 +148,7 @@ impl Windows {
     /// Makes windows of `n_frames` frames.
     pub fn new(
         dataset: Arc<Dataset>,
-        normalizer: Normalizer,
+        scales: impl Into<Scales>,
         augmentation: Augmentation,
         n_frames: usize,
         seed: u64,
@@ -151,7 +165,8 @@ impl Windows {
                 Split::Test => {}
             }
         }
-        Self { dataset, normalizer, augmentation, n_frames, seed, train, validation }
+        let scales = scales.into();
+        Self { dataset, scales, augmentation, n_frames, seed, train, validation }
     }
 
     pub fn dataset(&self) -> &Dataset {
@@ -159,7 +174,11 @@ impl Windows {
     }
 
     pub fn normalizer(&self) -> &Normalizer {
-        &self.normalizer
+        &self.scales.motion
+    }
+
+    pub fn scales(&self) -> &Scales {
+        &self.scales
     }
 
     /// Returns how many windows an epoch has.
@@ -222,7 +241,8 @@ impl Windows {
             let phrase = &self.dataset.phrases()[phrase as usize];
             let n = self.n_frames.min(phrase.n_frames - first as usize);
             let motion = self.dataset.motion(phrase, first as usize, n)?;
-            let audio = self.dataset.features(phrase, first as usize, n)?;
+            let mut audio = self.dataset.features(phrase, first as usize, n)?;
+            self.scales.features.apply(audio.view_mut());
             self.push(&mut batch, phrase, placed(motion), audio);
             let step = ((number as f64 + 0.5) * GOLDEN).fract();
             batch.chances.push(Chances { step, no_audio: 1.0, no_style: 1.0 });
@@ -265,6 +285,7 @@ impl Windows {
         if yaw_deg > 0.0 {
             rotate_yaw(&mut motion, (2.0 * turn - 1.0) * yaw_deg.to_radians());
         }
+        self.scales.features.apply(audio.view_mut());
         if condition_noise > 0.0 {
             let mut noise = vec![0.0_f32; audio.len()];
             Stream::new(self.seed, AUDIO_NOISE + number).normal(0, &mut noise);
@@ -284,7 +305,7 @@ impl Windows {
         audio: Array2<f32>,
     ) {
         let n = motion.nrows();
-        self.normalizer.normalize(motion.view_mut());
+        self.scales.motion.normalize(motion.view_mut());
         let rows = (0..self.n_frames).map(|t| t.min(n - 1));
         for t in rows {
             batch.motion.extend(motion.row(t));
@@ -316,17 +337,18 @@ fn placed(mut motion: Array2<f32>) -> Array2<f32> {
 /// Most frames that a normalizer is fitted to; more say nothing new.
 const MAX_FITTED_FRAMES: usize = 1 << 20;
 
-/// Fits a normalizer to the training windows of a dataset; returns the names of constant channels too.
+/// Fits the scales of motion and features to the training windows of a dataset; returns the names of
+/// constant channels of motion too.
 ///
 /// # Errors
 /// [`StoreError`] when the frames at hand cannot be read.
 ///
 /// # Panics
 /// When there are no training phrases.
-pub fn fit_normalizer(
+pub fn fit_scales(
     dataset: &Dataset,
     n_frames: usize,
-) -> Result<(Normalizer, Vec<&'static str>), StoreError> {
+) -> Result<(Scales, Vec<&'static str>), StoreError> {
     let train = dataset.phrases().iter().filter(|phrase| phrase.split == Split::Train);
     let windows: Vec<_> = train
         .flat_map(|phrase| {
@@ -334,14 +356,25 @@ pub fn fit_normalizer(
             (0..n_windows).map(move |k| (phrase, k * n_frames))
         })
         .collect();
-    // Evenly over all phrases where there are more than enough.
-    let stride = (windows.len() * n_frames).div_ceil(MAX_FITTED_FRAMES).max(1);
-    let mut values = Vec::new();
-    for (phrase, first) in windows.into_iter().step_by(stride) {
-        let n = n_frames.min(phrase.n_frames - first);
-        values.extend(placed(dataset.motion(phrase, first, n)?));
-    }
-    let shape = (values.len() / MOTION_DIM, MOTION_DIM);
-    let frames = Array2::from_shape_vec(shape, values).expect("whole frames were gathered");
-    Ok(Normalizer::fit(frames.view()))
+    let gather = |width: usize, max_frames: usize, read: &dyn Fn(&Phrase, usize, usize) -> _| {
+        // Evenly over all phrases where there are more than enough.
+        let stride = (windows.len() * n_frames).div_ceil(max_frames).max(1);
+        let mut values = Vec::new();
+        for &(phrase, first) in windows.iter().step_by(stride) {
+            let frames: Array2<f32> = read(phrase, first, n_frames.min(phrase.n_frames - first))?;
+            values.extend(frames);
+        }
+        let shape = (values.len() / width, width);
+        Ok::<_, StoreError>(
+            Array2::from_shape_vec(shape, values).expect("whole frames were gathered"),
+        )
+    };
+    let motion = gather(MOTION_DIM, MAX_FITTED_FRAMES, &|phrase, first, n| {
+        Ok(placed(dataset.motion(phrase, first, n)?))
+    })?;
+    let features = gather(FEATURE_DIM, MAX_FITTED_FRAMES / 8, &|phrase, first, n| {
+        dataset.features(phrase, first, n)
+    })?;
+    let (motion, constant) = Normalizer::fit(motion.view());
+    Ok((Scales { motion, features: FeatureScale::fit(features.view()) }, constant))
 }

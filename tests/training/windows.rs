@@ -5,7 +5,7 @@ use std::num::NonZeroUsize;
 use std::sync::Arc;
 
 use motiongen::motion::{Channel, MOTION_DIM, Normalizer};
-use motiongen::training::{Augmentation, Dataset, Loader, Split, Windows, fit_normalizer};
+use motiongen::training::{Augmentation, Dataset, Loader, Split, Windows, fit_scales};
 use ndarray::{Array2, s};
 use proptest::prelude::*;
 
@@ -142,7 +142,7 @@ fn the_normalizer_sees_the_training_split_alone() {
     let train = phrases[..1].to_vec();
     let fit = |phrases: Vec<(&str, Split, Array2<f32>, Array2<f32>)>| {
         let dataset = Dataset::in_memory(phrases).expect("in memory");
-        fit_normalizer(&dataset, 24).expect("at hand")
+        fit_scales(&dataset, 24).expect("at hand")
     };
     assert_eq!(fit(phrases), fit(train));
 }

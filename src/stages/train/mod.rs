@@ -19,7 +19,7 @@ use crate::training::{
     Augmentation, Checkpoints, DecoderLearner, Denoiser, DiffusionLearner, Drive, End, Journal,
     Kind, Learner, Loader, Plan, State, TrainConfig, TrainingError, Windows,
 };
-use session::{Looker, MachineParams, check_run_name, claim, claim_path, normalizer, read_phrases};
+use session::{Looker, MachineParams, check_run_name, claim, claim_path, read_phrases, scales};
 pub use summary::{Account, StageAccount};
 
 /// Share of a time budget that the decoder gets.
@@ -221,10 +221,10 @@ impl<'a> Run<'a> {
             read_phrases(self.store, Train::NAME, &params.machine, None, progress, self.watch)?;
         let threads = Arc::new(params.machine.start_threads()?);
         let n_frames = config.network.window_frames;
-        let normalizer = normalizer(&phrases.dataset, n_frames, self.watch)?;
+        let scales = scales(&phrases.dataset, n_frames, self.watch)?;
         let windows = |augmentation: Augmentation| {
-            let (dataset, normalizer) = (Arc::clone(&phrases.dataset), normalizer.clone());
-            Arc::new(Windows::new(dataset, normalizer, augmentation, n_frames, params.seed))
+            let (dataset, scales) = (Arc::clone(&phrases.dataset), scales.clone());
+            Arc::new(Windows::new(dataset, scales, augmentation, n_frames, params.seed))
         };
         let mut account = Account::new(&params.run, self.store, phrases.left_out.clone());
 
@@ -278,7 +278,7 @@ impl<'a> Run<'a> {
             L::STAGE,
             self.config.clone(),
             windows.dataset().fingerprint(),
-            windows.normalizer().clone(),
+            windows.scales().clone(),
         );
         let state = restore(learner, &checkpoints, state, &self.params.run, self.watch)?;
         let started_at = state.progress.step;

@@ -10,14 +10,13 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::autodiff::Threads;
-use crate::motion::Normalizer;
 use crate::stages::Progress;
 use crate::store::tables::FailureRow;
 use crate::store::{
     Commit, Item, Ledger, Location, Patience, Put, Row as _, StoreError, TimestampUs, digest,
 };
 use crate::training::{
-    Dataset, LeftOut, Reading, TrainingError, Watch, differences, fit_normalizer,
+    Dataset, LeftOut, Reading, Scales, TrainingError, Watch, differences, fit_scales,
 };
 
 /// Longest name of a run.
@@ -171,23 +170,19 @@ pub fn read_phrases(
     Ok(Phrases { dataset: Arc::new(dataset), left_out })
 }
 
-/// Fits the normalizer, and says which channels are constant.
+/// Fits the scales of motion and features, and says which channels are constant.
 ///
 /// # Errors
 /// When the frames at hand cannot be read.
-pub fn normalizer(
-    dataset: &Dataset,
-    n_frames: usize,
-    watch: &Looker,
-) -> Result<Normalizer, StoreError> {
-    let (normalizer, constant) = fit_normalizer(dataset, n_frames)?;
+pub fn scales(dataset: &Dataset, n_frames: usize, watch: &Looker) -> Result<Scales, StoreError> {
+    let (scales, constant) = fit_scales(dataset, n_frames)?;
     if !constant.is_empty() {
         watch.note(&format!(
             "constant in all training phrases, kept in their own unit: {}",
             constant.join(", ")
         ));
     }
-    Ok(normalizer)
+    Ok(scales)
 }
 
 /// Writes phrases that are left out into the table of failures, and withdraws those that are not any more.
