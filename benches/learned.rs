@@ -35,6 +35,7 @@ struct Arguments {
     n_windows: usize,
     n_steps: usize,
     threads: usize,
+    guidance: f64,
     /// Whether songs that were trained on are asked instead.
     trained: bool,
 }
@@ -44,6 +45,7 @@ fn arguments() -> Arguments {
         store: String::new(),
         run: String::new(),
         stage: "diffusion".to_owned(),
+        guidance: 1.0,
         trained: false,
         n_windows: 128,
         n_steps: 20,
@@ -56,6 +58,7 @@ fn arguments() -> Arguments {
             "--store" => found.store = value,
             "--run" => found.run = value,
             "--stage" => found.stage = value,
+            "--guidance" => found.guidance = value.parse().expect("a number"),
             "--songs" => found.trained = value == "trained",
             "--windows" => found.n_windows = number(),
             "--steps" => found.n_steps = number(),
@@ -289,7 +292,10 @@ fn main() {
             let condition =
                 Condition { audio: &audio, mask: &mask, style: &style, drop_audio: &[] };
             let latent = threads.run(|| {
-                denoiser.sample(&config, &schedule, noise, &condition, |_, _| ()).expect("sampled")
+                let guidance = arguments.guidance;
+                denoiser
+                    .sample(&config, &schedule, noise, &condition, guidance, |_, _| ())
+                    .expect("sampled")
             });
             let latent = latent.as_standard_layout().into_owned();
             let mut g = Eager::new(&decoder_weights, &arena);

@@ -3,7 +3,7 @@
 use ndarray::{Array3, ArrayView3};
 
 use crate::autodiff::{Arena, Eager, Parameters, Tensor};
-use crate::diffusion::{SamplerConfig, Schedule, sample};
+use crate::diffusion::{SamplerConfig, Schedule, denoise_guided, sample};
 use crate::model::{UNet1D, UNetInputs};
 use crate::motion::MOTION_DIM;
 use crate::motion::style::STYLE_DIM;
@@ -83,7 +83,8 @@ impl Denoiser<'_> {
 
     /// Samples: noise x_T becomes x0, normalised, \[batch, frames, 25\].
     ///
-    /// `noise` fills the draw of a number; see [`sample`].
+    /// With a `guidance` other than 1 every step looks twice, with the music and without, as one batch of
+    /// both; see [`denoise_guided`]. `noise` fills the draw of a number; see [`sample`].
     ///
     /// # Errors
     /// What the sampler or the network refuses.
@@ -93,10 +94,22 @@ impl Denoiser<'_> {
         schedule: &Schedule,
         x: Array3<f32>,
         condition: &Condition,
+        guidance: f64,
         noise: impl FnMut(usize, &mut [f32]),
     ) -> Result<Array3<f32>, TrainingError> {
         let batch = x.dim().0;
-        let denoise = |x: ArrayView3<f32>, t: usize| self.predict(x, &vec![t; batch], condition);
+        let denoise = |x: ArrayView3<f32>, t: usize| {
+            denoise_guided(guidance, x, t, |x, t, dropped: &[bool]| {
+                let n = dropped.len();
+                let repeat = |values: &[f32]| values.repeat(n / batch.max(1));
+                let (audio, mask) = (repeat(condition.audio), repeat(condition.mask));
+                let style = repeat(condition.style);
+                let drop: Vec<f32> = dropped.iter().map(|&d| f32::from(u8::from(d))).collect();
+                let condition =
+                    Condition { audio: &audio, mask: &mask, style: &style, drop_audio: &drop };
+                self.predict(x, &vec![t; n], &condition)
+            })
+        };
         sample(config, schedule, x, denoise, noise, None)
     }
 }
