@@ -83,11 +83,10 @@ from phrases p join motion m on p.phrase_id = m.phrase_id
 where p.has_features and not p.has_audio group by p.split order by p.split
 endef
 define TRAINING
-select stage, kind, count(*) as rows, max(step) as steps, round(max(elapsed_s), 1) as seconds,
-round(min(loss), 4) as lowest_loss from training_log where run = 'RUN_NAME'
-group by stage, kind order by stage, kind
+select run, stage, kind, count(*) as rows, max(step) as steps, round(max(elapsed_s), 1) as seconds,
+round(min(loss), 4) as lowest_loss from training_log
+group by run, stage, kind order by run, stage, kind
 endef
-TRAINING := $(subst RUN_NAME,$(RUN),$(value TRAINING))
 # Lines become spaces on the way to the shell.
 define newline
 
