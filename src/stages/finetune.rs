@@ -247,6 +247,7 @@ impl Params {
             time: self.minutes.map(minutes),
             windows_per_epoch: windows.n_train() as u64,
             batch_size: self.batch_size.get() as u64,
+            validate_first: true,
             validate_every_epochs: self.validate_every,
             save_every_epochs: self.save_every,
             save_every_steps: self.save_every_steps,

@@ -147,6 +147,8 @@ pub struct Plan {
     pub time: Option<Duration>,
     pub windows_per_epoch: u64,
     pub batch_size: u64,
+    /// Whether what is there before the first step is measured too.
+    pub validate_first: bool,
     pub validate_every_epochs: u64,
     pub save_every_epochs: u64,
     pub save_every_steps: Option<u64>,
@@ -248,6 +250,9 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
         let before_s = self.state.progress.elapsed_s;
         let started = Instant::now();
         let mut last_save = Instant::now();
+        if self.plan.validate_first && self.state.progress.step == 0 {
+            self.validate(learner)?;
+        }
         let end = loop {
             let step = self.state.progress.step;
             if step >= n_steps {

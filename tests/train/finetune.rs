@@ -51,6 +51,7 @@ fn coherence_improves_and_every_loss_is_logged() {
     }
     let validations: Vec<_> = rows.iter().filter(|row| row.kind == "validation").collect();
     let (first, last) = (validations[0], validations[validations.len() - 1]);
+    assert_eq!(first.step, 0, "what train left is measured too");
     assert!(last.loss < first.loss, "{:?} to {:?}", first.loss, last.loss);
     assert!(last.velocity_error < first.velocity_error);
     assert!(last.quaternion_pass_rate >= Some(0.0) && last.acceleration_error > Some(0.0));

@@ -316,6 +316,7 @@ impl<'a> Run<'a> {
             time: b.minutes.map(|m| minutes(share * m)),
             windows_per_epoch: windows.n_train() as u64,
             batch_size: batch_size as u64,
+            validate_first: false,
             validate_every_epochs: b.validate_every,
             save_every_epochs: b.save_every,
             save_every_steps: b.save_every_steps,
