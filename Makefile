@@ -24,7 +24,7 @@ build: ## build the executables (dev profile)
 	$(CARGO) build --locked --bins
 
 .PHONY: demo
-demo: build ## from tests/data to tables, a library, trained networks, a plot and answers (build/demo)
+demo: build setup ## from tests/data to tables, a library, trained networks, a plot and answers (build/demo)
 	@$(MAKE) --file pipelines/demo.mk BIN=$(BIN)
 
 .PHONY: ingest
@@ -46,9 +46,13 @@ check-format:
 check-data:
 	$(PYTHON) tests/data/make.py --check
 
+.PHONY: setup
+setup: ## obtain onnxruntime, with its checksum (.runtime)
+	@$(PYTHON) pipelines/onnxruntime/fetch.py
+
 # Unit tests of the library and the executables, the integration tests, and the examples' build.
 .PHONY: check-code
-check-code: build/venv/ready
+check-code: build/venv/ready setup
 	MOTIONGEN_TEST_PYTHON='$(CURDIR)/build/venv/bin/python' $(CARGO) test --locked
 
 .PHONY: lint
@@ -92,6 +96,12 @@ bench-training: build/engine-venv/ready ## measure training and fine-tuning besi
 	$(CARGO) build --locked --bin motiongen
 	$(CARGO) build --locked --release --no-default-features --bin motiongen --example training-bench
 	build/engine-venv/bin/python benches/training.py --bin $(TARGET)/release $(BENCH_ARGS)
+
+.PHONY: bench-inference
+bench-inference: build/engine-venv/ready setup ## measure inference beside PyTorch and onnxruntime [BENCH_ARGS=--quick]
+	$(CARGO) build --locked --release --no-default-features --example inference-bench
+	build/engine-venv/bin/python benches/inference.py \
+	  --bin $(TARGET)/release/examples/inference-bench $(BENCH_ARGS)
 
 .PHONY: bench-room
 bench-room: ## build the room autodiff alone, from nothing

@@ -12,6 +12,7 @@ mod library;
 mod motion_capture;
 mod npy_files;
 mod object_store_conformance;
+mod onnx;
 mod plot_features;
 mod plot_training;
 mod query_tables;

@@ -74,6 +74,7 @@ fn row(run: &str, stage: &str, kind: RowKind, epoch: i32, step: i64) -> Training
         velocity_error: None,
         acceleration_error: None,
         quaternion_pass_rate: None,
+        speed_ratio: None,
         gradient_norm: None,
         skipped: false,
         samples_per_s: None,

@@ -94,7 +94,8 @@ fn train_command(store: &Path, run: &str, more: &[&str]) -> Command {
     command
 }
 
-fn train(store: &Path, run: &str, more: &[&str]) -> Output {
+/// Trains the small network.
+pub fn train(store: &Path, run: &str, more: &[&str]) -> Output {
     finish(&mut train_command(store, run, more))
 }
 

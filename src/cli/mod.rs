@@ -15,6 +15,7 @@ use std::process::ExitCode;
 
 use clap::{Arg, ArgAction, ArgMatches, Command, FromArgMatches as _};
 
+use crate::stages::export::Export;
 use crate::stages::extract::Extract;
 use crate::stages::finetune::Finetune;
 use crate::stages::ingest::Ingest;
@@ -49,6 +50,7 @@ fn entries() -> Vec<Entry> {
         Entry::of::<Library>(),
         Entry::of::<Train>(),
         Entry::of::<Finetune>(),
+        Entry::of::<Export>(),
         Entry::of::<Model>(),
         Entry::of::<Plot>(),
         #[cfg(feature = "query")]

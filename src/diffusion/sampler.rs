@@ -27,6 +27,17 @@ pub enum Sampler {
     DpmSolver,
 }
 
+impl Sampler {
+    /// Returns the name that people know it by.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Ddpm => "DDPM",
+            Self::Ddim { .. } => "DDIM",
+            Self::DpmSolver => "DPM-Solver++",
+        }
+    }
+}
+
 impl Default for Sampler {
     fn default() -> Self {
         Self::Ddim { eta: 0.0 }

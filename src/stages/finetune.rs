@@ -9,14 +9,13 @@ use anyhow::ensure;
 use super::train::session::{
     Looker, MachineParams, check_run_name, claim, claim_path, read_phrases,
 };
-use super::train::{Account, StageAccount, best_section, quoted, restore};
+use super::train::{Account, StageAccount, quoted, restore};
+use super::trained::{Stand, Trained};
 use super::{ClientParams, Contract, Progress, Stage, Summary};
-use crate::model::{MotionDecoder, UNet1D};
 use crate::store::Location;
 use crate::training::{
-    Augmentation, Checkpoints, DecoderLearner, DiffusionLearner, Drive, End, FinetuneConfig,
-    FinetuneLearner, Journal, Kind, Learner, Loader, OptimizerConfig, Plan, State, TemporalConfig,
-    TrainConfig, TrainingError, Windows,
+    Augmentation, Checkpoints, Drive, End, FinetuneConfig, FinetuneLearner, Journal, Kind, Loader,
+    OptimizerConfig, Plan, State, TemporalConfig, Windows,
 };
 
 /// The stage.
@@ -93,6 +92,10 @@ pub struct Params {
     /// Steps of DDIM that gradients flow through.
     #[arg(long, value_name = "N", default_value_t = 5, help_heading = "Losses")]
     pub num_steps: usize,
+    /// Share of the diffusion's steps that are undone: sampling begins with the phrase's motion made as
+    /// noisy; 1 begins with noise alone, as in the reference, and ends in motion that stands still.
+    #[arg(long, value_name = "SHARE", default_value_t = 0.5, help_heading = "Losses")]
+    pub start: f64,
     #[command(flatten)]
     pub machine: MachineParams,
     #[command(flatten)]
@@ -204,6 +207,7 @@ impl Params {
             temporal_weight: self.temporal_weight,
             temporal: self.temporal.config(),
             num_steps: self.num_steps,
+            start: self.start,
             optimizer: OptimizerConfig {
                 weight_decay: self.weight_decay,
                 gradient_clip: (self.gradient_clip > 0.0).then_some(self.gradient_clip),
@@ -228,6 +232,11 @@ impl Params {
                 "{flag} {x} is below 0; give 0 or a positive number"
             );
         }
+        ensure!(
+            self.start > 0.0 && self.start <= 1.0,
+            "--start {} is no share; give a number above 0, up to 1",
+            self.start
+        );
         self.temporal.check()?;
         for (flag, x) in
             [("--minutes", self.minutes), ("--save-every-minutes", Some(self.save_every_minutes))]
@@ -278,7 +287,7 @@ impl Stage for Finetune {
             !params.resume || !checkpoints.steps(Kind::Step)?.is_empty(),
             "run {run} has no fine-tuning to resume in {store}; leave --resume out to start it"
         );
-        let trained = Trained::read(&store, run)?;
+        let trained = Trained::read(&store, run, Stand::Train)?;
         if params.force {
             checkpoints.clear()?;
             Journal::open(&store, Self::NAME, run, Self::NAME)?.clear()?;
@@ -303,7 +312,7 @@ impl Stage for Finetune {
             objective,
             &config,
             &windows,
-            [&trained.unet, &trained.decoder],
+            [&trained.unet.parameters, &trained.decoder.parameters],
         )?
         .on(&Arc::new(machine.start_threads()?));
         claim(&store, run, Self::NAME, &config, machine.patience(), &watch)?;
@@ -339,35 +348,5 @@ impl Stage for Finetune {
             return Ok(Box::new(account.interrupted(&words.join(" "))));
         }
         Ok(Box::new(account))
-    }
-}
-
-/// What `train` left of a run.
-struct Trained {
-    state: State<TrainConfig>,
-    unet: crate::autodiff::Parameters<f32>,
-    decoder: crate::autodiff::Parameters<f32>,
-}
-
-impl Trained {
-    fn read(store: &Location, run: &str) -> Result<Self, TrainingError> {
-        let of = |stage: &'static str| Checkpoints::new(store, run, stage);
-        let diffusion = of(DiffusionLearner::STAGE);
-        let Some(&step) = diffusion.steps(Kind::Best)?.last() else {
-            let way_out = format!("run motiongen train --run {run} first");
-            return Err(TrainingError::Missing {
-                run: run.to_owned(),
-                what: "trained UNet",
-                way_out,
-            });
-        };
-        let state: State<TrainConfig> = diffusion.read(Kind::Best, step, State::of)?;
-        let network = &state.config.network;
-        let (_, unet) = UNet1D::new(&network.unet);
-        let (_, decoder) = MotionDecoder::new(&network.decoder);
-        let unet = best_section(&diffusion, run, "unet.", "trained UNet", unet)?;
-        let (stage, what) = (of(DecoderLearner::STAGE), "trained decoder");
-        let decoder = best_section(&stage, run, "decoder.", what, decoder)?;
-        Ok(Self { state, unet, decoder })
     }
 }

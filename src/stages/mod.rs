@@ -1,5 +1,6 @@
 //! Stages: what the user runs. Each has a contract, parameters, a run and a summary.
 
+pub mod export;
 pub mod extract;
 pub mod failure;
 pub mod feature_file;
@@ -7,10 +8,12 @@ pub mod finetune;
 pub mod ingest;
 pub mod library;
 pub mod model;
+mod model_files;
 pub mod plot;
 #[cfg(feature = "query")]
 pub mod query;
 pub mod train;
+mod trained;
 
 use std::io::{self, Write};
 

@@ -14,6 +14,7 @@ mod local;
 mod location;
 mod part;
 mod patience;
+mod prepared;
 #[cfg(feature = "query")]
 mod query;
 mod reader;
@@ -34,6 +35,7 @@ pub use local::{replace_file, temporary_beside, write_file};
 pub use location::{Listed, Location, Put};
 pub use part::{FinishedPart, PartWriter};
 pub use patience::Patience;
+pub use prepared::prepared;
 #[cfg(feature = "query")]
 pub use query::{Answer, Format, TableInfo, query, table_infos};
 pub use reader::Snapshot;

@@ -121,9 +121,10 @@ rows! {
         quaternion_delta: Option<f64>, "", "2 ⟨max(0.95 − |q · q'|, 0)⟩.";
         phase_monotonic: Option<f64>, "", "Falls of the phase within bars, summed over a motion.";
         position_smoothness: Option<f64>, "m", "⟨max(|Δp| − 0.5, 0)⟩.";
-        velocity_error: Option<f64>, "m/s", "Of a validation in finetune: mean |v − 30 Δp| of sampled and decoded motion.";
+        velocity_error: Option<f64>, "m/s", "Of a validation in finetune: mean |v − 30 Δp| of motion that was sampled from noise and decoded.";
         acceleration_error: Option<f64>, "m/s²", "Of a validation in finetune: mean |a − 30 Δv|.";
         quaternion_pass_rate: Option<f64>, "", "Of a validation in finetune: share of sampled motions whose turns from frame to frame all keep |q · q'| ≥ 0.95.";
+        speed_ratio: Option<f64>, "", "Of a validation in finetune: mean speed of sampled motion, over that of the phrases; far below 1 where motion agrees with itself because it stands still.";
         gradient_norm: Option<f64>, "", "Norm of the gradient before it was clipped.";
         skipped: bool, "", "Whether the step was skipped because something was not finite.";
         samples_per_s: Option<f64>, "1/s", "Windows learned from per second.";
@@ -131,6 +132,29 @@ rows! {
         rss_bytes: Option<i64>, "bytes", "Memory of the process after the step.";
         elapsed_s: f64, "s", "Time that the stage has trained, over all resumptions.";
         time: TimestampUs, "", "When the row was made.";
+    }
+}
+
+rows! {
+    "One row per check of an exported model: what onnxruntime answers, held against the interpreter that trained it."
+    OnnxCheckRow in "onnx_checks" version 1 sorted by [model, check, n_samples, n_frames]
+    {
+        model: String, "", "Name of the model.";
+        run: String, "", "The run that it was exported from.";
+        check: String, "", "`forward` (one prediction of the UNet), `sample` (all steps of DDIM), `guided_sample` (the same with guidance), `decode` (the decoder on what was sampled), `rounding` (all steps of DDIM with rounded weights against the trained ones).";
+        precision: String, "", "How the weights are stored: `fp32`, `fp16` or `int8`.";
+        n_samples: i32, "samples", "Motions of the batch.";
+        n_frames: i32, "frames", "Frames of each.";
+        n_steps: Option<i32>, "steps", "Steps of DDIM.";
+        guidance: Option<f64>, "", "Guidance of the sampling.";
+        max_abs: f64, "", "Largest difference, in normalised units.";
+        rms: f64, "", "Root mean square of the differences.";
+        tolerance: f64, "", "What the check allows: of `rounding` the rms, of all others the largest difference.";
+        passed: bool, "", "Whether the difference is allowed.";
+        onnx_s: Option<f64>, "s", "Time that onnxruntime took.";
+        eager_s: f64, "s", "Time that our own interpreter took.";
+        runtime: String, "", "The build of onnxruntime.";
+        time: TimestampUs, "", "When the check was made.";
     }
 }
 
@@ -206,6 +230,7 @@ pub fn all() -> Vec<TableSchema> {
         BeatRow::schema(),
         FailureRow::schema(),
         TrainingLogRow::schema(),
+        OnnxCheckRow::schema(),
     ]
 }
 

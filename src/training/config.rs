@@ -129,8 +129,18 @@ pub struct FinetuneConfig {
     pub temporal: TemporalConfig,
     /// Steps of DDIM that gradients flow through.
     pub num_steps: usize,
+    /// Sampling begins with the phrase's motion at this share of the diffusion's steps; with noise at 1.
+    pub start: f64,
     pub optimizer: OptimizerConfig,
     pub num_phrases: Option<usize>,
+}
+
+impl FinetuneConfig {
+    /// Returns the number of steps of the diffusion that sampling goes back over, at least those of DDIM.
+    pub fn first_step(&self, n_train: usize) -> usize {
+        let share = (self.start * n_train as f64).round() as usize;
+        share.clamp(self.num_steps.min(n_train), n_train)
+    }
 }
 
 /// Returns what differs between two configurations, one phrase for each setting.

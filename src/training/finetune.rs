@@ -1,9 +1,16 @@
 //! End-to-end fine-tuning: the UNet and the decoder together, with gradients through the sampler.
 //!
 //! Reference, section 7. The loss is w_diff · L_diffusion + w_dec · (L_position + L_quaternion) +
-//! w_temp · L_temporal, the last two of motion that was sampled from noise in a few steps and decoded.
+//! w_temp · L_temporal, the last two of motion that was sampled in a few steps and decoded.
+//!
+//! The reference samples from noise. There is then nothing that tells which of all motions that suit the
+//! music the phrase's is, so what is nearest to it on average is their mean, and that is what both networks
+//! learn: motion that agrees with itself because it stands still. Here sampling begins with the phrase's
+//! motion made noisy ([`FinetuneConfig::start`]), and its step knows where it should lead.
 
 use std::sync::Arc;
+
+use ndarray::ArrayViewMut2;
 
 use crate::autodiff::op::binary::{Binary, Pair};
 use crate::autodiff::op::elementwise::{Function, Map};
@@ -24,7 +31,7 @@ use super::diffusion::{Given, MOMENTS, UNET, Withhold, section, tape_seed};
 use super::drive::{Alone, Learner, Losses, Reducer, Step, Validation};
 use super::error::TrainingError;
 use super::objective::{Objective, reconstruction};
-use super::sampling::is_partial;
+use super::sampling::{is_partial, motion_view};
 use super::temporal::{TemporalLosses, temporal_losses};
 use super::window::{Batch, Windows};
 
@@ -54,15 +61,15 @@ impl Pipeline {
         (Self { unet: Arc::new(unet), decoder, takes_style }, list)
     }
 
-    /// Samples from noise by DDIM, every step of which gradients can flow through.
+    /// Samples by DDIM from step `from` − 1 on, every step of which gradients can flow through.
     ///
     /// x̂0 = A x + B p, kept within the clip range; x' = c x + d x̂0 with c = √((1 − ᾱ')/(1 − ᾱ)) and
     /// d = √ᾱ' − c √ᾱ, which is DDIM with the ε̂ that fits x̂0; the last step leads to x̂0 itself.
-    /// Steps are evenly spaced from T − 1 to 0 (reference, 7.3). Each call of the network is run again
-    /// for its gradient, so that memory is that of one call.
+    /// Steps are evenly spaced from `from` − 1 to 0; from all T of them in the reference (7.3), where `x`
+    /// is noise. Each call of the network is run again for its gradient, so that memory is that of one call.
     ///
     /// # Shapes
-    /// - `noise`, returned: \[batch, frames, 25\]
+    /// - `x`, the sample at step `from` − 1, and returned: \[batch, frames, 25\]
     ///
     /// # Errors
     /// Shapes that do not fit; a number of steps that there is not.
@@ -70,17 +77,17 @@ impl Pipeline {
         &self,
         g: &mut I,
         schedule: &Schedule,
-        n_steps: usize,
-        noise: &[f32],
+        (from, n_steps): (usize, usize),
+        x: &[f32],
         batch: &Batch,
     ) -> Result<Tensor<f32>, TrainingError> {
         let (n, frames) = (batch.n_windows, batch.n_frames);
         let n_features = batch.audio.len() / (n * frames);
-        let mut x = g.constant(&[n, frames, MOTION_DIM], noise);
+        let mut x = g.constant(&[n, frames, MOTION_DIM], x);
         let audio = g.constant(&[n, frames, n_features], &batch.audio);
         let mask = is_partial(&batch.mask).then(|| g.constant(&[n, frames], &batch.mask));
         let style = self.takes_style.then(|| g.constant(&[n, STYLE_DIM], &batch.style));
-        for step in steps(schedule.len(), n_steps, Spacing::Linspace)? {
+        for step in steps(from, n_steps, Spacing::Linspace)? {
             let t = g.constant(&[n], &vec![step.t as f32; n]);
             let mut inputs = vec![&x, &t, &audio];
             inputs.extend(&mask);
@@ -107,9 +114,9 @@ impl Pipeline {
                 }
                 None => estimate,
             };
-            let (from, to) = (schedule.level(Some(step.t)), schedule.level(step.next));
-            let c = to.noise / from.noise;
-            let d = to.signal - c * from.signal;
+            let (here, there) = (schedule.level(Some(step.t)), schedule.level(step.next));
+            let c = there.noise / here.noise;
+            let d = there.signal - c * here.signal;
             x = if step.next.is_none() {
                 estimate
             } else {
@@ -176,7 +183,7 @@ impl FinetuneLearner {
     ) -> Result<Self, TrainingError> {
         network.check()?;
         let schedule = Schedule::new(&network.diffusion)?;
-        steps(schedule.len(), config.num_steps, Spacing::Linspace)?;
+        steps(config.first_step(schedule.len()), config.num_steps, Spacing::Linspace)?;
         let (pipeline, list) = Pipeline::new(network);
         let parameters = Parameters::from_fn(list, |parameter| {
             let (source, name) = split(parameter, unet, decoder);
@@ -224,7 +231,9 @@ impl FinetuneLearner {
         // The sample begins with the same noise that was added above, turned round: independent of
         // where a network that sees only the other went, and no further draw.
         let noise: Vec<f32> = batch.noise.iter().rev().copied().collect();
-        let latent = pipeline.sample(g, schedule, c.num_steps, &noise, batch)?;
+        let from = c.first_step(schedule.len());
+        let x = if from == schedule.len() { noise } else { self.noised(batch, &noise, from - 1) };
+        let latent = pipeline.sample(g, schedule, (from, c.num_steps), &x, batch)?;
         let decoded = pipeline.decoder.forward(g, &latent)?;
         let normalizer = self.windows.normalizer();
         let found = reconstruction(g, normalizer, &decoded, &batch.motion, &batch.mask)?;
@@ -238,6 +247,24 @@ impl FinetuneLearner {
         let total = weighted_sum(g, &terms)?;
         let (position, quaternion) = (found.position, found.quaternion);
         Ok(EndToEnd { total, diffusion, position, quaternion, temporal, decoded })
+    }
+
+    /// The motion of a batch at step t of the diffusion, \[batch, frames, 25\].
+    fn noised(&self, batch: &Batch, noise: &[f32], t: usize) -> Vec<f32> {
+        let (n, frames) = (batch.n_windows, batch.n_frames);
+        let x0 = motion_view(&batch.motion, n, frames);
+        let noised = self.schedule.add_noise(x0, motion_view(noise, n, frames), &vec![t; n]);
+        noised.iter().copied().collect()
+    }
+
+    /// Motion as it will be generated: sampled from noise alone, and decoded.
+    fn generated(&self, batch: &Batch) -> Result<Tensor<f32>, TrainingError> {
+        let Self { pipeline, schedule, config, .. } = self;
+        let mut g = Eager::new(&self.parameters, &self.arena);
+        let noise: Vec<f32> = batch.noise.iter().rev().copied().collect();
+        let plan = (schedule.len(), config.num_steps);
+        let latent = pipeline.sample(&mut g, schedule, plan, &noise, batch)?;
+        Ok(pipeline.decoder.forward(&mut g, &latent)?)
     }
 
     fn differentiate(&mut self, batch: &Batch, step: u64) -> Result<Losses, TrainingError> {
@@ -275,6 +302,10 @@ fn named(found: &EndToEnd<Tensor<f32>>) -> Losses {
     let temporal = TemporalLosses::<()>::NAMES.into_iter().zip(found.temporal.all());
     parts.extend(temporal.map(|(name, loss)| (name, value(loss))));
     Losses { total: value(&found.total), parts }
+}
+
+fn norm(x: &[f32]) -> f64 {
+    x.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>().sqrt()
 }
 
 /// Mean |v − f Δp| and |a − f Δv|, and whether every turn keeps |q · q'| above a target.
@@ -344,7 +375,8 @@ impl Learner for FinetuneLearner {
                 self.losses(&mut g, &batch)
             })?;
             let mut losses = named(&found);
-            let motions = found.decoded.data().chunks_exact(batch.n_frames * MOTION_DIM);
+            let decoded = self.threads.run(|| self.generated(&batch))?;
+            let motions = decoded.data().chunks_exact(batch.n_frames * MOTION_DIM);
             let target = self.config.temporal.target_quaternion_dot;
             let measured: Vec<_> = motions
                 .zip(batch.mask.chunks_exact(batch.n_frames))
@@ -353,6 +385,17 @@ impl Learner for FinetuneLearner {
                     Coherence::of(motion, n_frames, target)
                 })
                 .collect();
+            let mut real = batch.motion.clone();
+            for motion in real.chunks_exact_mut(batch.n_frames * MOTION_DIM) {
+                let rows = ArrayViewMut2::from_shape((batch.n_frames, MOTION_DIM), motion);
+                self.windows.normalizer().denormalize(rows.expect("frames of 25 channels"));
+            }
+            let speed = |frames: &[f32]| -> f64 {
+                let rows = frames.chunks_exact(MOTION_DIM).zip(&batch.mask);
+                let counted = rows.filter(|(_, w)| **w > 0.0);
+                counted.map(|(row, _)| norm(&row[Channel::Velocity.range()])).sum()
+            };
+            let speed_ratio = speed(decoded.data()) / speed(&real).max(f64::MIN_POSITIVE);
             let mean = |of: &dyn Fn(&Coherence) -> f64| {
                 measured.iter().map(of).sum::<f64>() / measured.len() as f64
             };
@@ -360,6 +403,7 @@ impl Learner for FinetuneLearner {
                 ("velocity_error", mean(&|c| c.velocity_m_s)),
                 ("acceleration_error", mean(&|c| c.acceleration_m_s2)),
                 ("quaternion_pass_rate", mean(&|c| f64::from(u8::from(c.is_smooth)))),
+                ("speed_ratio", speed_ratio),
             ]);
             sum.add(&losses, 1.0 / n as f64);
         }

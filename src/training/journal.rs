@@ -137,6 +137,7 @@ impl<'a> Journal<'a> {
             velocity_error: part("velocity_error"),
             acceleration_error: part("acceleration_error"),
             quaternion_pass_rate: part("quaternion_pass_rate"),
+            speed_ratio: part("speed_ratio"),
             gradient_norm: entry.taken.and_then(|taken| finite(taken.gradient_norm)),
             skipped: entry.is_skipped,
             samples_per_s: entry.samples_per_s,

@@ -112,7 +112,7 @@ fn a_run_that_was_not_trained_is_refused() {
     assert_eq!(output.code, 0, "{output:?}");
     assert_eq!(
         said("run", &["--num-steps=0"]),
-        "error: n_steps of the sampler is 0; it must be 1 to 1000, the number of steps that the network \
+        "error: n_steps of the sampler is 0; it must be 1 to 500, the number of steps that the network \
          was trained on"
     );
     assert_eq!(

@@ -207,6 +207,7 @@ fn config(num_steps: usize, [diffusion, decoder, temporal]: [f64; 3]) -> Finetun
         temporal_weight: temporal,
         temporal: TemporalConfig::default(),
         num_steps,
+        start: 1.0,
         optimizer: OptimizerConfig::default(),
         num_phrases: None,
     }

@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use anyhow::{bail, ensure};
 
+use super::trained::best;
 use super::{ClientParams, Contract, Progress, Stage, Summary};
 use crate::autodiff::{Arena, Parameters};
 use crate::diffusion::Schedule;
@@ -392,28 +393,7 @@ pub fn best_unet(
     run: &str,
     list: crate::model::ParameterList,
 ) -> Result<Parameters<f32>, TrainingError> {
-    best_section(checkpoints, run, "unet.", "trained UNet", list)
-}
-
-/// Reads weights of a run that validated best, by the beginning of their names.
-///
-/// # Errors
-/// When there are none, or they are of another network.
-pub fn best_section(
-    checkpoints: &Checkpoints,
-    run: &str,
-    prefix: &str,
-    what: &'static str,
-    list: crate::model::ParameterList,
-) -> Result<Parameters<f32>, TrainingError> {
-    let Some(&step) = checkpoints.steps(Kind::Best)?.last() else {
-        let way_out = format!("run motiongen train --run {run} to the end first");
-        return Err(TrainingError::Missing { run: run.to_owned(), what, way_out });
-    };
-    checkpoints.read(Kind::Best, step, |archive, place| {
-        let place = place.to_owned();
-        archive.section(prefix, list).map_err(|source| TrainingError::Weights { place, source })
-    })
+    Ok(best(checkpoints, run, "unet.", "trained UNet", list)?.parameters)
 }
 
 /// Returns the command that goes on where this one stopped.

@@ -1,13 +1,17 @@
-//! `model`: what a network consists of and costs.
+//! `model`: what a network consists of and costs, or what an exported model is.
+
+mod exported;
 
 use std::io::{self, Write};
 
 use anyhow::ensure;
 
-use super::{Contract, Progress, Stage, Summary};
+use super::model_files::EngineParams;
+use super::{ClientParams, Contract, Progress, Stage, Summary};
 use crate::model::{
     DecoderConfig, Kept, Layer, MotionDecoder, Outline, Preset, UNet1D, UNetConfig, UNetInputs,
 };
+use crate::store::Location;
 
 /// The stage.
 pub struct Model;
@@ -36,16 +40,32 @@ pub struct Params {
     /// Motions of a training batch.
     #[arg(long, value_name = "N", default_value_t = 8)]
     pub batch_size: usize,
+    /// Folder or bucket of an exported model.
+    #[arg(long, value_name = "URL", requires = "model")]
+    pub store: Option<String>,
+    /// Tell of this exported model instead: what it is, whether its files are whole, how fast it runs here.
+    #[arg(long, value_name = "NAME", requires = "store", conflicts_with_all = ["preset", "network", "batch_size"])]
+    pub model: Option<String>,
+    #[command(flatten)]
+    pub engine: EngineParams,
+    #[command(flatten)]
+    pub client: ClientParams,
 }
 
 impl Stage for Model {
     const NAME: &'static str = "model";
-    const ABOUT: &'static str = "print a network's layers, parameters, FLOPs and memory";
-    const CONTRACT: Contract = Contract { reads: "nothing", writes: "standard output" };
+    const ABOUT: &'static str =
+        "print what a network consists of and costs, or what an exported model is";
+    const CONTRACT: Contract =
+        Contract { reads: "nothing, or models/<model>/", writes: "standard output" };
     type Params = Params;
 
-    fn run(params: Params, _progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
+    fn run(params: Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
         ensure!(params.frames > 0, "--frames is 0; a motion has at least one frame");
+        if let (Some(store), Some(model)) = (&params.store, &params.model) {
+            let store = Location::open(store, &params.client.options())?;
+            return exported::look(&store, model, params.frames, &params.engine, progress);
+        }
         ensure!(params.batch_size > 0, "--batch-size is 0; a batch has at least one motion");
         let one = follow(&params, 1, false)?;
         let kept = follow(&params, params.batch_size, false)?.kept;

@@ -1,0 +1,110 @@
+//! The engine that is always there: our own interpreter.
+
+use std::num::NonZeroUsize;
+
+use ndarray::{Array3, ArrayView3};
+
+use crate::audio::FeatureScale;
+use crate::autodiff::{Arena, Eager, Parameters, Tensor, Threads};
+use crate::model::{MotionDecoder, UNet1D, UNetInputs};
+
+use super::engine::{Engine, EngineError, Inputs};
+use super::pool::Pool;
+
+/// Runs a model by the interpreter that trains it.
+pub struct EagerEngine {
+    unet: UNet1D,
+    unet_parameters: Parameters<f32>,
+    takes_style: bool,
+    decoder: MotionDecoder,
+    decoder_parameters: Parameters<f32>,
+    scale: FeatureScale,
+    workers: Pool<Worker>,
+}
+
+struct Worker {
+    threads: Threads,
+    arena: Arena<f32>,
+}
+
+impl EagerEngine {
+    /// Makes an engine of `n_workers` that have `n_threads` each.
+    ///
+    /// # Errors
+    /// When the system gives no threads.
+    pub fn new(
+        (unet, unet_parameters): (UNet1D, Parameters<f32>),
+        (decoder, decoder_parameters): (MotionDecoder, Parameters<f32>),
+        takes_style: bool,
+        scale: FeatureScale,
+        (n_workers, n_threads): (NonZeroUsize, NonZeroUsize),
+    ) -> std::io::Result<Self> {
+        let worker =
+            |_| Ok(Worker { threads: Threads::start(n_threads)?, arena: Arena::default() });
+        let workers = (0..n_workers.get()).map(worker).collect::<std::io::Result<Vec<_>>>()?;
+        let workers = Pool::new(workers);
+        Ok(Self { unet, unet_parameters, takes_style, decoder, decoder_parameters, scale, workers })
+    }
+}
+
+impl Engine for EagerEngine {
+    fn name(&self) -> &'static str {
+        "eager"
+    }
+
+    fn n_workers(&self) -> usize {
+        self.workers.len()
+    }
+
+    fn predict(&self, inputs: &Inputs) -> Result<Array3<f32>, EngineError> {
+        inputs.check(self.scale.centre.len())?;
+        let (batch, frames, channels) = inputs.x.dim();
+        let n_features = self.scale.centre.len();
+        let mut audio = inputs.audio.as_standard_layout().into_owned();
+        let rows = audio.view_mut().into_shape_with_order((batch * frames, n_features));
+        self.scale.apply(rows.expect("in order"));
+        let x = inputs.x.as_standard_layout();
+        let t: Vec<f32> = inputs.t.iter().map(|&t| t as f32).collect();
+        let drop: Vec<f32> = inputs.drop_audio.iter().map(|&d| f32::from(u8::from(d))).collect();
+        let style = inputs.style.filter(|_| self.takes_style);
+        self.workers.with(|Worker { threads, arena }| {
+            threads.run(|| {
+                let mut g = Eager::new(&self.unet_parameters, arena);
+                let x = g.input(&[batch, frames, channels], x.as_slice().expect("in order"));
+                let t = g.input(&[batch], &t);
+                let audio =
+                    g.input(&[batch, frames, n_features], audio.as_slice().expect("in order"));
+                let drop = (!drop.is_empty()).then(|| g.input(&[batch], &drop));
+                let style = style.map(|style| {
+                    let values: Vec<f32> = style.iter().copied().collect();
+                    g.input(style.shape(), &values)
+                });
+                let inputs = UNetInputs {
+                    x: &x,
+                    t: &t,
+                    audio: &audio,
+                    drop_audio: drop.as_ref(),
+                    mask: None,
+                    style: style.as_ref(),
+                };
+                Ok(to_array(&self.unet.forward(&mut g, inputs)?))
+            })
+        })
+    }
+
+    fn decode(&self, latent: ArrayView3<f32>) -> Result<Array3<f32>, EngineError> {
+        let latent = latent.as_standard_layout();
+        self.workers.with(|Worker { threads, arena }| {
+            threads.run(|| {
+                let mut g = Eager::new(&self.decoder_parameters, arena);
+                let x = g.input(latent.shape(), latent.as_slice().expect("in order"));
+                Ok(to_array(&self.decoder.forward(&mut g, &x)?))
+            })
+        })
+    }
+}
+
+fn to_array(x: &Tensor<f32>) -> Array3<f32> {
+    let [a, b, c] = x.shape() else { unreachable!("networks return three axes") };
+    Array3::from_shape_vec((*a, *b, *c), x.data().to_vec()).expect("as many as its shape says")
+}

@@ -1,0 +1,79 @@
+//! What samplers ask of a model, whoever carries it out.
+
+use ndarray::{Array3, ArrayView2, ArrayView3};
+
+use crate::diffusion::DiffusionError;
+use crate::model::GraphError;
+use crate::onnx::OnnxError;
+
+/// What a prediction is made from.
+#[derive(Clone, Copy, Debug)]
+pub struct Inputs<'a> {
+    /// Noisy motion, normalised, \[batch, frames, 25\].
+    pub x: ArrayView3<'a, f32>,
+    /// Step of each sample, \[batch\].
+    pub t: &'a [usize],
+    /// Features as the table has them, \[batch, frames, 163\].
+    pub audio: ArrayView3<'a, f32>,
+    /// Samples that go without music, \[batch\]; nobody where empty.
+    pub drop_audio: &'a [bool],
+    /// Normalised style, \[batch, 8\], for a network that takes one.
+    pub style: Option<ArrayView2<'a, f32>>,
+}
+
+/// Why a model gave no answer.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum EngineError {
+    #[error(transparent)]
+    Graph(#[from] GraphError),
+    #[error(transparent)]
+    Onnx(#[from] OnnxError),
+    #[error(transparent)]
+    Diffusion(#[from] DiffusionError),
+    #[error("{what} is {found:?}, {expected:?} is needed")]
+    Shape { what: &'static str, found: Vec<usize>, expected: Vec<usize> },
+}
+
+/// Runs the two networks of a model.
+///
+/// Calls may come from several threads; up to [`Engine::n_workers`] of them run at once.
+pub trait Engine: Sync {
+    /// Returns the name that flags and tables use.
+    fn name(&self) -> &'static str;
+
+    /// Returns how many calls run at once.
+    fn n_workers(&self) -> usize;
+
+    /// Predicts, in normalised units. → \[batch, frames, 25\]
+    ///
+    /// # Errors
+    /// Shapes that do not fit, or what the runtime says.
+    fn predict(&self, inputs: &Inputs) -> Result<Array3<f32>, EngineError>;
+
+    /// Decodes latents to motion, \[batch, frames, 25\] → \[batch, frames, 25\] in metres, seconds, radians.
+    ///
+    /// # Errors
+    /// Shapes that do not fit, or what the runtime says.
+    fn decode(&self, latent: ArrayView3<f32>) -> Result<Array3<f32>, EngineError>;
+}
+
+impl Inputs<'_> {
+    /// Refuses inputs whose sizes do not fit each other.
+    pub(super) fn check(&self, n_features: usize) -> Result<(), EngineError> {
+        let (batch, frames, _) = self.x.dim();
+        let expect = |what, found: &[usize], expected: &[usize]| {
+            if found == expected {
+                return Ok(());
+            }
+            let (found, expected) = (found.to_vec(), expected.to_vec());
+            Err(EngineError::Shape { what, found, expected })
+        };
+        expect("the shape of the features", self.audio.shape(), &[batch, frames, n_features])?;
+        expect("the number of steps", &[self.t.len()], &[batch])?;
+        if !self.drop_audio.is_empty() {
+            expect("the number of samples without music", &[self.drop_audio.len()], &[batch])?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,21 @@
+//! From an exported model to motion: engines that run it, and what is sampled with them.
+//!
+//! An [`Engine`] answers what the networks say; [`sample`] asks it step by step. [`ModelCard`] is what a
+//! model's folder says of itself.
+
+mod card;
+mod eager;
+mod engine;
+mod pool;
+mod runtime;
+mod sampling;
+
+pub use card::{
+    CardError, FileEntry, MODEL_FORMAT, ModelCard, Networks, Provenance, file_names, own_channels,
+    own_features,
+};
+pub use eager::EagerEngine;
+pub use engine::{Engine, EngineError, Inputs};
+pub use pool::Pool;
+pub use runtime::{OnnxEngine, SessionPlan};
+pub use sampling::{Sampling, sample};

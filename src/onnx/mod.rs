@@ -1,0 +1,26 @@
+//! Networks as ONNX files: written, checked, read back, and run through onnxruntime.
+//!
+//! [`Builder`] is the [`Graph`](crate::model::Graph) that writes nodes, so what is exported is what was
+//! trained. [`Runtime`] finds and loads onnxruntime, [`Session`] runs a file. Only this room names `ort`
+//! and `prost`.
+
+mod builder;
+mod check;
+mod error;
+mod file;
+mod networks;
+mod operations;
+mod proto;
+mod runtime;
+mod session;
+mod weights;
+
+pub use builder::{Axes, Builder, Form, Storage, Value};
+pub use check::check;
+pub use error::OnnxError;
+pub use file::{EMBEDDED_BYTES, Encoded, IR_VERSION, ModelFile, OPSET};
+pub use networks::{DecoderNames, UNetNames, decoder, unet};
+pub use proto::{Graph, Model};
+pub use runtime::{Device, PINNED_VERSION, Runtime};
+pub use session::{Numbers, Session, SessionOptions, Tensor};
+pub use weights::values_of;

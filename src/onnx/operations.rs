@@ -1,0 +1,612 @@
+//! What each operation of a network is in ONNX.
+//!
+//! The forms were chosen by measurement (docs/onnx.md): convolutions over an image of one row,
+//! normalisation by groups as normalisation of instances of a reshaped tensor, attention as two
+//! products around a softmax.
+
+use std::ops::Range;
+use std::sync::Arc;
+
+use ndarray::Array2;
+
+use crate::model::{
+    Activation, Attention, Channels, Convolution, Graph, GraphError, GroupNormalization,
+    ParameterId, Result,
+};
+
+use super::builder::{Axes, Builder, Form, Use, Value, expect, float, integer, integers, word};
+use super::proto::DataType;
+
+/// What is added to the score of a key that does not count: e^(it) is 0 in f32.
+const MASKED: f64 = -1e9;
+
+impl Builder<'_> {
+    /// The axis of frames behind the channels.
+    fn frames_axis(&self) -> i64 {
+        match self.form {
+            Form::Line => 2,
+            Form::Image => 3,
+        }
+    }
+
+    /// The shape that has channels before frames, for `Reshape`: 0 keeps the batch, −1 is the frames.
+    fn frames_shape(&mut self, channels: usize) -> String {
+        match self.form {
+            Form::Line => self.integers(&[0, channels as i64, -1]),
+            Form::Image => self.integers(&[0, channels as i64, 1, -1]),
+        }
+    }
+
+    /// \[batch, channels\] → \[batch, channels, 1\] or \[batch, channels, 1, 1\]
+    fn beside_frames(&mut self, vector: &str) -> String {
+        let axes = match self.form {
+            Form::Line => self.integers(&[2]),
+            Form::Image => self.integers(&[2, 3]),
+        };
+        self.node("Unsqueeze", &[vector, &axes], vec![])
+    }
+
+    fn binary(&mut self, operation: &'static str, a: Value, b: Value) -> Result<Value> {
+        let op_type = if operation == "add" { "Add" } else { "Mul" };
+        self.begin(operation, None);
+        let channels = a.channels.max(b.channels);
+        match (a.axes, b.axes) {
+            (Axes::Frames, Axes::Frames) if !(self.has_last(a) && self.has_last(b)) => {
+                let (a, b) = (self.first(operation, a)?, self.first(operation, b)?);
+                let y = self.node(op_type, &[&a, &b], vec![]);
+                Ok(self.new_first(channels, y))
+            }
+            (x, y) if x == y || y == Axes::Channels || x == Axes::Channels => {
+                let axes = if x == Axes::Channels { y } else { x };
+                let (a, b) = (self.last(a)?, self.last(b)?);
+                let y = self.node(op_type, &[&a, &b], vec![]);
+                Ok(self.new_last(axes, channels, y))
+            }
+            (a, b) => Err(GraphError::shape(
+                operation,
+                format!("inputs have axes {a:?} and {b:?}, of which neither repeats the other"),
+            )),
+        }
+    }
+
+    fn activate(&mut self, x: &str, activation: Activation) -> String {
+        match activation {
+            Activation::Identity => x.to_owned(),
+            Activation::Silu => {
+                let s = self.node("Sigmoid", &[x], vec![]);
+                self.node("Mul", &[x, &s], vec![])
+            }
+            Activation::Gelu => self.node("Gelu", &[x], vec![word("approximate", "none")]),
+            Activation::Relu => self.node("Relu", &[x], vec![]),
+            Activation::LeakyRelu { slope } => {
+                self.node("LeakyRelu", &[x], vec![float("alpha", slope)])
+            }
+            Activation::Mish => self.node("Mish", &[x], vec![]),
+            Activation::Tanh => self.node("Tanh", &[x], vec![]),
+            Activation::Sigmoid => self.node("Sigmoid", &[x], vec![]),
+        }
+    }
+
+    /// Applies what is said of a name to a value, in the form that it has.
+    fn map(
+        &mut self,
+        x: Value,
+        channels: usize,
+        f: impl FnOnce(&mut Self, &str) -> String,
+    ) -> Result<Value> {
+        if x.axes == Axes::Frames && !self.has_last(x) {
+            let name = self.first("map", x)?;
+            let y = f(self, &name);
+            return Ok(self.new_first(channels, y));
+        }
+        let name = self.last(x)?;
+        let y = f(self, &name);
+        Ok(self.new_last(x.axes, channels, y))
+    }
+
+    /// The axis of a value's channels, in the form that [`Self::map`] chooses.
+    fn channels_axis(&self, x: Value) -> i64 {
+        if x.axes == Axes::Frames && !self.has_last(x) { 1 } else { -1 }
+    }
+
+    /// A part of a tensor's channels as \[batch, heads, channels of a head, frames\].
+    fn heads(&mut self, part: &Channels<'_, Value>, width: usize, heads: usize) -> Result<String> {
+        let x = self.first("attention", *part.tensor)?;
+        let x = if (part.first, width) == (0, part.tensor.channels) {
+            x
+        } else {
+            let [starts, ends, axes] =
+                [part.first, part.first + width, 1].map(|n| self.integers(&[n as i64]));
+            self.node("Slice", &[&x, &starts, &ends, &axes], vec![])
+        };
+        let shape = self.integers(&[0, heads as i64, (width / heads) as i64, -1]);
+        Ok(self.node("Reshape", &[&x, &shape], vec![]))
+    }
+
+    /// Frames of a value, a vector of one number.
+    fn n_frames(&mut self, x: Value) -> Result<String> {
+        let (name, axis) = if self.has_last(x) || x.axes != Axes::Frames {
+            (self.last(x)?, 1)
+        } else {
+            (self.first("frames", x)?, self.frames_axis())
+        };
+        let ends = vec![integer("start", axis), integer("end", axis + 1)];
+        Ok(self.node("Shape", &[&name], ends))
+    }
+
+    /// Frames that are missing up to a multiple: (m − n mod m) mod m.
+    fn n_missing(&mut self, frames: &str, multiple: usize) -> String {
+        let m = self.integers(&[multiple as i64]);
+        let rest = self.node("Mod", &[frames, &m], vec![]);
+        let missing = self.node("Sub", &[&m, &rest], vec![]);
+        self.node("Mod", &[&missing, &m], vec![])
+    }
+
+    /// 0, 1, … for a number of frames, a vector of one number.
+    fn places(&mut self, frames: &str) -> String {
+        let axes = self.integers(&[0]);
+        let end = self.node("Squeeze", &[frames, &axes], vec![]);
+        let (start, step) = (self.integer(0), self.integer(1));
+        self.node("Range", &[&start, &end, &step], vec![])
+    }
+
+    /// Subtracts a centre from each channel and divides by a scale.
+    pub(super) fn standardized(
+        &mut self,
+        x: Value,
+        centre: &[f32],
+        scale: &[f32],
+    ) -> Result<Value> {
+        self.begin("standardize", None);
+        let n = x.channels;
+        if centre.len() != n || scale.len() != n {
+            let problem = format!("input has {n} channels, its scale has {}", scale.len());
+            return Err(GraphError::shape("standardize", problem));
+        }
+        let centre = self.numbers("scale/centre", &[n], centre);
+        let scale = self.numbers("scale/scale", &[n], scale);
+        let name = self.last(x)?;
+        let y = self.node("Sub", &[&name, &centre], vec![]);
+        let y = self.node("Div", &[&y, &scale], vec![]);
+        Ok(self.new_last(x.axes, n, y))
+    }
+
+    fn cast(&mut self, x: &str, to: DataType) -> String {
+        self.node("Cast", &[x], vec![integer("to", to as i64)])
+    }
+
+    /// Rows of a table by index.
+    fn rows(&mut self, table: &str, index: Value, channels: usize) -> Result<Value> {
+        let mut name = self.last(index)?;
+        if !index.integer {
+            name = self.cast(&name, DataType::Int64);
+        }
+        let y = self.node("Gather", &[table, &name], vec![]);
+        let axes = if index.axes == Axes::Batch { Axes::Samples } else { Axes::Frames };
+        Ok(self.new_last(axes, channels, y))
+    }
+
+    /// The mask as what is added to scores, \[batch, 1, 1, keys\].
+    fn bias(&mut self, mask: Value) -> Result<String> {
+        let mask = self.last(mask)?;
+        let (one, factor) = (self.number(1.0), self.number(-MASKED));
+        let less = self.node("Sub", &[&mask, &one], vec![]);
+        let bias = self.node("Mul", &[&less, &factor], vec![]);
+        let axes = self.integers(&[1, 2]);
+        Ok(self.node("Unsqueeze", &[&bias, &axes], vec![]))
+    }
+
+    /// \[queries, keys\], [`MASKED`] where the key comes after the query.
+    fn causal_bias(&mut self, query: Value, key: Value) -> Result<String> {
+        let (n_queries, n_keys) = (self.n_frames(query)?, self.n_frames(key)?);
+        let (queries, keys) = (self.places(&n_queries), self.places(&n_keys));
+        let axes = self.integers(&[1]);
+        let queries = self.node("Unsqueeze", &[&queries, &axes], vec![]);
+        let later = self.node("Less", &[&queries, &keys], vec![]);
+        let later = self.cast(&later, DataType::Float);
+        let factor = self.number(MASKED);
+        Ok(self.node("Mul", &[&later, &factor], vec![]))
+    }
+
+    fn product(
+        &mut self,
+        x: Value,
+        weight: ParameterId,
+        bias: Option<ParameterId>,
+        convolution: Convolution,
+    ) -> Result<Value> {
+        let outputs = self.outputs("conv1d", x, weight)?;
+        let name = self.first("conv1d", x)?;
+        let Convolution { taps, stride, padding, dilation } = convolution;
+        let [taps, stride, padding, dilation] = [taps, stride, padding, dilation].map(|n| n as i64);
+        let along = |n: i64, other: i64| match self.form {
+            Form::Line => vec![n],
+            Form::Image => vec![other, n],
+        };
+        let pads = match self.form {
+            Form::Line => vec![padding, padding],
+            Form::Image => vec![0, padding, 0, padding],
+        };
+        let attributes = vec![
+            integers("kernel_shape", &along(taps, 1)),
+            integers("strides", &along(stride, 1)),
+            integers("dilations", &along(dilation, 1)),
+            integers("pads", &pads),
+        ];
+        let mut inputs = vec![name, self.weight(weight, Use::Convolution)];
+        if let Some(bias) = bias {
+            inputs.push(self.weight(bias, Use::Plain));
+        }
+        let inputs: Vec<&str> = inputs.iter().map(String::as_str).collect();
+        let y = self.node("Conv", &inputs, attributes);
+        Ok(self.new_first(outputs, y))
+    }
+
+    /// Returns the outputs of a weight, and checks its inputs.
+    fn outputs(&self, operation: &'static str, x: Value, weight: ParameterId) -> Result<usize> {
+        let parameter = self.list.get(weight);
+        match parameter.shape.as_slice() {
+            &[outputs, inputs, ..] if inputs == x.channels => Ok(outputs),
+            shape => Err(GraphError::shape(
+                operation,
+                format!("input has {} channels, {} has {shape:?}", x.channels, parameter.name),
+            )),
+        }
+    }
+}
+
+impl Graph for Builder<'_> {
+    type Tensor = Value;
+
+    fn parameter(&mut self, id: ParameterId) -> Result<Value> {
+        self.begin("parameter", Some(id));
+        let channels = self.list.get(id).len();
+        let name = self.weight(id, Use::Plain);
+        Ok(self.new_last(Axes::Channels, channels, name))
+    }
+
+    fn linear(
+        &mut self,
+        x: &Value,
+        weight: ParameterId,
+        bias: Option<ParameterId>,
+    ) -> Result<Value> {
+        self.begin("linear", Some(weight));
+        let outputs = self.outputs("linear", *x, weight)?;
+        if x.axes == Axes::Frames && !self.has_last(*x) {
+            let one = Convolution { taps: 1, stride: 1, padding: 0, dilation: 1 };
+            return self.product(*x, weight, bias, one);
+        }
+        let name = self.last(*x)?;
+        let weight = self.weight(weight, Use::Transposed);
+        let mut y = self.node("MatMul", &[&name, &weight], vec![]);
+        if let Some(bias) = bias {
+            let bias = self.weight(bias, Use::Plain);
+            y = self.node("Add", &[&y, &bias], vec![]);
+        }
+        Ok(self.new_last(x.axes, outputs, y))
+    }
+
+    fn conv1d(
+        &mut self,
+        x: &Value,
+        weight: ParameterId,
+        bias: Option<ParameterId>,
+        convolution: Convolution,
+    ) -> Result<Value> {
+        self.begin("conv1d", Some(weight));
+        self.product(*x, weight, bias, convolution)
+    }
+
+    fn group_norm(
+        &mut self,
+        x: &Value,
+        norm: GroupNormalization,
+        film: Option<&Value>,
+        activation: Activation,
+    ) -> Result<Value> {
+        self.begin("group_norm", Some(norm.weight));
+        let name = self.first("group_norm", *x)?;
+        let groups = norm.groups;
+        let shape = self.integers(&[0, groups as i64, -1]);
+        let grouped = self.node("Reshape", &[&name, &shape], vec![]);
+        let ones = self.numbers(&format!("constant/ones_{groups}"), &[groups], &vec![1.0; groups]);
+        let zeros =
+            self.numbers(&format!("constant/zeros_{groups}"), &[groups], &vec![0.0; groups]);
+        let epsilon = vec![float("epsilon", norm.epsilon)];
+        let normed = self.node("InstanceNormalization", &[&grouped, &ones, &zeros], epsilon);
+        let shape = self.frames_shape(x.channels);
+        let normed = self.node("Reshape", &[&normed, &shape], vec![]);
+        let (gain, shift) = match film {
+            None => {
+                let gain = self.weight(norm.weight, Use::AlongChannels);
+                (gain, self.weight(norm.bias, Use::AlongChannels))
+            }
+            Some(film) => {
+                // (γ x̂ + β)(1 + s) + h = x̂ · γ(1 + s) + (β(1 + s) + h): two passes instead of four.
+                expect("group_norm", *film, Axes::Samples)?;
+                let film = self.last(*film)?;
+                let halves = vec![integer("axis", 1), integer("num_outputs", 2)];
+                let halves = self.nodes_of("Split", &[&film], halves, 2);
+                let one = self.number(1.0);
+                let scale = self.node("Add", &[&halves[0], &one], vec![]);
+                let gain = self.weight(norm.weight, Use::Plain);
+                let gain = self.node("Mul", &[&scale, &gain], vec![]);
+                let bias = self.weight(norm.bias, Use::Plain);
+                let bias = self.node("Mul", &[&scale, &bias], vec![]);
+                let shift = self.node("Add", &[&bias, &halves[1]], vec![]);
+                (self.beside_frames(&gain), self.beside_frames(&shift))
+            }
+        };
+        let y = self.node("Mul", &[&normed, &gain], vec![]);
+        let y = self.node("Add", &[&y, &shift], vec![]);
+        let y = self.activate(&y, activation);
+        Ok(self.new_first(x.channels, y))
+    }
+
+    fn layer_norm(
+        &mut self,
+        x: &Value,
+        affine: Option<[ParameterId; 2]>,
+        epsilon: f64,
+    ) -> Result<Value> {
+        self.begin("layer_norm", affine.map(|[weight, _]| weight));
+        let name = self.last(*x)?;
+        let n = x.channels;
+        let [weight, bias] = match affine {
+            Some(affine) => affine.map(|id| self.weight(id, Use::Plain)),
+            None => [("ones", 1.0), ("zeros", 0.0)].map(|(what, value)| {
+                self.numbers(&format!("constant/{what}_{n}"), &[n], &vec![value; n])
+            }),
+        };
+        let attributes = vec![integer("axis", -1), float("epsilon", epsilon)];
+        let y = self.node("LayerNormalization", &[&name, &weight, &bias], attributes);
+        Ok(self.new_last(x.axes, n, y))
+    }
+
+    fn activation(&mut self, x: &Value, activation: Activation) -> Result<Value> {
+        self.begin("activation", None);
+        self.map(*x, x.channels, |g, x| g.activate(x, activation))
+    }
+
+    fn attention(&mut self, attention: Attention<Value>) -> Result<Value> {
+        self.begin("attention", None);
+        let Attention { query, key, value, width, heads, key_mask, causal } = attention;
+        let q = self.heads(&query, width, heads)?;
+        let k = self.heads(&key, width, heads)?;
+        let v = self.heads(&value, width, heads)?;
+        let swap = || vec![integers("perm", &[0, 1, 3, 2])];
+        let q = self.node("Transpose", &[&q], swap());
+        let scores = self.node("MatMul", &[&q, &k], vec![]);
+        let factor = self.number(1.0 / ((width / heads) as f64).sqrt());
+        let mut scores = self.node("Mul", &[&scores, &factor], vec![]);
+        if let Some(mask) = key_mask {
+            let bias = self.bias(*mask)?;
+            scores = self.node("Add", &[&scores, &bias], vec![]);
+        }
+        if causal {
+            let bias = self.causal_bias(*query.tensor, *key.tensor)?;
+            scores = self.node("Add", &[&scores, &bias], vec![]);
+        }
+        let weights = self.node("Softmax", &[&scores], vec![integer("axis", -1)]);
+        let weights = self.node("Transpose", &[&weights], swap());
+        let y = self.node("MatMul", &[&v, &weights], vec![]);
+        let shape = self.frames_shape(width);
+        let y = self.node("Reshape", &[&y, &shape], vec![]);
+        Ok(self.new_first(width, y))
+    }
+
+    fn add(&mut self, a: &Value, b: &Value) -> Result<Value> {
+        self.binary("add", *a, *b)
+    }
+
+    fn mul(&mut self, a: &Value, b: &Value) -> Result<Value> {
+        self.binary("mul", *a, *b)
+    }
+
+    fn add_to_frames(&mut self, x: &Value, v: &Value) -> Result<Value> {
+        self.begin("add_to_frames", None);
+        expect("add_to_frames", *v, Axes::Samples)?;
+        let (x_name, v_name) = (self.first("add_to_frames", *x)?, self.last(*v)?);
+        let v_name = self.beside_frames(&v_name);
+        let y = self.node("Add", &[&x_name, &v_name], vec![]);
+        Ok(self.new_first(x.channels, y))
+    }
+
+    fn scale(&mut self, x: &Value, factor: f64) -> Result<Value> {
+        self.begin("scale", None);
+        let factor = self.number(factor);
+        self.map(*x, x.channels, |g, x| g.node("Mul", &[x, &factor], vec![]))
+    }
+
+    fn concat(&mut self, parts: &[&Value]) -> Result<Value> {
+        self.begin("concat", None);
+        let Some(&&one) = parts.first() else {
+            return Err(GraphError::shape("concat", "has no inputs"));
+        };
+        for part in parts {
+            expect("concat", **part, one.axes)?;
+        }
+        let channels = parts.iter().map(|part| part.channels).sum();
+        let is_first = one.axes == Axes::Frames && !parts.iter().all(|x| self.has_last(**x));
+        let names: Vec<String> = parts
+            .iter()
+            .map(|x| if is_first { self.first("concat", **x) } else { self.last(**x) })
+            .collect::<Result<_>>()?;
+        let names: Vec<&str> = names.iter().map(String::as_str).collect();
+        let axis = vec![integer("axis", if is_first { 1 } else { -1 })];
+        let y = self.node("Concat", &names, axis);
+        Ok(if is_first {
+            self.new_first(channels, y)
+        } else {
+            self.new_last(one.axes, channels, y)
+        })
+    }
+
+    fn channels(&mut self, x: &Value, range: Range<usize>) -> Result<Value> {
+        self.begin("channels", None);
+        if range.start > range.end || range.end > x.channels {
+            let problem = format!("input has {} channels, {range:?} is taken", x.channels);
+            return Err(GraphError::shape("channels", problem));
+        }
+        let axis = self.channels_axis(*x);
+        let [starts, ends, axes] =
+            [range.start as i64, range.end as i64, axis].map(|n| self.integers(&[n]));
+        self.map(*x, range.len(), |g, x| g.node("Slice", &[x, &starts, &ends, &axes], vec![]))
+    }
+
+    fn upsample(&mut self, x: &Value, factor: usize) -> Result<Value> {
+        self.begin("upsample", None);
+        let name = self.first("upsample", *x)?;
+        let n = factor as f32;
+        let scales = match self.form {
+            Form::Line => self.numbers(&format!("constant/times_{factor}"), &[3], &[1.0, 1.0, n]),
+            Form::Image => {
+                self.numbers(&format!("constant/times_{factor}"), &[4], &[1.0, 1.0, 1.0, n])
+            }
+        };
+        let attributes = vec![
+            word("mode", "nearest"),
+            word("coordinate_transformation_mode", "asymmetric"),
+            word("nearest_mode", "floor"),
+        ];
+        let y = self.node("Resize", &[&name, "", &scales], attributes);
+        Ok(self.new_first(x.channels, y))
+    }
+
+    fn gather(&mut self, table: &Arc<Array2<f64>>, index: &Value) -> Result<Value> {
+        self.begin("gather", None);
+        let (rows, columns) = table.dim();
+        let values: Vec<f32> = table.iter().map(|&x| x as f32).collect();
+        let name = self.table(&[rows, columns], &values);
+        self.rows(&name, *index, columns)
+    }
+
+    fn embedding(&mut self, table: ParameterId, index: &Value) -> Result<Value> {
+        self.begin("embedding", Some(table));
+        let channels = self.list.get(table).shape.last().copied().unwrap_or(0);
+        let table = self.weight(table, Use::Plain);
+        self.rows(&table, *index, channels)
+    }
+
+    fn dropout(&mut self, x: &Value, _probability: f64) -> Result<Value> {
+        Ok(*x)
+    }
+
+    fn select(&mut self, choice: &Value, other: &Value, x: &Value) -> Result<Value> {
+        self.begin("select", None);
+        expect("select", *choice, Axes::Batch)?;
+        expect("select", *other, Axes::Channels)?;
+        expect("select", *x, Axes::Frames)?;
+        let (choice, other, name) = (self.last(*choice)?, self.last(*other)?, self.last(*x)?);
+        let (zero, axes) = (self.number(0.0), self.integers(&[1, 2]));
+        let chosen = self.node("Greater", &[&choice, &zero], vec![]);
+        let chosen = self.node("Unsqueeze", &[&chosen, &axes], vec![]);
+        let y = self.node("Where", &[&chosen, &other, &name], vec![]);
+        Ok(self.new_last(Axes::Frames, x.channels, y))
+    }
+
+    fn normalize(&mut self, x: &Value, epsilon: f64) -> Result<Value> {
+        self.begin("normalize", None);
+        let (axes, epsilon) = (self.channels_axis(*x), self.number(epsilon));
+        let axes = self.integers(&[axes]);
+        self.map(*x, x.channels, |g, x| {
+            let norm = g.node("ReduceL2", &[x, &axes], vec![integer("keepdims", 1)]);
+            let norm = g.node("Max", &[&norm, &epsilon], vec![]);
+            g.node("Div", &[x, &norm], vec![])
+        })
+    }
+
+    fn rotary(&mut self, x: &Value, heads: usize) -> Result<Value> {
+        self.begin("rotary", None);
+        let name = self.last(*x)?;
+        let dim = x.channels / heads;
+        let rates: Vec<f32> =
+            (0..dim / 2).map(|i| 10_000_f64.powf(-2.0 * i as f64 / dim as f64) as f32).collect();
+        let rates = self.numbers(&format!("constant/rates_{dim}"), &[rates.len()], &rates);
+        let frames = self.n_frames(*x)?;
+        let places = self.places(&frames);
+        let places = self.cast(&places, DataType::Float);
+        let axes = self.integers(&[1]);
+        let places = self.node("Unsqueeze", &[&places, &axes], vec![]);
+        // [frames, d / 2] → [frames, 1, d / 2], beside the heads.
+        let angles = self.node("Mul", &[&places, &rates], vec![]);
+        let angles = self.node("Unsqueeze", &[&angles, &axes], vec![]);
+        let (cos, sin) =
+            (self.node("Cos", &[&angles], vec![]), self.node("Sin", &[&angles], vec![]));
+        let shape = self.integers(&[0, 0, heads as i64, (dim / 2) as i64, 2]);
+        let pairs = self.node("Reshape", &[&name, &shape], vec![]);
+        let halves = vec![integer("axis", -1), integer("num_outputs", 2)];
+        let halves = self.nodes_of("Split", &[&pairs], halves, 2);
+        let last = self.integers(&[4]);
+        let [a, b] = [0, 1].map(|i| self.node("Squeeze", &[&halves[i], &last], vec![]));
+        let times = |g: &mut Self, x: &str, y: &str| g.node("Mul", &[x, y], vec![]);
+        let (a_cos, b_sin) = (times(self, &a, &cos), times(self, &b, &sin));
+        let (a_sin, b_cos) = (times(self, &a, &sin), times(self, &b, &cos));
+        let turned = [
+            self.node("Sub", &[&a_cos, &b_sin], vec![]),
+            self.node("Add", &[&a_sin, &b_cos], vec![]),
+        ]
+        .map(|x| self.node("Unsqueeze", &[&x, &last], vec![]));
+        let pairs = self.node("Concat", &[&turned[0], &turned[1]], vec![integer("axis", -1)]);
+        let shape = self.integers(&[0, 0, x.channels as i64]);
+        let y = self.node("Reshape", &[&pairs, &shape], vec![]);
+        Ok(self.new_last(Axes::Frames, x.channels, y))
+    }
+
+    fn hold_frames(&mut self, x: &Value, multiple: usize) -> Result<Value> {
+        self.begin("hold_frames", None);
+        expect("hold_frames", *x, Axes::Frames)?;
+        if multiple == 1 {
+            return Ok(*x);
+        }
+        let frames = self.n_frames(*x)?;
+        let missing = self.n_missing(&frames, multiple);
+        let name = self.last(*x)?;
+        let (none, axes) = (self.integers(&[0]), self.integers(&[1]));
+        let pads = self.node("Concat", &[&none, &missing], vec![integer("axis", 0)]);
+        let y = self.node("Pad", &[&name, &pads, "", &axes], vec![word("mode", "edge")]);
+        Ok(self.new_last(Axes::Frames, x.channels, y))
+    }
+
+    fn crop_frames(&mut self, x: &Value, like: &Value) -> Result<Value> {
+        self.begin("crop_frames", None);
+        let ends = self.n_frames(*like)?;
+        let starts = self.integers(&[0]);
+        let axis = if self.has_last(*x) { 1 } else { self.frames_axis() };
+        let axes = self.integers(&[axis]);
+        self.map(*x, x.channels, |g, x| g.node("Slice", &[x, &starts, &ends, &axes], vec![]))
+    }
+
+    fn frame_mask(&mut self, x: &Value, mask: Option<&Value>, multiple: usize) -> Result<Value> {
+        self.begin("frame_mask", None);
+        let frames = self.n_frames(*x)?;
+        let missing = self.n_missing(&frames, multiple);
+        let y = match mask {
+            Some(mask) => {
+                let mask = self.last(*mask)?;
+                let (none, axes) = (self.integers(&[0]), self.integers(&[1]));
+                let pads = self.node("Concat", &[&none, &missing], vec![integer("axis", 0)]);
+                self.node("Pad", &[&mask, &pads, "", &axes], vec![word("mode", "constant")])
+            }
+            None => {
+                let held = self.node("Add", &[&frames, &missing], vec![]);
+                let places = self.places(&held);
+                let counts = self.node("Less", &[&places, &frames], vec![]);
+                let counts = self.cast(&counts, DataType::Float);
+                let axes = self.integers(&[0]);
+                self.node("Unsqueeze", &[&counts, &axes], vec![])
+            }
+        };
+        Ok(self.new_last(Axes::Mask, 0, y))
+    }
+
+    fn stride_mask(&mut self, mask: &Value, stride: usize) -> Result<Value> {
+        self.begin("stride_mask", None);
+        let name = self.last(*mask)?;
+        let (starts, ends) = (self.integers(&[0]), self.integers(&[i64::MAX]));
+        let (axes, steps) = (self.integers(&[1]), self.integers(&[stride as i64]));
+        let y = self.node("Slice", &[&name, &starts, &ends, &axes, &steps], vec![]);
+        Ok(self.new_last(Axes::Mask, 0, y))
+    }
+}

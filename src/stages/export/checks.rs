@@ -1,0 +1,330 @@
+//! A model held against the interpreter that trained it, on real music.
+
+use std::num::NonZeroUsize;
+use std::time::Instant;
+
+use anyhow::Context as _;
+use ndarray::{Array3, ArrayView3, Axis, s};
+
+use super::Params;
+use super::files::Files;
+use crate::audio::FEATURE_DIM;
+use crate::autodiff::{Parameters, Stream};
+use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
+use crate::generation::{
+    EagerEngine, Engine, Inputs, OnnxEngine, Sampling, SessionPlan, file_names, sample,
+};
+use crate::model::{MotionDecoder, Parameter, ParameterList, UNet1D};
+use crate::motion::MOTION_DIM;
+use crate::onnx::{Device, Model, Runtime, Storage, values_of};
+use crate::stages::Progress;
+use crate::stages::train::session::{Looker, read_phrases};
+use crate::stages::trained::Trained;
+use crate::store::tables::OnnxCheckRow;
+use crate::store::{Location, TimestampUs, write_file};
+use crate::training::Dataset;
+
+/// Name of the check of rounded weights.
+pub const ROUNDING: &str = "rounding";
+/// Steps of the sampling that is held against another.
+const N_STEPS: usize = 20;
+const GUIDANCE: f64 = 2.5;
+/// Training phrases that are read for their music, beside those of the other splits.
+const N_PHRASES: usize = 16;
+
+/// f32 of another order of summation: 2e-5 at most was seen over a forward of the largest preset.
+const FORWARD_TOLERANCE: f64 = 1e-4;
+/// Twenty forwards, each fed by the one before.
+const SAMPLE_TOLERANCE: f64 = 1e-3;
+/// Rounded weights: the rms that a whole sample may move, in units of the data's spread.
+const ROUNDING_TOLERANCE: f64 = 0.05;
+
+/// What is checked.
+pub struct Checking<'a> {
+    pub store: &'a Location,
+    pub params: &'a Params,
+    pub trained: &'a Trained,
+    pub files: &'a Files,
+}
+
+/// What came of it.
+pub struct Held {
+    pub rows: Vec<OnnxCheckRow>,
+    pub runtime: String,
+}
+
+/// How far two answers are apart.
+#[derive(Clone, Copy)]
+struct Difference {
+    max_abs: f64,
+    rms: f64,
+}
+
+fn difference(a: ArrayView3<f32>, b: ArrayView3<f32>) -> Difference {
+    let (mut max_abs, mut squares) = (0.0_f64, 0.0);
+    for (a, b) in a.iter().zip(b) {
+        let d = f64::from(a - b).abs();
+        // NaN stays: f64::max would drop it.
+        max_abs = if d > max_abs || d.is_nan() { d } else { max_abs };
+        squares += d * d;
+    }
+    Difference { max_abs, rms: (squares / a.len().max(1) as f64).sqrt() }
+}
+
+/// A batch that both engines are asked about.
+struct Case {
+    n_samples: usize,
+    n_frames: usize,
+}
+
+impl Checking<'_> {
+    /// Runs the checks.
+    ///
+    /// # Errors
+    /// When onnxruntime refuses a file, or there is no music to check with.
+    pub fn run(&self, runtime: &Runtime, progress: &dyn Progress) -> anyhow::Result<Held> {
+        let machine = &self.params.machine;
+        let folder = tempfile::tempdir().context("while making a temporary folder")?;
+        for (name, bytes) in &self.files.bytes {
+            let path = folder.path().join(name);
+            write_file(&path, |out| out.write_all(bytes))
+                .with_context(|| format!("while writing {}", path.display()))?;
+        }
+        let network = &self.trained.state.config.network;
+        let takes_style = network.unet.style_dim > 0;
+        let plan =
+            SessionPlan { n_workers: 1, n_threads: machine.threads.get(), device: Device::Cpu };
+        let path = |name| folder.path().join(name);
+        let unet = path(file_names::UNET);
+        let decoder = path(file_names::DECODER);
+        let onnx = OnnxEngine::open(runtime, (&unet, false), &decoder, takes_style, plan)?;
+        // What the files hold, which rounding has changed.
+        let eager = self.eager(
+            self.read_back(
+                file_names::UNET,
+                file_names::UNET_WEIGHTS,
+                UNet1D::new(&network.unet).1,
+            )?,
+            self.read_back(
+                file_names::DECODER,
+                file_names::DECODER_WEIGHTS,
+                MotionDecoder::new(&network.decoder).1,
+            )?,
+        )?;
+        let music = self.music(progress)?;
+        let schedule = Schedule::new(&network.diffusion)?;
+        let window = network.window_frames;
+        let cases = [(1, window), (3, window), (2, window / 2 + 17), (1, 2 * window + 1)]
+            .map(|(n_samples, n_frames)| Case { n_samples, n_frames });
+        let is_rounded = self.params.precision != Storage::Fp32;
+        progress.start("check", "checks", cases.len() as u64 + 3 + u64::from(is_rounded));
+        let mut rows = Vec::new();
+        for case in &cases {
+            rows.push(self.forward(&onnx, &eager, &music, case, schedule.len())?);
+            progress.advance(1);
+        }
+        let case = Case { n_samples: 2, n_frames: window };
+        let config = SamplerConfig {
+            sampler: Sampler::Ddim { eta: 0.0 },
+            n_steps: N_STEPS.min(schedule.len()),
+            spacing: Spacing::Trailing,
+            clip: true,
+        };
+        let asked = |guidance| Sampling { config: &config, schedule: &schedule, guidance };
+        let (row, latent) = self.sampled("sample", &onnx, &eager, &music, &case, asked(1.0))?;
+        rows.push(row);
+        progress.advance(1);
+        rows.push(self.decoded(&onnx, &eager, latent.view())?);
+        progress.advance(1);
+        let guided = asked(GUIDANCE);
+        rows.push(self.sampled("guided_sample", &onnx, &eager, &music, &case, guided)?.0);
+        progress.advance(1);
+        if is_rounded {
+            let trained = self.eager(
+                self.trained.unet.parameters.clone(),
+                self.trained.decoder.parameters.clone(),
+            )?;
+            let (row, _) = self.sampled(ROUNDING, &trained, &eager, &music, &case, asked(1.0))?;
+            rows.push(OnnxCheckRow { onnx_s: None, ..row });
+            progress.advance(1);
+        }
+        progress.finish();
+        let build = runtime.build();
+        for row in &mut rows {
+            row.runtime.clone_from(&build);
+        }
+        Ok(Held { rows, runtime: build })
+    }
+
+    fn eager(
+        &self,
+        unet: Parameters<f32>,
+        decoder: Parameters<f32>,
+    ) -> anyhow::Result<EagerEngine> {
+        let network = &self.trained.state.config.network;
+        let engine = EagerEngine::new(
+            (UNet1D::new(&network.unet).0, unet),
+            (MotionDecoder::new(&network.decoder).0, decoder),
+            network.unet.style_dim > 0,
+            self.trained.state.scales.features.clone(),
+            (NonZeroUsize::MIN, self.params.machine.threads),
+        );
+        engine.context("while starting threads")
+    }
+
+    /// Reads weights out of the files, as the eager engine does.
+    fn read_back(
+        &self,
+        name: &str,
+        weights_name: &str,
+        list: ParameterList,
+    ) -> anyhow::Result<Parameters<f32>> {
+        let bytes = self.files.get(name).with_context(|| format!("there is no {name}"))?;
+        let model = Model::read(bytes.clone(), self.files.get(weights_name), name)?;
+        for (_, parameter) in list.iter() {
+            values_of(&model, parameter, name)?;
+        }
+        let values =
+            |parameter: &Parameter| values_of(&model, parameter, name).expect("looked up before");
+        Ok(Parameters::from_fn(list, values))
+    }
+
+    /// Returns music of the store, frame after frame, \[frames, 163\]; held-out songs first.
+    fn music(&self, progress: &dyn Progress) -> anyhow::Result<ndarray::Array2<f32>> {
+        let watch = Looker(progress);
+        let machine = &self.params.machine;
+        let phrases = read_phrases(
+            self.store,
+            <super::Export as crate::stages::Stage>::NAME,
+            machine,
+            Some(N_PHRASES),
+            progress,
+            &watch,
+        )?;
+        let dataset: &Dataset = &phrases.dataset;
+        let mut order: Vec<_> = dataset.phrases().iter().collect();
+        order.sort_by_key(|phrase| std::cmp::Reverse(phrase.split));
+        let mut music = ndarray::Array2::zeros((0, FEATURE_DIM));
+        for phrase in order.into_iter().take(N_PHRASES) {
+            let features = dataset.features(phrase, 0, phrase.n_frames)?;
+            music.append(Axis(0), features.view()).context("features of another width")?;
+        }
+        Ok(music)
+    }
+
+    /// Returns the music of a case: excerpts that begin at different places, \[samples, frames, 163\].
+    fn audio(music: &ndarray::Array2<f32>, case: &Case) -> Array3<f32> {
+        let n = music.nrows().max(1);
+        Array3::from_shape_fn((case.n_samples, case.n_frames, FEATURE_DIM), |(i, t, j)| {
+            music[[(i * n / case.n_samples + t) % n, j]]
+        })
+    }
+
+    fn noise(case: &Case, seed: u64) -> Array3<f32> {
+        let mut x = Array3::zeros((case.n_samples, case.n_frames, MOTION_DIM));
+        let values = x.as_slice_mut().expect("in order");
+        Stream::new(seed, 0).normal(0, values);
+        x
+    }
+
+    fn row(&self, check: &str, case: &Case, difference: Difference) -> OnnxCheckRow {
+        OnnxCheckRow {
+            model: self.params.model.clone(),
+            run: self.params.run.clone(),
+            check: check.to_owned(),
+            precision: self.params.precision.name().to_owned(),
+            n_samples: case.n_samples as i32,
+            n_frames: case.n_frames as i32,
+            n_steps: None,
+            guidance: None,
+            max_abs: difference.max_abs,
+            rms: difference.rms,
+            tolerance: FORWARD_TOLERANCE,
+            // NaN is not within any tolerance.
+            passed: difference.max_abs <= FORWARD_TOLERANCE,
+            onnx_s: None,
+            eager_s: 0.0,
+            runtime: String::new(),
+            time: TimestampUs::now(),
+        }
+    }
+
+    fn forward(
+        &self,
+        onnx: &dyn Engine,
+        eager: &dyn Engine,
+        music: &ndarray::Array2<f32>,
+        case: &Case,
+        n_steps: usize,
+    ) -> anyhow::Result<OnnxCheckRow> {
+        let (x, audio) = (Self::noise(case, 11), Self::audio(music, case));
+        // Steps from the least noisy to the noisiest; the last of several samples goes without music.
+        let n = case.n_samples;
+        let t: Vec<usize> = (0..n).map(|i| (i + 1) * (n_steps - 1) / n).collect();
+        let drop: Vec<bool> = (0..n).map(|i| n > 1 && i + 1 == n).collect();
+        let inputs =
+            Inputs { x: x.view(), t: &t, audio: audio.view(), drop_audio: &drop, style: None };
+        let (a, onnx_s) = timed(|| onnx.predict(&inputs))?;
+        let (b, eager_s) = timed(|| eager.predict(&inputs))?;
+        let row = self.row("forward", case, difference(a.view(), b.view()));
+        Ok(OnnxCheckRow { onnx_s: Some(onnx_s), eager_s, ..row })
+    }
+
+    fn sampled(
+        &self,
+        check: &str,
+        onnx: &dyn Engine,
+        eager: &dyn Engine,
+        music: &ndarray::Array2<f32>,
+        case: &Case,
+        sampling: Sampling,
+    ) -> anyhow::Result<(OnnxCheckRow, Array3<f32>)> {
+        let (x, audio) = (Self::noise(case, 12), Self::audio(music, case));
+        let run = |engine: &dyn Engine| {
+            sample(engine, sampling, x.clone(), audio.view(), None, |_, _| (), None)
+        };
+        let (a, onnx_s) = timed(|| run(onnx))?;
+        let (b, eager_s) = timed(|| run(eager))?;
+        let difference = difference(a.view(), b.view());
+        let (tolerance, found) = match check == ROUNDING {
+            true => (ROUNDING_TOLERANCE, difference.rms),
+            false => (SAMPLE_TOLERANCE, difference.max_abs),
+        };
+        let row = OnnxCheckRow {
+            n_steps: Some(sampling.config.n_steps as i32),
+            guidance: Some(sampling.guidance),
+            tolerance,
+            passed: found <= tolerance,
+            onnx_s: Some(onnx_s),
+            eager_s,
+            ..self.row(check, case, difference)
+        };
+        Ok((row, b))
+    }
+
+    /// The decoder on what was sampled, its motion in units of each channel's spread.
+    fn decoded(
+        &self,
+        onnx: &dyn Engine,
+        eager: &dyn Engine,
+        latent: ArrayView3<f32>,
+    ) -> anyhow::Result<OnnxCheckRow> {
+        let (mut a, onnx_s) = timed(|| onnx.decode(latent))?;
+        let (mut b, eager_s) = timed(|| eager.decode(latent))?;
+        let scale = &self.trained.state.scales.motion.scale;
+        for motion in [&mut a, &mut b] {
+            for (i, scale) in scale.iter().enumerate() {
+                motion.slice_mut(s![.., .., i]).mapv_inplace(|x| x / scale);
+            }
+        }
+        let (n_samples, n_frames, _) = latent.dim();
+        let row = self.row("decode", &Case { n_samples, n_frames }, difference(a.view(), b.view()));
+        Ok(OnnxCheckRow { onnx_s: Some(onnx_s), eager_s, ..row })
+    }
+}
+
+fn timed<T, E>(work: impl FnOnce() -> Result<T, E>) -> Result<(T, f64), E> {
+    let started = Instant::now();
+    let made = work()?;
+    Ok((made, started.elapsed().as_secs_f64()))
+}

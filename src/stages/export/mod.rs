@@ -1,0 +1,166 @@
+//! `export`: a trained run becomes a model: two ONNX files that were checked, and what they say of themselves.
+
+mod checks;
+mod files;
+mod report;
+
+use std::path::PathBuf;
+
+use anyhow::{bail, ensure};
+use bytes::Bytes;
+
+use self::checks::{Checking, Held};
+use self::files::Files;
+use self::report::{Planned, Report};
+use super::model_files::{folder_of, sha256};
+use super::train::session::{MachineParams, check_run_name};
+use super::trained::{Stand, Trained};
+use super::{ClientParams, Contract, Progress, Stage, Summary};
+use crate::generation::file_names;
+use crate::onnx::{Runtime, Storage};
+use crate::store::tables::OnnxCheckRow;
+use crate::store::{Commit, Item, Ledger, Location, Row as _, StoreError, TimestampUs, digest};
+
+/// The stage.
+pub struct Export;
+
+/// What the user asks for.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Params {
+    /// Folder or bucket of the tables, the run and the models.
+    #[arg(long, value_name = "URL")]
+    pub store: String,
+    /// Name of the run.
+    #[arg(long, value_name = "NAME")]
+    pub run: String,
+    /// Name of the model: models/NAME in the store.
+    #[arg(long, value_name = "NAME")]
+    pub model: String,
+    /// Which weights of the run.
+    #[arg(long, value_enum, default_value_t = Stand::Latest)]
+    pub weights: Stand,
+    /// How weights are stored; computing is always in fp32.
+    #[arg(long, value_enum, default_value_t = Storage::Fp32)]
+    pub precision: Storage,
+    /// Licence of the model, as people will read it in its files.
+    #[arg(long, value_name = "TEXT", default_value = "not stated")]
+    pub licence: String,
+    /// Largest weights that lie within the .onnx file itself, in MB; larger ones lie beside it.
+    #[arg(long, value_name = "MB", default_value_t = 1000)]
+    pub embed_mb: usize,
+    /// Replace a model of the same name.
+    #[arg(long)]
+    pub force: bool,
+    /// Say what would be written, and write nothing.
+    #[arg(long)]
+    pub dry_run: bool,
+    /// Library of onnxruntime [default: ORT_DYLIB_PATH, else beside the program, in .runtime, of the system]
+    #[arg(long, value_name = "FILE", help_heading = "Machine")]
+    pub ort_lib: Option<PathBuf>,
+    #[command(flatten)]
+    pub machine: MachineParams,
+    #[command(flatten)]
+    pub client: ClientParams,
+}
+
+impl Stage for Export {
+    const NAME: &'static str = "export";
+    const ABOUT: &'static str = "write a trained run as ONNX files, checked through onnxruntime";
+    const CONTRACT: Contract = Contract {
+        reads: "runs/<run>/, phrases, motion, features",
+        writes: "models/<model>/ (unet.onnx, decoder.onnx, model.json), onnx_checks",
+    };
+    type Params = Params;
+
+    fn run(params: Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
+        check_run_name(&params.run)?;
+        check_model_name(&params.model)?;
+        let store = Location::open(&params.store, &params.client.options())?;
+        let trained = Trained::read(&store, &params.run, params.weights)?;
+        let files = Files::make(&trained, &params)?;
+        if params.dry_run {
+            return Ok(Box::new(Planned::new(&params, &files, &store)));
+        }
+        match read_if_there(&store, &card_path(&params.model))? {
+            Some(there) if there == files.card_text => {
+                return Ok(Box::new(Report::up_to_date(&params, &store, &files)));
+            }
+            Some(_) if !params.force => bail!(
+                "store {store} has a model \"{}\" of other weights or settings; give another --model name, \
+                 or replace it with --force",
+                params.model
+            ),
+            _ => {}
+        }
+        // Before anything is computed: without the library there is nothing to check with.
+        let runtime = Runtime::load(params.ort_lib.as_deref())?;
+        let checking =
+            Checking { store: &store, params: &params, trained: &trained, files: &files };
+        let held = checking.run(&runtime, progress)?;
+        record(&store, &params, &files, &held)?;
+        if let Some(failed) = held.rows.iter().find(|row| !row.passed) {
+            bail!(
+                "model {} was not written: check {} on {} × {} frames differs by {:.2e}, {:.0e} is allowed; \
+                 all checks are in the table onnx_checks",
+                params.model,
+                failed.check,
+                failed.n_samples,
+                failed.n_frames,
+                if failed.check == checks::ROUNDING { failed.rms } else { failed.max_abs },
+                failed.tolerance
+            );
+        }
+        publish(&store, &params.model, &files)?;
+        Ok(Box::new(Report::written(&params, &store, &files, held)))
+    }
+}
+
+fn check_model_name(model: &str) -> anyhow::Result<()> {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || ['-', '_', '.'].contains(&c);
+    ensure!(
+        (1..=100).contains(&model.len()) && model.chars().all(is_plain) && !model.starts_with('.'),
+        "--model {model:?} is no name for a model; use 1 to 100 letters, digits, -, _ and ., and no . at \
+         the beginning"
+    );
+    Ok(())
+}
+
+fn card_path(model: &str) -> String {
+    format!("{}/{}", folder_of(model), file_names::CARD)
+}
+
+fn read_if_there(store: &Location, path: &str) -> Result<Option<Bytes>, StoreError> {
+    match store.read(path) {
+        Err(StoreError::NotFound { .. }) => Ok(None),
+        read => read.map(Some),
+    }
+}
+
+/// Puts the files in place; the card comes last, and without it there is no model.
+fn publish(store: &Location, model: &str, files: &Files) -> Result<(), StoreError> {
+    let folder = folder_of(model);
+    store.remove(&card_path(model))?;
+    for listed in store.list(&folder)? {
+        store.remove(&listed.path)?;
+    }
+    for (name, bytes) in &files.bytes {
+        store.put_new(&format!("{folder}/{name}"), bytes.clone())?;
+    }
+    store.put_new(&card_path(model), files.card_text.clone())?;
+    Ok(())
+}
+
+/// Writes the checks of a model into their table, in place of those of an earlier export.
+fn record(store: &Location, params: &Params, files: &Files, held: &Held) -> Result<(), StoreError> {
+    let ledger = Ledger::read(store, Export::NAME)?;
+    let mut commit = Commit::new(store, Export::NAME, "", &params.run);
+    let time = TimestampUs::now();
+    let rows: Vec<OnnxCheckRow> =
+        held.rows.iter().map(|row| OnnxCheckRow { time, ..row.clone() }).collect();
+    commit.part(OnnxCheckRow::schema().name, OnnxCheckRow::schema)?.write_rows(&rows)?;
+    let known = format!("{}\n{}", sha256(&files.card_text), held.runtime);
+    let input_hash = digest(known.as_bytes())[..32].to_owned();
+    let id = params.model.clone();
+    commit.settle(Item { id, fingerprint: input_hash.clone(), input_hash, failure: None }, &ledger);
+    commit.publish().map(|_| ())
+}

@@ -1,0 +1,122 @@
+//! What export says when it is done.
+
+use std::io::{self, Write};
+
+use super::Params;
+use super::checks::{Held, ROUNDING};
+use super::files::Files;
+use crate::generation::ModelCard;
+use crate::stages::Summary;
+use crate::stages::model_files::folder_of;
+use crate::store::Location;
+use crate::store::tables::OnnxCheckRow;
+
+/// The account of an export.
+pub struct Report {
+    card: ModelCard,
+    place: String,
+    checks: Vec<OnnxCheckRow>,
+    is_up_to_date: bool,
+}
+
+impl Report {
+    pub fn written(params: &Params, store: &Location, files: &Files, held: Held) -> Self {
+        Self { checks: held.rows, is_up_to_date: false, ..Self::up_to_date(params, store, files) }
+    }
+
+    /// A model that is there already, made of the same weights in the same way.
+    pub fn up_to_date(params: &Params, store: &Location, files: &Files) -> Self {
+        let place = store.url_of(&folder_of(&params.model));
+        Self { card: files.card.clone(), place, checks: Vec::new(), is_up_to_date: true }
+    }
+}
+
+impl Summary for Report {
+    fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
+        let Self { card, place, checks, is_up_to_date } = self;
+        if !checks.is_empty() {
+            writeln!(
+                out,
+                "{:<14} {:>7} {:>7} {:>9} {:>9} {:>9}  {:>8} {:>8}",
+                "check", "samples", "frames", "max", "rms", "allowed", "onnx", "eager"
+            )?;
+        }
+        for row in checks.iter() {
+            let seconds = |s: f64| format!("{:.0} ms", 1000.0 * s);
+            writeln!(
+                out,
+                "{:<14} {:>7} {:>7} {:>9.1e} {:>9.1e} {:>9.0e}  {:>8} {:>8}{}",
+                row.check,
+                row.n_samples,
+                row.n_frames,
+                row.max_abs,
+                row.rms,
+                row.tolerance,
+                row.onnx_s.map_or_else(|| "-".to_owned(), seconds),
+                seconds(row.eager_s),
+                if row.check == ROUNDING { "  (rms counts)" } else { "" }
+            )?;
+        }
+        writeln!(
+            out,
+            "model {}{} → {place}",
+            card.name,
+            if *is_up_to_date { ", up to date" } else { "" }
+        )?;
+        for file in &card.files {
+            let mb = file.n_bytes as f64 / 1e6;
+            writeln!(out, "  {:<20} {mb:>8.1} MB  {}", file.name, &file.sha256[..16])?;
+        }
+        writeln!(
+            out,
+            "  {} and {} parameters, {}, of run {} ({}, step {})",
+            card.n_parameters.unet,
+            card.n_parameters.decoder,
+            card.precision.name(),
+            card.provenance.run,
+            card.provenance.stage,
+            card.provenance.unet_step
+        )
+    }
+
+    fn n_failed(&self) -> u64 {
+        0
+    }
+}
+
+/// What `--dry-run` says.
+pub struct Planned {
+    place: String,
+    card: ModelCard,
+}
+
+impl Planned {
+    pub fn new(params: &Params, files: &Files, store: &Location) -> Self {
+        Self { place: store.url_of(&folder_of(&params.model)), card: files.card.clone() }
+    }
+}
+
+impl Summary for Planned {
+    fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
+        let sizes: Vec<String> = self
+            .card
+            .files
+            .iter()
+            .map(|file| format!("{} ({:.1} MB)", file.name, file.n_bytes as f64 / 1e6))
+            .collect();
+        let provenance = &self.card.provenance;
+        writeln!(
+            out,
+            "would check and write {} of run {} ({}, step {}) to {}",
+            sizes.join(" and "),
+            provenance.run,
+            provenance.stage,
+            provenance.unet_step,
+            self.place
+        )
+    }
+
+    fn n_failed(&self) -> u64 {
+        0
+    }
+}

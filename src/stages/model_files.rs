@@ -1,0 +1,316 @@
+//! A model's folder, opened to be run.
+
+use std::fmt::Write as _;
+use std::num::NonZeroUsize;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, bail};
+use bytes::Bytes;
+use sha2::{Digest as _, Sha256};
+
+use crate::autodiff::Parameters;
+use crate::generation::{
+    CardError, EagerEngine, Engine, FileEntry, ModelCard, OnnxEngine, SessionPlan, file_names,
+};
+use crate::model::{MotionDecoder, ParameterList, UNet1D};
+use crate::onnx::{Device, Model, OnnxError, PINNED_VERSION, Runtime, Session, values_of};
+use crate::store::{Location, StoreError, prepared};
+
+/// What runs a model.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum EngineChoice {
+    /// onnxruntime where its library is found, else eager.
+    #[default]
+    Auto,
+    /// The interpreter that trained it, which needs nothing.
+    Eager,
+    /// onnxruntime.
+    Onnx,
+}
+
+/// How models are run, whatever for.
+#[derive(Clone, Debug, clap::Args)]
+pub struct EngineParams {
+    /// What runs the model; MOTIONGEN_DEVICE chooses onnxruntime's device (auto, cpu, cuda, …).
+    #[arg(long, value_enum, default_value_t = EngineChoice::Auto, help_heading = "Engine")]
+    pub engine: EngineChoice,
+    /// Library of onnxruntime [default: ORT_DYLIB_PATH, else beside the program, in .runtime, of the system]
+    #[arg(long, value_name = "FILE", help_heading = "Engine")]
+    pub ort_lib: Option<PathBuf>,
+    /// Threads in all.
+    #[arg(long, value_name = "N", default_value_t = all_threads(), help_heading = "Engine")]
+    pub threads: NonZeroUsize,
+    /// Folder for models as this machine's processor likes them [default: ~/.cache/motiongen]
+    #[arg(long, value_name = "DIR", help_heading = "Engine")]
+    pub model_cache: Option<PathBuf>,
+}
+
+fn all_threads() -> NonZeroUsize {
+    std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN)
+}
+
+impl EngineParams {
+    /// Returns the folder of the cache.
+    pub fn cache(&self) -> PathBuf {
+        let variable = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty());
+        let below = |folder: PathBuf| folder.join("motiongen");
+        self.model_cache.clone().unwrap_or_else(|| {
+            variable("XDG_CACHE_HOME")
+                .map(|folder| below(folder.into()))
+                .or_else(|| variable("HOME").map(|home| below(PathBuf::from(home).join(".cache"))))
+                .unwrap_or_else(|| below(std::env::temp_dir()))
+        })
+    }
+}
+
+/// A model whose files are at hand on this machine.
+pub struct OpenModel {
+    pub card: ModelCard,
+    folder: PathBuf,
+    /// What messages call it.
+    place: String,
+    /// Whether the files' digests are known to be those of the card.
+    is_verified: bool,
+}
+
+/// Returns where a model lies below a store.
+pub fn folder_of(name: &str) -> String {
+    format!("models/{name}")
+}
+
+impl OpenModel {
+    /// Opens a model of a store, and fetches its files if the store is far away.
+    ///
+    /// # Errors
+    /// One sentence about what is missing or of another kind.
+    pub fn of_store(store: &Location, name: &str, cache: &Path) -> anyhow::Result<Self> {
+        let folder = folder_of(name);
+        let path = format!("{folder}/{}", file_names::CARD);
+        let bytes = match store.read(&path) {
+            Err(StoreError::NotFound { .. }) => bail!(
+                "store {store} has no model \"{name}\"{}; run motiongen export --store {store} --run RUN \
+                 --model {name} first",
+                others(store)?
+            ),
+            read => read?,
+        };
+        let card = ModelCard::read(&bytes, &store.url_of(&path))?;
+        let place = store.url_of(&folder);
+        if let Some(root) = store.local_path() {
+            return Ok(Self { card, folder: root.join(folder), place, is_verified: false });
+        }
+        let key = format!("model-{}", &sha256(&bytes)[..32]);
+        let fetched = prepared(cache, &key, |into| {
+            for file in &card.files {
+                let bytes = store.read(&format!("{folder}/{}", file.name))?;
+                verify(file, &sha256(&bytes), &place)?;
+                let to = into.join(&file.name);
+                crate::store::write_file(&to, |out| out.write_all(&bytes))
+                    .with_context(|| to.display().to_string())?;
+            }
+            anyhow::Ok(())
+        })?;
+        Ok(Self { card, folder: fetched, place, is_verified: true })
+    }
+
+    /// Makes an engine: onnxruntime's or ours, and what to tell of the choice.
+    ///
+    /// # Errors
+    /// When the engine that was asked for cannot be had, or a file is not what the card says.
+    pub fn engine(
+        &self,
+        params: &EngineParams,
+        n_workers: NonZeroUsize,
+    ) -> anyhow::Result<(Box<dyn Engine>, Option<String>)> {
+        let n_workers = n_workers.min(params.threads);
+        let n_threads =
+            NonZeroUsize::new(params.threads.get() / n_workers.get()).unwrap_or(NonZeroUsize::MIN);
+        let eager = || -> anyhow::Result<Box<dyn Engine>> {
+            Ok(Box::new(self.eager(n_workers, n_threads)?))
+        };
+        if params.engine == EngineChoice::Eager {
+            return Ok((eager()?, None));
+        }
+        let asked = Device::from_environment()?;
+        let runtime = match Runtime::load(params.ort_lib.as_deref()) {
+            Err(OnnxError::NoRuntime { .. }) if params.engine == EngineChoice::Auto => {
+                let note = "onnxruntime was not found, so the model runs in the eager engine; `make setup` \
+                            obtains it";
+                return Ok((eager()?, Some(note.to_owned())));
+            }
+            loaded => loaded?,
+        };
+        let (device, note) = asked.chosen(&runtime);
+        let plan = SessionPlan { n_workers: n_workers.get(), n_threads: n_threads.get(), device };
+        Ok((Box::new(self.onnx(&runtime, plan, &params.cache())?), note))
+    }
+
+    /// Makes the engine of our own interpreter, with the weights that the files have.
+    ///
+    /// # Errors
+    /// When a file is not what the card says.
+    pub fn eager(
+        &self,
+        n_workers: NonZeroUsize,
+        n_threads: NonZeroUsize,
+    ) -> anyhow::Result<EagerEngine> {
+        let card = &self.card;
+        let (unet, list) = UNet1D::new(&card.unet);
+        let unet_parameters = self.parameters(file_names::UNET, file_names::UNET_WEIGHTS, list)?;
+        let (decoder, list) = MotionDecoder::new(&card.decoder);
+        let decoder_parameters =
+            self.parameters(file_names::DECODER, file_names::DECODER_WEIGHTS, list)?;
+        let engine = EagerEngine::new(
+            (unet, unet_parameters),
+            (decoder, decoder_parameters),
+            card.unet.style_dim > 0,
+            card.feature_scale.clone(),
+            (n_workers, n_threads),
+        );
+        engine.context("while starting threads")
+    }
+
+    fn parameters(
+        &self,
+        name: &'static str,
+        weights_name: &'static str,
+        list: ParameterList,
+    ) -> anyhow::Result<Parameters<f32>> {
+        let bytes = self.read(name)?;
+        let has_weights = self.card.files.iter().any(|file| file.name == weights_name);
+        let weights = if has_weights { Some(self.read(weights_name)?) } else { None };
+        let place = format!("{}/{name}", self.place);
+        let model = Model::read(bytes, weights.as_ref(), &place)?;
+        // Looked up first, since filling cannot fail.
+        for (_, parameter) in list.iter() {
+            values_of(&model, parameter, &place)?;
+        }
+        let values = |parameter: &crate::model::Parameter| {
+            values_of(&model, parameter, &place).expect("looked up before")
+        };
+        Ok(Parameters::from_fn(list, values))
+    }
+
+    /// Reads a file and holds it against the card.
+    fn read(&self, name: &'static str) -> anyhow::Result<Bytes> {
+        let entry = self.card.file(name, &self.place)?;
+        let bytes = Location::local(&self.folder)?.read(name)?;
+        if !self.is_verified {
+            verify(entry, &sha256(&bytes), &self.place)?;
+        }
+        Ok(bytes)
+    }
+
+    /// Makes the engine of onnxruntime; on a processor from a copy of the UNet that was optimised once.
+    ///
+    /// # Errors
+    /// When a file is not what the card says, or onnxruntime refuses it.
+    pub fn onnx(
+        &self,
+        runtime: &Runtime,
+        plan: SessionPlan,
+        cache: &Path,
+    ) -> anyhow::Result<OnnxEngine> {
+        let takes_style = self.card.unet.style_dim > 0;
+        let unet = self.folder.join(file_names::UNET);
+        let decoder = self.folder.join(file_names::DECODER);
+        // Files are looked through while onnxruntime loads what it has of them already.
+        std::thread::scope(|scope| {
+            let verified = scope.spawn(|| self.verify());
+            let opened = (|| {
+                if plan.device != Device::Cpu {
+                    return Ok(OnnxEngine::open(
+                        runtime,
+                        (&unet, false),
+                        &decoder,
+                        takes_style,
+                        plan,
+                    )?);
+                }
+                let entry = self.card.file(file_names::UNET, &self.place)?;
+                let key = format!(
+                    "optimized-{}",
+                    &sha256(
+                        format!(
+                            "{}\n{PINNED_VERSION}\n{}\n{}",
+                            entry.sha256,
+                            runtime.build(),
+                            processor()
+                        )
+                        .as_bytes()
+                    )[..32]
+                );
+                let optimized = prepared(cache, &key, |into| {
+                    // What is kept must come from the file that the card names.
+                    self.verify()?;
+                    Ok::<_, anyhow::Error>(Session::optimize(
+                        runtime,
+                        &unet,
+                        &into.join(file_names::UNET),
+                    )?)
+                })?;
+                let unet = optimized.join(file_names::UNET);
+                Ok(OnnxEngine::open(runtime, (&unet, true), &decoder, takes_style, plan)?)
+            })();
+            // A file that was changed explains whatever else went wrong.
+            verified.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
+            opened
+        })
+    }
+
+    /// Holds every file against the card.
+    fn verify(&self) -> anyhow::Result<()> {
+        if self.is_verified {
+            return Ok(());
+        }
+        let folder = Location::local(&self.folder)?;
+        for file in &self.card.files {
+            verify(file, &sha256(&folder.read(&file.name)?), &self.place)?;
+        }
+        Ok(())
+    }
+}
+
+fn verify(file: &FileEntry, found: &str, folder: &str) -> Result<(), CardError> {
+    if found == file.sha256 {
+        return Ok(());
+    }
+    Err(CardError::Digest {
+        place: format!("{folder}/{}", file.name),
+        found: found.to_owned(),
+        expected: file.sha256.clone(),
+    })
+}
+
+/// Returns the SHA-256 of bytes as hexadecimal digits.
+pub fn sha256(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().fold(String::with_capacity(64), |mut text, byte| {
+        // Writing to a string cannot fail.
+        let _ = write!(text, "{byte:02x}");
+        text
+    })
+}
+
+/// Returns what tells this processor from others: a model that is optimised for one may not run on another.
+fn processor() -> String {
+    let known = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let of_first = known.lines().take_while(|line| !line.is_empty());
+    let mut told: Vec<&str> = of_first
+        .filter(|line| ["model name", "flags", "Features"].iter().any(|key| line.starts_with(key)))
+        .collect();
+    told.push(std::env::consts::ARCH);
+    told.push(std::env::consts::OS);
+    told.join("\n")
+}
+
+/// Says which models a store has.
+fn others(store: &Location) -> anyhow::Result<String> {
+    let listed = store.list("models")?;
+    let suffix = format!("/{}", file_names::CARD);
+    let mut names: Vec<&str> = listed
+        .iter()
+        .filter_map(|listed| listed.path.strip_prefix("models/")?.strip_suffix(&suffix))
+        .collect();
+    names.sort_unstable();
+    Ok(if names.is_empty() { String::new() } else { format!(" (it has {})", names.join(", ")) })
+}

@@ -1,0 +1,118 @@
+//! What training left of a run: its configuration and the weights that validated best.
+
+use crate::autodiff::Parameters;
+use crate::model::{MotionDecoder, ParameterList, UNet1D};
+use crate::store::Location;
+use crate::training::{
+    Checkpoints, DecoderLearner, DiffusionLearner, FinetuneLearner, Kind, Learner as _, State,
+    TrainConfig, TrainingError,
+};
+
+/// Which weights of a run.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Stand {
+    /// Those of finetune where the run has them, else those of train.
+    #[default]
+    Latest,
+    /// Those of train: the UNet and the decoder, each on its own.
+    Train,
+    /// Those of finetune.
+    Finetune,
+}
+
+/// A run that was trained.
+pub struct Trained {
+    /// The state of the UNet's training: configuration, scales, data.
+    pub state: State<TrainConfig>,
+    pub unet: Best,
+    pub decoder: Best,
+    /// `diffusion` or `finetune`.
+    pub stage: &'static str,
+    /// The validation loss of what the stage minimises.
+    pub loss: Option<f64>,
+}
+
+/// Weights, and the step at which they validated best.
+pub struct Best {
+    pub parameters: Parameters<f32>,
+    pub step: u64,
+}
+
+impl Trained {
+    /// Reads a run.
+    ///
+    /// # Errors
+    /// [`TrainingError::Missing`] with the command that makes what is missing.
+    pub fn read(store: &Location, run: &str, stand: Stand) -> Result<Self, TrainingError> {
+        let of = |stage: &'static str| Checkpoints::new(store, run, stage);
+        let diffusion = of(DiffusionLearner::STAGE);
+        let Some(&step) = diffusion.steps(Kind::Best)?.last() else {
+            let way_out = format!("run motiongen train --run {run} first");
+            return Err(TrainingError::Missing {
+                run: run.to_owned(),
+                what: "trained UNet",
+                way_out,
+            });
+        };
+        let state: State<TrainConfig> = diffusion.read(Kind::Best, step, State::of)?;
+        let network = &state.config.network;
+        let (_, unet) = UNet1D::new(&network.unet);
+        let (_, decoder) = MotionDecoder::new(&network.decoder);
+        let tuned = of(FinetuneLearner::STAGE);
+        let tuned_steps = match stand {
+            Stand::Train => Vec::new(),
+            Stand::Latest | Stand::Finetune => tuned.steps(Kind::Best)?,
+        };
+        if let Some(&step) = tuned_steps.last() {
+            let best = |prefix, list: ParameterList| -> Result<Best, TrainingError> {
+                Ok(Best { parameters: section(&tuned, step, prefix, list)?, step })
+            };
+            let loss = tuned.read(Kind::Best, step, |archive, place| {
+                let state: State<serde_json::Value> = State::of(archive, place)?;
+                Ok(state.progress.best.map(|best| best.loss))
+            })?;
+            let (unet, decoder) = (best("unet.", unet)?, best("decoder.", decoder)?);
+            return Ok(Self { state, unet, decoder, stage: FinetuneLearner::STAGE, loss });
+        }
+        if stand == Stand::Finetune {
+            let way_out = format!("run motiongen finetune --run {run} first");
+            let (run, what) = (run.to_owned(), "fine-tuned networks");
+            return Err(TrainingError::Missing { run, what, way_out });
+        }
+        let unet = best(&diffusion, run, "unet.", "trained UNet", unet)?;
+        let (stage, what) = (of(DecoderLearner::STAGE), "trained decoder");
+        let decoder = best(&stage, run, "decoder.", what, decoder)?;
+        let loss = state.progress.best.map(|best| best.loss);
+        Ok(Self { state, unet, decoder, stage: DiffusionLearner::STAGE, loss })
+    }
+}
+
+/// Returns the weights of a stage that validated best.
+///
+/// # Errors
+/// [`TrainingError::Missing`] when the stage has none yet.
+pub fn best(
+    checkpoints: &Checkpoints,
+    run: &str,
+    prefix: &str,
+    what: &'static str,
+    list: ParameterList,
+) -> Result<Best, TrainingError> {
+    let Some(&step) = checkpoints.steps(Kind::Best)?.last() else {
+        let way_out = format!("run motiongen train --run {run} to the end first");
+        return Err(TrainingError::Missing { run: run.to_owned(), what, way_out });
+    };
+    Ok(Best { parameters: section(checkpoints, step, prefix, list)?, step })
+}
+
+fn section(
+    checkpoints: &Checkpoints,
+    step: u64,
+    prefix: &str,
+    list: ParameterList,
+) -> Result<Parameters<f32>, TrainingError> {
+    checkpoints.read(Kind::Best, step, |archive, place| {
+        let place = place.to_owned();
+        archive.section(prefix, list).map_err(|source| TrainingError::Weights { place, source })
+    })
+}
