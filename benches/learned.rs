@@ -4,10 +4,12 @@
 //!
 //! Motion is sampled for phrases of the validation and test songs, and asked: does its vertical velocity
 //! follow the bar (R² of a regression on four harmonics of the bar's phase, against the same at wrong
-//! tempi)? A control gets the music of another song. See docs/training.md.
+//! tempi, with a fit for each phrase of four seconds and with one for all phrases of a song)? A control
+//! gets the music of another song. See docs/training.md.
 
 #![allow(clippy::print_stdout, clippy::print_stderr, reason = "a program of its own")]
 
+use std::collections::BTreeMap;
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 
@@ -26,6 +28,8 @@ use ndarray::Array3;
 /// Wrong tempi that the true one is held against.
 const N_WRONG: usize = 199;
 const BATCH: usize = 16;
+/// Constructed phrases begin so many frames apart.
+const HOP_FRAMES: f64 = 60.0;
 
 struct Arguments {
     store: String,
@@ -72,6 +76,8 @@ fn arguments() -> Arguments {
 /// A phrase of a song that training did not see.
 struct HeldOut {
     song: String,
+    /// Where it begins in its song.
+    start_frames: f64,
     /// \[frames, 163\]
     audio: Vec<f32>,
     /// Bar phase of each frame.
@@ -82,6 +88,11 @@ struct HeldOut {
 
 fn column(frames: &[f32], channel: usize) -> Vec<f64> {
     frames.chunks_exact(MOTION_DIM).map(|frame| f64::from(frame[channel])).collect()
+}
+
+/// The number of a constructed phrase within its take.
+fn number_of(id: &str) -> f64 {
+    id.rsplit('.').next().and_then(|number| number.parse().ok()).expect("SONG.tTAKE.NUMBER")
 }
 
 fn held_out(
@@ -107,6 +118,7 @@ fn held_out(
             let frames: Vec<f32> = motion.iter().copied().collect();
             HeldOut {
                 song: phrase.id.split(".t").next().unwrap_or_default().to_owned(),
+                start_frames: number_of(&phrase.id) * HOP_FRAMES,
                 audio: audio.iter().copied().collect(),
                 phase: column(&frames, Channel::Phase.range().start),
                 real: column(&frames, Channel::Velocity.range().start + 1),
@@ -141,20 +153,34 @@ fn wrong_ratios() -> Vec<f64> {
     (0..N_WRONG).map(|i| apart[i * (apart.len() - 1) / (N_WRONG - 1)]).collect()
 }
 
+/// Bars since the song began, by the tempo of a phrase and where it begins.
+///
+/// Wrong tempi then drift from the music over the whole song, not over four seconds.
+fn bars_of_song(window: &HeldOut) -> Vec<f64> {
+    let bars = unwrapped(&window.phase);
+    let n = bars.len();
+    let bars_per_frame = (bars[n - 1] - bars[0]) / (n - 1) as f64;
+    let before = (window.start_frames * bars_per_frame - bars[0]).round();
+    bars.iter().map(|x| x + before).collect()
+}
+
 struct Lock {
     r2: f64,
     wrong_mean: f64,
     p: f64,
 }
 
-/// R² of all windows at the true tempo, against wrong ones.
-fn lock(windows: &[HeldOut], signals: &[Vec<f64>]) -> Lock {
+/// R² at the true tempo, against wrong ones: one fit per group of windows, mean over groups.
+fn lock(windows: &[HeldOut], signals: &[Vec<f64>], groups: &[Vec<usize>]) -> Lock {
+    let bars: Vec<Vec<f64>> = windows.iter().map(bars_of_song).collect();
     let mean = |ratio: f64| {
-        let of = |(window, signal): (&HeldOut, &Vec<f64>)| {
-            let phase: Vec<f64> = unwrapped(&window.phase).iter().map(|x| x * ratio).collect();
-            bar_locking(signal, &phase)
+        let of = |group: &Vec<usize>| {
+            let signal: Vec<f64> = group.iter().flat_map(|&i| signals[i].clone()).collect();
+            let phase: Vec<f64> =
+                group.iter().flat_map(|&i| bars[i].iter().map(|x| x * ratio)).collect();
+            bar_locking(&signal, &phase)
         };
-        windows.iter().zip(signals).map(of).sum::<f64>() / windows.len() as f64
+        groups.iter().map(of).sum::<f64>() / groups.len() as f64
     };
     let r2 = mean(1.0);
     let wrong: Vec<f64> = wrong_ratios().into_iter().map(mean).collect();
@@ -164,6 +190,15 @@ fn lock(windows: &[HeldOut], signals: &[Vec<f64>]) -> Lock {
         wrong_mean: wrong.iter().sum::<f64>() / wrong.len() as f64,
         p: (1 + n_as_good) as f64 / (1 + wrong.len()) as f64,
     }
+}
+
+/// Windows by song.
+fn songs(windows: &[HeldOut]) -> Vec<Vec<usize>> {
+    let mut of: BTreeMap<&str, Vec<usize>> = BTreeMap::new();
+    for (i, window) in windows.iter().enumerate() {
+        of.entry(&window.song).or_default().push(i);
+    }
+    of.into_values().collect()
 }
 
 fn correlation(a: &[f64], b: &[f64]) -> f64 {
@@ -337,14 +372,17 @@ fn main() {
             coherence(motions, 4.0)
         );
     }
-    println!("{:<22} {:>8} {:>12} {:>8}", "", "R²", "wrong tempi", "p");
-    let show = |name: &str, signals: &[Vec<f64>]| {
-        let Lock { r2, wrong_mean, p } = lock(&windows, signals);
-        println!("{name:<22} {r2:>8.3} {wrong_mean:>12.3} {p:>8.3}");
-    };
-    show("constructed (truth)", &real);
-    show("generated", &signals(&generated));
-    show("shuffled condition", &signals(&shuffled));
+    let alone: Vec<Vec<usize>> = (0..n).map(|i| vec![i]).collect();
+    for (what, groups) in [("a fit per phrase", &alone), ("a fit per song", &songs(&windows))] {
+        println!("{what:<22} {:>8} {:>12} {:>8}", "R²", "wrong tempi", "p");
+        let show = |name: &str, signals: &[Vec<f64>]| {
+            let Lock { r2, wrong_mean, p } = lock(&windows, signals, groups);
+            println!("{name:<22} {r2:>8.3} {wrong_mean:>12.3} {p:>8.3}");
+        };
+        show("constructed (truth)", &real);
+        show("generated", &signals(&generated));
+        show("shuffled condition", &signals(&shuffled));
+    }
 
     let speed = |motion: &[f32]| {
         let v = Channel::Velocity.range();

@@ -72,6 +72,7 @@ impl Bench {
             temporal_weight: 10.0,
             temporal: TemporalConfig::default(),
             num_steps: 5,
+            start: 1.0,
             optimizer: OptimizerConfig::default(),
             num_phrases: None,
         };

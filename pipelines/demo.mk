@@ -1,6 +1,6 @@
 # The demo: real music and real motion capture (tests/data) become tables, the music's features are
 # extracted, phrases to train on are constructed from both, small networks are trained on them and
-# fine-tuned, and queries answer.
+# fine-tuned, they become ONNX files, and queries answer.
 #
 #   make demo                              builds first
 #   make -f pipelines/demo.mk BIN=…        with executables that are there already
@@ -10,6 +10,7 @@ OUT    ?= build/demo
 STORE  ?= $(OUT)/store
 CONFIG ?= pipelines/demo.toml
 RUN    ?= demo
+MODEL  ?= demo
 
 .DEFAULT_GOAL := demo
 include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
@@ -24,6 +25,7 @@ demo:
 	@echo "tables   $(STORE)"
 	@echo "answers  $(ANSWERS)"
 	@echo "plot     $(PLOT)"
+	@echo "model    $(STORE)/models/$(MODEL)"
 	@echo "ask on   $(MOTIONGEN) query --store $(STORE) \"select …\""
 
 # ingest: both sources into one store.
@@ -52,6 +54,11 @@ $(FINETUNED): $(TRAINED) $(CONFIG) $(MOTIONGEN)
 PLOT := $(OUT)/training-$(RUN).png
 $(PLOT): $(FINETUNED)
 	$(MOTIONGEN) plot training --store $(STORE) --run $(RUN) --output $@
+
+# export: the networks as ONNX files, held against the interpreter that trained them.
+EXPORTED := $(STAMPS)/export-$(MODEL).done
+$(EXPORTED): $(FINETUNED) $(CONFIG) $(MOTIONGEN)
+	$(call stage,$(MOTIONGEN) export --config $(CONFIG) --store $(STORE) --run $(RUN) --model $(MODEL) --force)
 
 # query: what the tables tell.
 define SPLITS
@@ -87,6 +94,10 @@ select run, stage, kind, count(*) as rows, max(step) as steps, round(max(elapsed
 round(min(loss), 4) as lowest_loss from training_log
 group by run, stage, kind order by run, stage, kind
 endef
+define CHECKS
+select model, check, precision, n_samples, n_frames, round(max_abs * 1000000, 2) as max_difference_e6,
+passed from onnx_checks order by model, check, n_samples, n_frames
+endef
 # Lines become spaces on the way to the shell.
 define newline
 
@@ -96,7 +107,7 @@ comma := ,
 ask = @{ echo; echo '$(1)'; $(MOTIONGEN) query --config $(CONFIG) --store $(STORE) \
 	'$(subst $(newline), ,$($(2)))'; } | tee --append $@.new
 
-$(ANSWERS): $(INGESTED) $(EXTRACTED) $(LIBRARY) $(FINETUNED) $(PLOT)
+$(ANSWERS): $(INGESTED) $(EXTRACTED) $(LIBRARY) $(FINETUNED) $(EXPORTED) $(PLOT)
 	@rm -f $@.new
 	@{ echo; echo 'What is there?'; $(MOTIONGEN) query --store $(STORE) --tables; } | tee $@.new
 	$(call ask,How much is in each split?,SPLITS)
@@ -105,4 +116,5 @@ $(ANSWERS): $(INGESTED) $(EXTRACTED) $(LIBRARY) $(FINETUNED) $(PLOT)
 	$(call ask,What do the songs sound like?,LOUDNESS)
 	$(call ask,What was constructed to train on?,CONSTRUCTED)
 	$(call ask,What did training bring?,TRAINING)
+	$(call ask,Does onnxruntime answer what was trained?,CHECKS)
 	@mv $@.new $@
