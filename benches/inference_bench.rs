@@ -256,7 +256,8 @@ impl Served {
     ) -> anyhow::Result<Array3<f32>> {
         let sampling = Sampling { config, schedule: &self.schedule, guidance };
         let (x, audio) = (noise(batch, seed), music(batch));
-        let latent = sample(&*self.engine, sampling, x, audio.view(), None, |_, _| (), None)?;
+        let start = (x, self.schedule.len());
+        let latent = sample(&*self.engine, sampling, start, audio.view(), None, |_, _| (), None)?;
         Ok(self.engine.decode(latent.view())?)
     }
 }

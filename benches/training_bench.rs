@@ -70,7 +70,7 @@ impl Bench {
             diffusion_weight: 0.1,
             decoder_weight: 1.0,
             temporal_weight: 10.0,
-            temporal: TemporalConfig::default(),
+            temporal: TemporalConfig::reference(),
             num_steps: 5,
             start: 1.0,
             optimizer: OptimizerConfig::default(),

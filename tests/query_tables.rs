@@ -193,7 +193,8 @@ fn tables_counts_rows_bytes_and_parts_of_what_is_live() {
             String::from("table                    rows          bytes   parts  version\n");
         let of_extract = ["features", "extractions", "beats"].map(|name| (name, 0));
         let [phrases, motion, failures] = tables;
-        let rest = [failures, ("training_log", 0)];
+        let of_models = ["training_log", "onnx_checks", "generations", "generated"];
+        let rest = [failures].into_iter().chain(of_models.map(|name| (name, 0)));
         for (name, n_rows) in [phrases, motion].into_iter().chain(of_extract).chain(rest) {
             let live = live_files(&store, name);
             let n_bytes: u64 = live.iter().sum();
@@ -319,6 +320,9 @@ extractions                 0              0       0        1
 beats                       0              0       0        1
 failures                    0              0       0        1
 training_log                0              0       0        1
+onnx_checks                 0              0       0        1
+generations                 0              0       0        1
+generated                   0              0       0        1
 ";
     let output = ask(&store, &["--tables"]);
     assert_eq!((output.code, output.stdout.as_str()), (0, expected), "{}", output.stderr);
@@ -370,7 +374,7 @@ fn an_unknown_table_comes_with_the_nearest_and_all_others() {
         let start = format!("table \"{table}\" not found; nearest: {nearest}");
         assert!(sentence.starts_with(&start), "{sentence}");
         let all = "; a store has phrases, motion, features, extractions, beats, failures, \
-                   training_log";
+                   training_log, onnx_checks, generations, generated";
         assert!(sentence.ends_with(all), "{sentence}");
     }
 }
@@ -477,6 +481,7 @@ fn a_store_in_memory_is_asked_inside_the_process() {
     let infos = table_infos(&store, &options).expect("a store");
     let counts: Vec<_> = infos.iter().map(|i| (i.name, i.n_rows, i.n_parts)).collect();
     let empty = ["phrases", "motion", "features", "extractions", "beats"].map(|name| (name, 0, 0));
-    let rest = [("failures", 3, 2), ("training_log", 0, 0)];
-    assert_eq!(counts, [&empty[..], &rest].concat());
+    let of_models = ["training_log", "onnx_checks", "generations", "generated"];
+    let of_models = of_models.map(|name| (name, 0, 0));
+    assert_eq!(counts, [&empty[..], &[("failures", 3, 2)], &of_models].concat());
 }

@@ -4,21 +4,23 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Which rooms a room may use.
-const MAY_USE: [(&str, &[&str]); 14] = [
+const MAY_USE: [(&str, &[&str]); 16] = [
     ("units", &[]),
     ("audio", &["units"]),
     ("autodiff", &["model"]),
     ("diffusion", &[]),
+    ("evaluation", &["motion", "units"]),
     ("generation", &["audio", "autodiff", "diffusion", "model", "motion", "onnx", "units"]),
     ("model", &["audio", "motion"]),
     ("motion", &["units"]),
     ("onnx", &["audio", "model", "motion"]),
-    ("plot", &["units"]),
+    ("plot", &["motion", "units"]),
     ("store", &["audio", "motion", "units"]),
     (
         "training",
         &["audio", "autodiff", "diffusion", "model", "motion", "store", "units", "weights"],
     ),
+    ("view", &["motion", "units"]),
     ("weights", &["autodiff", "model"]),
     (
         "stages",
@@ -26,6 +28,7 @@ const MAY_USE: [(&str, &[&str]); 14] = [
             "audio",
             "autodiff",
             "diffusion",
+            "evaluation",
             "generation",
             "model",
             "motion",
@@ -34,6 +37,7 @@ const MAY_USE: [(&str, &[&str]); 14] = [
             "store",
             "training",
             "units",
+            "view",
             "weights",
         ],
     ),

@@ -22,7 +22,8 @@
 //! # Order of a step
 //!
 //! [`sample`] imposes known values on x_t, asks the denoiser, turns its prediction into x̂0 and ε̂
-//! (clipped if so configured), imposes known values on them, and takes the sampler's step.
+//! (clipped if so configured), imposes known values on them, has them refined where the caller wants
+//! that ([`sample_refined`]), and takes the sampler's step.
 //!
 //! # Sources
 //!
@@ -60,7 +61,7 @@ pub use ddpm::{Posterior, posterior};
 pub use dpm_solver::{DpmCoefficients, dpm_solver_update};
 pub use guidance::{denoise_guided, guided};
 pub use inpaint::Known;
-pub use sample::sample;
+pub use sample::{Refine, sample, sample_refined};
 pub use sampler::{Sampler, SamplerConfig};
 pub use schedule::{Level, Schedule};
 pub use spacing::{Spacing, Step, steps, timesteps};

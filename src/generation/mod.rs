@@ -4,18 +4,25 @@
 //! model's folder says of itself.
 
 mod card;
+mod control;
 mod eager;
 mod engine;
 mod pool;
 mod runtime;
 mod sampling;
+mod seam;
+mod track;
+mod windows;
 
 pub use card::{
     CardError, FileEntry, MODEL_FORMAT, ModelCard, Networks, Provenance, file_names, own_channels,
     own_features,
 };
+pub use control::{Constraints, ControlError, Miss, Wanted, continuing, facing};
 pub use eager::EagerEngine;
 pub use engine::{Engine, EngineError, Inputs};
 pub use pool::Pool;
 pub use runtime::{OnnxEngine, SessionPlan};
 pub use sampling::{Sampling, sample};
+pub use track::{Constrained, Generator, OVERLAP_FRAMES, Primed, RUN_WINDOWS, Track};
+pub use windows::Windows;

@@ -2,7 +2,7 @@
 
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, concatenate};
 
-use crate::diffusion::{Known, SamplerConfig, Schedule, denoise_guided, sample as run_sampler};
+use crate::diffusion::{Refine, SamplerConfig, Schedule, denoise_guided, sample_refined};
 
 use super::engine::{Engine, EngineError, Inputs};
 
@@ -17,19 +17,20 @@ pub struct Sampling<'a> {
 
 /// Samples: noise x_T becomes x0, normalised, \[batch, frames, 25\].
 ///
-/// With a guidance other than 0 and 1 each step is one call of a doubled batch. `noise` fills the draw of a
-/// number; see [`crate::diffusion::sample`].
+/// With a guidance other than 0 and 1 each step is one call of a doubled batch. `x` comes with the number of
+/// steps that are left, `noise` fills the draw of a number, and `refine` changes every estimate of x0; see
+/// [`sample_refined`].
 ///
 /// # Errors
 /// What the sampler or the engine refuses.
 pub fn sample(
     engine: &dyn Engine,
     sampling: Sampling,
-    x: Array3<f32>,
+    start: (Array3<f32>, usize),
     audio: ArrayView3<f32>,
     style: Option<ArrayView2<f32>>,
     noise: impl FnMut(usize, &mut [f32]),
-    known: Option<&Known>,
+    refine: Option<Refine>,
 ) -> Result<Array3<f32>, EngineError> {
     let is_double = sampling.guidance != 1.0 && sampling.guidance != 0.0;
     // What does not change from step to step is doubled once.
@@ -48,5 +49,5 @@ pub fn sample(
             engine.predict(&Inputs { x, t: &t, audio, drop_audio: dropped, style })
         })
     };
-    run_sampler(sampling.config, sampling.schedule, x, denoise, noise, known)
+    sample_refined(sampling.config, sampling.schedule, start, denoise, noise, None, refine)
 }

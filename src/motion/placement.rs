@@ -48,6 +48,19 @@ impl Placement {
         ))
     }
 
+    /// Returns a placement that is given within this one as the world has it.
+    ///
+    /// `(x, z)' = (x, z) + R(yaw) (x_in, z_in)`, `yaw' = yaw + yaw_in`.
+    pub fn of_inner(&self, inner: Self) -> Self {
+        let turn = from_axis_angle([0.0, 1.0, 0.0], self.yaw_rad);
+        let [x, _, z] = rotate(turn, [inner.x_m, 0.0, inner.z_m]);
+        Self {
+            x_m: self.x_m + x,
+            z_m: self.z_m + z,
+            yaw_rad: wrapped(self.yaw_rad + inner.yaw_rad),
+        }
+    }
+
     /// Takes the placement off, in place: what stood here and faced this way stands over the origin
     /// and faces +Z. Shape `[T, 25]`.
     ///
@@ -199,6 +212,23 @@ mod tests {
             for ((i, got), want) in moved.indexed_iter().zip(frames.iter()) {
                 // Two roundings of values up to 30 (an acceleration), each half an ulp.
                 prop_assert!((got - want).abs() <= 4e-6, "{i:?}: {got} for {want}");
+            }
+        }
+
+        #[test]
+        fn a_placement_within_another_is_where_both_lead(x in -7.0..7.0f64, z in -7.0..7.0f64,
+                                                         yaw in -3.1..3.1f64, turn in -9.0..9.0f64) {
+            let outer = Placement { x_m: x, z_m: z, yaw_rad: yaw };
+            let inner = Placement { x_m: z, z_m: 1.0, yaw_rad: wrapped(turn) };
+            let (mut one, mut other) = (walk(5, 0.3, 0.1, 0.2, turn), walk(5, 0.3, 0.1, 0.2, turn));
+            inner.restore(&mut one);
+            outer.restore(&mut one);
+            outer.of_inner(inner).restore(&mut other);
+            for (i, (a, b)) in one.iter().zip(other.iter()).enumerate() {
+                // q and -q turn alike; rounding of values up to 30.
+                let is_turn = (9..13).contains(&(i % MOTION_DIM));
+                let off = if is_turn { (a.abs() - b.abs()).abs() } else { (a - b).abs() };
+                prop_assert!(off <= 1e-5, "{i}: {a} and {b}");
             }
         }
 

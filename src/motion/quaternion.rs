@@ -82,6 +82,22 @@ pub fn angular_velocity(from: Quaternion, to: Quaternion, rate_hz: f64) -> [f64;
     [d[1], d[2], d[3]].map(|c| c * angle_per_sine * rate_hz)
 }
 
+/// Spherical linear interpolation along the shorter arc, `sin((1-s)θ) q_a + sin(sθ) q_b` over `sin θ`.
+///
+/// Source: Shoemake, Animating rotation with quaternion curves, SIGGRAPH 1985.
+pub fn slerp(a: Quaternion, b: Quaternion, s: f64) -> Quaternion {
+    let cosine = dot(a, b);
+    let b = if cosine < 0.0 { b.map(|c| -c) } else { b };
+    let angle = cosine.abs().min(1.0).acos();
+    // Nearly equal orientations: the limit of both weights.
+    let (wa, wb) = if angle < 1e-6 {
+        (1.0 - s, s)
+    } else {
+        (((1.0 - s) * angle).sin() / angle.sin(), (s * angle).sin() / angle.sin())
+    };
+    normalize(std::array::from_fn(|c| wa * a[c] + wb * b[c]))
+}
+
 fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
@@ -141,6 +157,21 @@ mod tests {
         assert_eq!(angular_velocity(IDENTITY, IDENTITY, 30.0), [0.0; 3]);
         let tiny = from_axis_angle([0.0, 0.0, 1.0], 1e-10);
         assert_close(&angular_velocity(IDENTITY, tiny, 30.0), &[0.0, 0.0, 3e-9], 1e-22);
+    }
+
+    #[test]
+    fn slerp_turns_evenly_along_the_shorter_arc() {
+        let (a, b) = (
+            from_axis_angle([0.0, 1.0, 0.0], 0.2),
+            from_axis_angle([0.0, 1.0, 0.0], 1.4).map(|c| -c),
+        );
+        for i in 0..=6 {
+            let s = f64::from(i) / 6.0;
+            let q = slerp(a, b, s);
+            let turned = angular_velocity(a, q, 1.0)[1];
+            assert!((turned - 1.2 * s).abs() < 1e-12, "{s}: {turned}");
+        }
+        assert_eq!(slerp(a, a, 0.3), a);
     }
 
     #[test]

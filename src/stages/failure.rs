@@ -19,14 +19,20 @@ pub enum FailureKind {
     /// The file was written to while it was read, or since it was ingested.
     Changed,
     ChannelLimit,
+    /// A constraint that the track cannot keep.
+    Constraint,
     DuplicateId,
     EmptyFile,
+    /// What runs a model stopped.
+    Engine,
     Layout,
     LengthMismatch,
     MissingKey,
     Name,
     /// A song without enough beats to dance to.
     NoBeats,
+    /// A phrase with nothing to dance to.
+    NoMusic,
     /// A capture that nothing can be danced of.
     NoPrimitive,
     NonFinite,
@@ -47,6 +53,7 @@ pub enum FailureKind {
     TooShort,
     Truncated,
     Unreadable,
+    Unwritable,
 }
 
 impl FailureKind {
@@ -63,13 +70,16 @@ impl FailureKind {
             FailureKind::BvhFormat => "bvh_format",
             FailureKind::Changed => "changed",
             FailureKind::ChannelLimit => "channel_limit",
+            FailureKind::Constraint => "constraint",
             FailureKind::DuplicateId => "duplicate_id",
             FailureKind::EmptyFile => "empty_file",
+            FailureKind::Engine => "engine",
             FailureKind::Layout => "layout",
             FailureKind::LengthMismatch => "length_mismatch",
             FailureKind::MissingKey => "missing_key",
             FailureKind::Name => "name",
             FailureKind::NoBeats => "no_beats",
+            FailureKind::NoMusic => "no_music",
             FailureKind::NoPrimitive => "no_primitive",
             FailureKind::NonFinite => "non_finite",
             FailureKind::NotAFile => "not_a_file",
@@ -87,6 +97,7 @@ impl FailureKind {
             FailureKind::TooShort => "too_short",
             FailureKind::Truncated => "truncated",
             FailureKind::Unreadable => "unreadable",
+            FailureKind::Unwritable => "unwritable",
         }
     }
 }
@@ -136,7 +147,7 @@ pub fn guarded<T>(path: &str, work: impl FnOnce() -> Result<T, Failure>) -> Resu
 
 impl FailureKind {
     /// Every kind, for looking one up by the name that a reader gives.
-    const ALL: [FailureKind; 34] = [
+    const ALL: [FailureKind; 38] = [
         FailureKind::AudioCodec,
         FailureKind::AudioData,
         FailureKind::AudioHeader,
@@ -147,13 +158,16 @@ impl FailureKind {
         FailureKind::BvhFormat,
         FailureKind::Changed,
         FailureKind::ChannelLimit,
+        FailureKind::Constraint,
         FailureKind::DuplicateId,
         FailureKind::EmptyFile,
+        FailureKind::Engine,
         FailureKind::Layout,
         FailureKind::LengthMismatch,
         FailureKind::MissingKey,
         FailureKind::Name,
         FailureKind::NoBeats,
+        FailureKind::NoMusic,
         FailureKind::NoPrimitive,
         FailureKind::NonFinite,
         FailureKind::NotAFile,
@@ -171,6 +185,7 @@ impl FailureKind {
         FailureKind::TooShort,
         FailureKind::Truncated,
         FailureKind::Unreadable,
+        FailureKind::Unwritable,
     ];
 
     /// Returns the kind that a reader names.

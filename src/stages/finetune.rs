@@ -65,17 +65,17 @@ pub struct Params {
     #[arg(long, value_name = "N", default_value_t = NonZeroUsize::new(8).expect("not 0"),
           help_heading = "Optimizer")]
     pub batch_size: NonZeroUsize,
-    /// Learning rate of the UNet.
-    #[arg(long, value_name = "X", default_value_t = 1e-6, help_heading = "Optimizer")]
+    /// Learning rate of the UNet (1e-6 in the reference).
+    #[arg(long, value_name = "X", default_value_t = 1e-4, help_heading = "Optimizer")]
     pub lr_diffusion: f64,
-    /// Learning rate of the decoder.
-    #[arg(long, value_name = "X", default_value_t = 5e-5, help_heading = "Optimizer")]
+    /// Learning rate of the decoder (5e-5 in the reference).
+    #[arg(long, value_name = "X", default_value_t = 5e-6, help_heading = "Optimizer")]
     pub lr_decoder: f64,
-    /// Weight of the loss of the UNet's prediction.
-    #[arg(long, value_name = "W", default_value_t = 0.1, help_heading = "Losses")]
-    pub diffusion_weight: f64,
-    /// Weight of the distance of sampled motion from the phrase's.
+    /// Weight of the loss of the UNet's prediction (0.1 in the reference).
     #[arg(long, value_name = "W", default_value_t = 1.0, help_heading = "Losses")]
+    pub diffusion_weight: f64,
+    /// Weight of the distance of sampled motion from the phrase's (1 in the reference).
+    #[arg(long, value_name = "W", default_value_t = 3.0, help_heading = "Losses")]
     pub decoder_weight: f64,
     /// Weight of the losses of coherence in time.
     #[arg(long, value_name = "W", default_value_t = 10.0, help_heading = "Losses")]
@@ -94,7 +94,7 @@ pub struct Params {
     pub num_steps: usize,
     /// Share of the diffusion's steps that are undone: sampling begins with the phrase's motion made as
     /// noisy; 1 begins with noise alone, as in the reference, and ends in motion that stands still.
-    #[arg(long, value_name = "SHARE", default_value_t = 0.5, help_heading = "Losses")]
+    #[arg(long, value_name = "SHARE", default_value_t = 0.25, help_heading = "Losses")]
     pub start: f64,
     #[command(flatten)]
     pub machine: MachineParams,
@@ -287,7 +287,8 @@ impl Stage for Finetune {
             !params.resume || !checkpoints.steps(Kind::Step)?.is_empty(),
             "run {run} has no fine-tuning to resume in {store}; leave --resume out to start it"
         );
-        let trained = Trained::read(&store, run, Stand::Train)?;
+        let Trained { state: trained, unet, decoder, .. } =
+            Trained::read(&store, run, Stand::Train)?;
         if params.force {
             checkpoints.clear()?;
             Journal::open(&store, Self::NAME, run, Self::NAME)?.clear()?;
@@ -297,24 +298,26 @@ impl Stage for Finetune {
         let machine = &params.machine;
         let limit = config.num_phrases;
         let phrases = read_phrases(&store, Self::NAME, machine, limit, progress, &watch)?;
-        let network = &trained.state.config.network;
+        let network = &trained.config.network;
         let windows = Arc::new(Windows::new(
             Arc::clone(&phrases.dataset),
-            trained.state.scales.clone(),
+            trained.scales.clone(),
             // The phrases as they are: sampled motion is held against them.
             Augmentation { condition_noise: 0.0, mirror: false, yaw_deg: 0.0, stretch: 0.0 },
             network.window_frames,
             params.seed,
         ));
-        let objective = &trained.state.config.diffusion.objective;
+        let objective = &trained.config.diffusion.objective;
         let mut learner = FinetuneLearner::new(
             network,
             objective,
             &config,
             &windows,
-            [&trained.unet.parameters, &trained.decoder.parameters],
+            [&unet.parameters, &decoder.parameters],
         )?
         .on(&Arc::new(machine.start_threads()?));
+        // The learner has copies; of `base` they are half a gigabyte.
+        drop((unet, decoder));
         claim(&store, run, Self::NAME, &config, machine.patience(), &watch)?;
         let fresh = State::new(
             Self::NAME,

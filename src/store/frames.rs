@@ -11,9 +11,6 @@ use parquet::errors::ParquetError;
 use super::StoreError;
 use super::reader::Snapshot;
 
-/// Channels begin behind the item's name and the frame's number.
-const FIRST_CHANNEL: usize = 2;
-
 impl Snapshot {
     /// Returns a snapshot of one part alone.
     pub fn part(&self, i: usize) -> Self {
@@ -34,7 +31,7 @@ impl Snapshot {
         wanted: &BTreeSet<String>,
         mut visit: impl FnMut(&str, Array2<f32>) -> Result<(), E>,
     ) -> Result<(), E> {
-        let n_channels = self.schema.columns.len().saturating_sub(FIRST_CHANNEL);
+        let n_channels = self.schema.columns.len() - self.schema.frame_column() - 1;
         let mut item = String::new();
         let mut values: Vec<f32> = Vec::new();
         let mut finish = |item: &str, values: Vec<f32>| {
@@ -90,8 +87,9 @@ impl<'a> Columns<'a> {
         let column = |i: usize| batch.column_by_name(&table.schema.columns[i].name);
         let missing = || table.broken("a batch", "has no columns of frames".to_owned());
         let items = column(0).and_then(|c| c.as_any().downcast_ref()).ok_or_else(missing)?;
-        let numbers = column(1).and_then(|c| c.as_any().downcast_ref()).ok_or_else(missing)?;
-        let channels = (FIRST_CHANNEL..table.schema.columns.len())
+        let frame = table.schema.frame_column();
+        let numbers = column(frame).and_then(|c| c.as_any().downcast_ref()).ok_or_else(missing)?;
+        let channels = (frame + 1..table.schema.columns.len())
             .map(|i| column(i).and_then(|c| c.as_any().downcast_ref()).ok_or_else(missing))
             .collect::<Result<_, _>>()?;
         Ok(Self { items, numbers, channels })

@@ -54,7 +54,7 @@ impl ItemTables {
     /// [`StoreError`] when a part cannot be read, is of another version or has other columns, or
     /// when its frames are not 0, 1, 2 and so on.
     pub fn frames(&self, table: TableSchema) -> Result<Option<Array2<f32>>, StoreError> {
-        let n_channels = table.columns.len().saturating_sub(2);
+        let n_channels = table.columns.len() - table.frame_column() - 1;
         let batches: Vec<RecordBatch> =
             self.snapshot(table.clone())?.batches().collect::<Result<_, _>>()?;
         let n_frames = batches.iter().map(RecordBatch::num_rows).sum();
@@ -80,7 +80,7 @@ impl ItemTables {
     ) -> Result<(), StoreError> {
         let broken = |what: String| self.broken(table, what);
         let column = |i: usize| batch.column_by_name(&table.columns[i].name);
-        let numbers = column(1)
+        let numbers = column(table.frame_column())
             .and_then(|c| c.as_any().downcast_ref::<Int32Array>())
             .ok_or_else(|| broken("has no frame numbers".to_owned()))?;
         for (number, expected) in numbers.values().iter().zip(first..) {
@@ -88,7 +88,7 @@ impl ItemTables {
                 return Err(broken(format!("has frame {number} where frame {expected} should be")));
             }
         }
-        for (mut to, i) in frames.columns_mut().into_iter().zip(2..) {
+        for (mut to, i) in frames.columns_mut().into_iter().zip(table.frame_column() + 1..) {
             let from = column(i)
                 .and_then(|c| c.as_any().downcast_ref::<Float32Array>())
                 .ok_or_else(|| broken(format!("has no numbers in {}", table.columns[i].name)))?;

@@ -33,7 +33,7 @@ pub use frames::FrameSpool;
 pub use item::ItemTables;
 pub use local::{replace_file, temporary_beside, write_file};
 pub use location::{Listed, Location, Put};
-pub use part::{FinishedPart, PartWriter};
+pub use part::{FinishedPart, Label, PartWriter};
 pub use patience::Patience;
 pub use prepared::prepared;
 #[cfg(feature = "query")]

@@ -33,10 +33,17 @@ pub struct PartWriter {
 /// Rows of a frame table that wait for their row group.
 #[derive(Default)]
 struct FrameBuffer {
-    /// Items and how many frames each has here.
-    items: Vec<(String, usize)>,
+    /// Items, what else names them, and how many frames each has here.
+    items: Vec<(String, Vec<Label>, usize)>,
     frame: Vec<i32>,
     channels: Vec<Vec<f32>>,
+}
+
+/// What names an item beside its own column; the same for all its frames.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Label {
+    Text(String),
+    Number(i32),
 }
 
 /// A finished part, not yet published.
@@ -76,7 +83,7 @@ impl PartWriter {
         }
         let writer = ArrowWriter::try_new(file, Arc::clone(&schema), Some(properties.build()))
             .map_err(|e| failed(&table, e))?;
-        let n_channels = table.columns.len().saturating_sub(2);
+        let n_channels = table.columns.len().saturating_sub(table.frame_column() + 1);
         let frames = FrameBuffer { channels: vec![Vec::new(); n_channels], ..Default::default() };
         Ok(Self { table, schema, writer, frames, n_rows: 0 })
     }
@@ -108,7 +115,24 @@ impl PartWriter {
         item: &str,
         frames: ndarray::ArrayView2<f32>,
     ) -> Result<(), StoreError> {
+        self.write_labelled_frames(item, &[], frames)
+    }
+
+    /// Appends the frames of one item to a frame table that has labels, given in the order of its columns.
+    ///
+    /// # Errors
+    /// [`StoreError::Parquet`].
+    ///
+    /// # Panics
+    /// When there are more or fewer labels or channels than the table has.
+    pub fn write_labelled_frames(
+        &mut self,
+        item: &str,
+        labels: &[Label],
+        frames: ndarray::ArrayView2<f32>,
+    ) -> Result<(), StoreError> {
         assert_eq!(frames.ncols(), self.frames.channels.len(), "channels of {}", self.table.name);
+        assert_eq!(labels.len() + 1, self.table.frame_column(), "labels of {}", self.table.name);
         let waiting = self.frames.frame.len();
         if waiting > 0 && waiting + frames.nrows() > ROW_GROUP_ROWS {
             self.flush_frames()?;
@@ -117,7 +141,7 @@ impl PartWriter {
         {
             let first = start * ROW_GROUP_ROWS;
             let buffer = &mut self.frames;
-            buffer.items.push((item.to_owned(), piece.nrows()));
+            buffer.items.push((item.to_owned(), labels.to_vec(), piece.nrows()));
             buffer.frame.extend((first..first + piece.nrows()).map(|i| i as i32));
             for (channel, values) in buffer.channels.iter_mut().zip(piece.columns()) {
                 channel.extend(values);
@@ -135,12 +159,15 @@ impl PartWriter {
         if n_rows == 0 {
             return Ok(());
         }
-        let mut item = StringBuilder::with_capacity(n_rows, n_rows * 16);
-        for (name, n) in buffer.items.drain(..) {
-            (0..n).for_each(|_| item.append_value(&name));
+        let items: Vec<(String, Vec<Label>, usize)> = buffer.items.drain(..).collect();
+        let mut columns: Vec<ArrayRef> =
+            vec![repeated(items.iter().map(|(name, _, n)| (name.as_str(), *n)), n_rows)];
+        for label in 0..self.table.frame_column() - 1 {
+            let of =
+                move |(_, labels, n): &(String, Vec<Label>, usize)| (labels[label].clone(), *n);
+            columns.push(labels_of(items.iter().map(of), n_rows));
         }
-        let frame = Int32Array::from(std::mem::take(&mut buffer.frame));
-        let mut columns: Vec<ArrayRef> = vec![Arc::new(item.finish()), Arc::new(frame)];
+        columns.push(Arc::new(Int32Array::from(std::mem::take(&mut buffer.frame))));
         for channel in &mut buffer.channels {
             columns.push(Arc::new(Float32Array::from(std::mem::take(channel))));
         }
@@ -167,6 +194,38 @@ impl PartWriter {
         }
         let file = self.writer.into_inner().map_err(|e| failed(&self.table, e))?;
         Ok(FinishedPart { file, n_rows: self.n_rows })
+    }
+}
+
+/// A column of texts, each repeated.
+fn repeated<'a>(texts: impl Iterator<Item = (&'a str, usize)>, n_rows: usize) -> ArrayRef {
+    let mut column = StringBuilder::with_capacity(n_rows, n_rows * 16);
+    for (text, n) in texts {
+        (0..n).for_each(|_| column.append_value(text));
+    }
+    Arc::new(column.finish())
+}
+
+/// A column of labels of one kind, each repeated.
+fn labels_of(labels: impl Iterator<Item = (Label, usize)> + Clone, n_rows: usize) -> ArrayRef {
+    let numbers = labels.clone().map(|(label, n)| match label {
+        Label::Number(number) => Some((number, n)),
+        Label::Text(_) => None,
+    });
+    match numbers.collect::<Option<Vec<_>>>() {
+        Some(numbers) => {
+            let all = numbers.into_iter().flat_map(|(number, n)| std::iter::repeat_n(number, n));
+            Arc::new(all.collect::<Int32Array>())
+        }
+        None => {
+            let texts: Vec<(String, usize)> = labels
+                .map(|(label, n)| match label {
+                    Label::Text(text) => (text, n),
+                    Label::Number(number) => (number.to_string(), n),
+                })
+                .collect();
+            repeated(texts.iter().map(|(text, n)| (text.as_str(), *n)), n_rows)
+        }
     }
 }
 

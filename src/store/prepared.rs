@@ -95,7 +95,7 @@ mod tests {
             std::fs::write(folder.join("a"), "half").expect("written");
             Err(StoreError::Cache { place: "x".into(), reason: "broken".into() })
         });
-        assert_eq!(broken.unwrap_err().to_string(), "cache x broken");
+        assert_eq!(broken.unwrap_err().to_string(), "cache x: broken");
         assert_eq!(std::fs::read_dir(root.path()).unwrap().count(), 0);
     }
 

@@ -74,10 +74,19 @@ impl ColumnType {
     }
 }
 
+/// The column that counts the frames of an item.
+pub const FRAME_COLUMN: &str = "frame";
+
 impl TableSchema {
     /// Returns the column that names the item which a row belongs to: the first that rows are sorted by.
     pub fn item_column(&self) -> &'static str {
         self.sorted_by[0]
+    }
+
+    /// Returns the place of the column that counts the frames of a frame table. Before it are the item and what
+    /// else names it (labels), behind it the channels.
+    pub fn frame_column(&self) -> usize {
+        self.columns.iter().position(|column| column.name == FRAME_COLUMN).unwrap_or(0)
     }
 
     /// Returns the Arrow schema of the table's parts.

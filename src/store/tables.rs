@@ -158,6 +158,70 @@ rows! {
     }
 }
 
+rows! {
+    "One row per motion that generate sampled, kept or not; measured times differ from run to run, nothing else does."
+    GenerationRow in "generations" version 1 sorted by [generation, candidate]
+    {
+        generation: String, "", "The motion: `RUN/PHRASE/SAMPLE`.";
+        run: String, "", "Name of the generation (--run), by default that of the model.";
+        phrase_id: String, "", "The phrase whose music it was made for, as in `phrases`.";
+        sample: i32, "samples", "Number of the motion among those of the phrase, from 0.";
+        candidate: i32, "", "Number of the candidate for the sample, from 0; more than one with --best-of.";
+        selected: bool, "", "Whether it is the candidate that was kept; its frames are in `generated`.";
+        seed: i64, "", "Seed of its noise, which follows from --seed, the phrase, the sample and the candidate.";
+        model: String, "", "Name of the model.";
+        weights: String, "SHA-256", "Digest of the model's weights, UNet and decoder.";
+        engine: String, "", "What ran the model: `onnx` or `eager`.";
+        sampler: String, "", "Name of the sampler.";
+        n_steps: i32, "steps", "Steps of the sampler.";
+        guidance: f64, "", "Guidance: 1 follows the music, more exaggerates it.";
+        eta: Option<f64>, "", "Of DDIM, the share of the noise that is renewed.";
+        primed_by: Option<String>, "", "The library phrases that sampling began from, one for each window.";
+        n_frames: i64, "frames", "Frames of the motion.";
+        n_windows: i32, "windows", "Windows that it was sampled in.";
+        score: Option<f64>, "", "Score of the selection, from 0 to 1; none where a value is not finite.";
+        checks_passed: i32, "checks", "Sanity checks passed, of the reference's and the strict ones.";
+        n_checks: i32, "checks", "Sanity checks made.";
+        locking: Option<f64>, "", "Share of the vertical velocity's variance that follows the bar, R²; none without beats.";
+        velocity_error: f64, "m/s", "Mean |v − 30 Δp| of the motion as it was decoded, before post-processing.";
+        control_error_mm: Option<f64>, "mm", "Largest distance from a constraint on the position.";
+        control_error_deg: Option<f64>, "°", "Largest angle from a constraint on the orientation.";
+        generate_s: f64, "s", "Time that sampling, decoding and post-processing took.";
+        real_time_factor: f64, "", "That time over the length of the motion.";
+        time: TimestampUs, "", "When it was made.";
+    }
+}
+
+/// Name of the table of generated motion.
+pub const GENERATED: &str = "generated";
+
+/// Returns the schema of `generated`: one row per frame, named by run, phrase and sample.
+pub fn generated() -> TableSchema {
+    let mut table = TableSchema { name: GENERATED, ..motion() };
+    table.description = "One row per frame of generated motion at 30 fps.";
+    let column = |name: &'static str, column_type, unit, meaning: &'static str| Column {
+        name: name.into(),
+        column_type,
+        nullable: false,
+        unit,
+        description: meaning.into(),
+    };
+    table.columns[0] = column(
+        "generation",
+        ColumnType::Utf8,
+        "",
+        "The motion: `RUN/PHRASE/SAMPLE`, as in `generations`.",
+    );
+    let labels = [
+        column("run", ColumnType::Utf8, "", "Name of the generation."),
+        column(ITEM_COLUMN, ColumnType::Utf8, "", "The phrase, as in `phrases`."),
+        column("sample", ColumnType::Int32, "samples", "Number of the motion among the phrase's."),
+    ];
+    table.columns.splice(1..1, labels);
+    table.sorted_by = &["generation", "frame"];
+    table
+}
+
 /// Name of the feature table.
 pub const FEATURES: &str = "features";
 
@@ -231,6 +295,8 @@ pub fn all() -> Vec<TableSchema> {
         FailureRow::schema(),
         TrainingLogRow::schema(),
         OnnxCheckRow::schema(),
+        GenerationRow::schema(),
+        generated(),
     ]
 }
 

@@ -143,6 +143,14 @@ fn weighted_sum<I: Interpreter<Element = f32>>(
     Ok(sum.expect("a sum has terms"))
 }
 
+/// What is said of motion that was sampled and decoded.
+struct Sampled<T> {
+    position: T,
+    quaternion: T,
+    temporal: TemporalLosses<T>,
+    decoded: T,
+}
+
 /// What end-to-end training adds up, and the motion that it is about.
 pub struct EndToEnd<T> {
     pub total: T,
@@ -225,11 +233,34 @@ impl FinetuneLearner {
         g: &mut I,
         batch: &Batch,
     ) -> Result<EndToEnd<Tensor<f32>>, TrainingError> {
-        let Self { pipeline, schedule, config: c, .. } = self;
+        let diffusion = self.diffusion(g, batch)?;
+        let sampled = self.sampled(g, batch)?;
+        let rest = self.total(g, &sampled)?;
+        let total = weighted_sum(g, &[(&diffusion, self.config.diffusion_weight), (&rest, 1.0)])?;
+        let Sampled { position, quaternion, temporal, decoded } = sampled;
+        Ok(EndToEnd { total, diffusion, position, quaternion, temporal, decoded })
+    }
+
+    /// The loss of the UNet's prediction.
+    fn diffusion<I: Interpreter<Element = f32>>(
+        &self,
+        g: &mut I,
+        batch: &Batch,
+    ) -> Result<Tensor<f32>, TrainingError> {
+        let Self { pipeline, schedule, .. } = self;
         let given = Given::of(batch, schedule, Withhold::default(), pipeline.takes_style);
-        let diffusion = given.loss(g, &pipeline.unet, schedule, &self.objective)?;
-        // The sample begins with the same noise that was added above, turned round: independent of
-        // where a network that sees only the other went, and no further draw.
+        given.loss(g, &pipeline.unet, schedule, &self.objective)
+    }
+
+    /// The losses of motion that is sampled and decoded.
+    fn sampled<I: Interpreter<Element = f32>>(
+        &self,
+        g: &mut I,
+        batch: &Batch,
+    ) -> Result<Sampled<Tensor<f32>>, TrainingError> {
+        let Self { pipeline, schedule, config: c, .. } = self;
+        // The sample begins with the same noise that was added for the prediction, turned round: independent
+        // of where a network that sees only the other went, and no further draw.
         let noise: Vec<f32> = batch.noise.iter().rev().copied().collect();
         let from = c.first_step(schedule.len());
         let x = if from == schedule.len() { noise } else { self.noised(batch, &noise, from - 1) };
@@ -238,15 +269,21 @@ impl FinetuneLearner {
         let normalizer = self.windows.normalizer();
         let found = reconstruction(g, normalizer, &decoded, &batch.motion, &batch.mask)?;
         let temporal = temporal_losses(g, &c.temporal, &decoded, &batch.mask)?;
-        let mut terms = vec![
-            (&diffusion, c.diffusion_weight),
-            (&found.position, c.decoder_weight),
-            (&found.quaternion, c.decoder_weight),
-        ];
-        terms.extend(temporal.all().map(|loss| (loss, c.temporal_weight)));
-        let total = weighted_sum(g, &terms)?;
         let (position, quaternion) = (found.position, found.quaternion);
-        Ok(EndToEnd { total, diffusion, position, quaternion, temporal, decoded })
+        Ok(Sampled { position, quaternion, temporal, decoded })
+    }
+
+    /// The weighted sum of what is said of sampled motion.
+    fn total<I: Interpreter<Element = f32>>(
+        &self,
+        g: &mut I,
+        sampled: &Sampled<Tensor<f32>>,
+    ) -> Result<Tensor<f32>, TrainingError> {
+        let c = &self.config;
+        let mut terms =
+            vec![(&sampled.position, c.decoder_weight), (&sampled.quaternion, c.decoder_weight)];
+        terms.extend(sampled.temporal.all().map(|loss| (loss, c.temporal_weight)));
+        weighted_sum(g, &terms)
     }
 
     /// The motion of a batch at step t of the diffusion, \[batch, frames, 25\].
@@ -269,15 +306,37 @@ impl FinetuneLearner {
 
     fn differentiate(&mut self, batch: &Batch, step: u64) -> Result<Losses, TrainingError> {
         self.gradients.clear();
-        let seed = tape_seed(self.config.seed, step);
-        let mut tape = Tape::new(&self.parameters, &self.arena, Some(seed));
-        let found = self.losses(&mut tape, batch)?;
-        let losses = named(&found);
-        let EndToEnd { total, .. } = found;
-        tape.backward(total, &mut self.gradients)?;
+        // A tape for either part of the sum, one after the other, so that what backward needs of the
+        // prediction is not kept while motion is sampled: a tenth of the memory of a step of `base`.
+        let tape = |part: u64| {
+            let seed = tape_seed(self.config.seed, 2 * step + part);
+            Tape::new(&self.parameters, &self.arena, Some(seed))
+        };
+        let mut first = tape(0);
+        let diffusion = self.diffusion(&mut first, batch)?;
+        let diffusion_value = value(&diffusion);
+        let weighted = first.scale(&diffusion, self.config.diffusion_weight)?;
+        first.backward(weighted, &mut self.gradients)?;
+        let mut second = tape(1);
+        let sampled = self.sampled(&mut second, batch)?;
+        let rest = self.total(&mut second, &sampled)?;
+        let total = self.config.diffusion_weight * diffusion_value + value(&rest);
+        let losses = named(
+            total,
+            diffusion_value,
+            &sampled.position,
+            &sampled.quaternion,
+            &sampled.temporal,
+        );
+        drop(sampled);
+        second.backward(rest, &mut self.gradients)?;
         self.reducer.reduce(&mut self.gradients);
         Ok(losses)
     }
+}
+
+fn value(x: &Tensor<f32>) -> f64 {
+    f64::from(x.scalar())
 }
 
 /// Returns where a parameter of both networks comes from, and what it is called there.
@@ -292,16 +351,21 @@ fn split<'a>(
     }
 }
 
-fn named(found: &EndToEnd<Tensor<f32>>) -> Losses {
-    let value = |x: &Tensor<f32>| f64::from(x.scalar());
+fn named(
+    total: f64,
+    diffusion: f64,
+    position: &Tensor<f32>,
+    quaternion: &Tensor<f32>,
+    temporal: &TemporalLosses<Tensor<f32>>,
+) -> Losses {
     let mut parts = vec![
-        ("diffusion", value(&found.diffusion)),
-        ("decoder_position", value(&found.position)),
-        ("decoder_quaternion", value(&found.quaternion)),
+        ("diffusion", diffusion),
+        ("decoder_position", value(position)),
+        ("decoder_quaternion", value(quaternion)),
     ];
-    let temporal = TemporalLosses::<()>::NAMES.into_iter().zip(found.temporal.all());
+    let temporal = TemporalLosses::<()>::NAMES.into_iter().zip(temporal.all());
     parts.extend(temporal.map(|(name, loss)| (name, value(loss))));
-    Losses { total: value(&found.total), parts }
+    Losses { total, parts }
 }
 
 fn norm(x: &[f32]) -> f64 {
@@ -374,7 +438,8 @@ impl Learner for FinetuneLearner {
                 let mut g = Eager::new(&self.parameters, &self.arena);
                 self.losses(&mut g, &batch)
             })?;
-            let mut losses = named(&found);
+            let EndToEnd { total, diffusion, position, quaternion, temporal, .. } = &found;
+            let mut losses = named(value(total), value(diffusion), position, quaternion, temporal);
             let decoded = self.threads.run(|| self.generated(&batch))?;
             let motions = decoded.data().chunks_exact(batch.n_frames * MOTION_DIM);
             let target = self.config.temporal.target_quaternion_dot;

@@ -216,7 +216,7 @@ fn what_is_missing_is_named_with_the_way_out() {
          setup` for version 1.32.0, or use --engine eager\n"
     );
     let text = dir.at("libonnxruntime.so");
-    crate::support::write(&text, b"no library".to_vec());
+    crate::support::write(&text, b"no library");
     let foreign = export(&store, &[&format!("--ort-lib={}", text.display())]);
     assert_eq!(
         foreign.stderr,

@@ -42,9 +42,8 @@ fn coherence_improves_and_every_loss_is_logged() {
             + of(row.quaternion_delta)
             + of(row.phase_monotonic)
             + of(row.position_smoothness);
-        let total = 0.1 * of(row.diffusion)
-            + of(row.decoder_position)
-            + of(row.decoder_quaternion)
+        let total = of(row.diffusion)
+            + 3.0 * (of(row.decoder_position) + of(row.decoder_quaternion))
             + 10.0 * temporal;
         // Sums of a dozen single-precision numbers.
         assert!((of(row.loss) - total).abs() < 1e-5 * total, "{} and {total}", of(row.loss));
@@ -112,7 +111,7 @@ fn a_run_that_was_not_trained_is_refused() {
     assert_eq!(output.code, 0, "{output:?}");
     assert_eq!(
         said("run", &["--num-steps=0"]),
-        "error: n_steps of the sampler is 0; it must be 1 to 500, the number of steps that the network \
+        "error: n_steps of the sampler is 0; it must be 1 to 250, the number of steps that the network \
          was trained on"
     );
     assert_eq!(

@@ -205,7 +205,7 @@ fn config(num_steps: usize, [diffusion, decoder, temporal]: [f64; 3]) -> Finetun
         diffusion_weight: diffusion,
         decoder_weight: decoder,
         temporal_weight: temporal,
-        temporal: TemporalConfig::default(),
+        temporal: TemporalConfig::reference(),
         num_steps,
         start: 1.0,
         optimizer: OptimizerConfig::default(),

@@ -22,7 +22,7 @@ fn check<E: Element>(tolerance: f64) {
         phase_weight: 0.5,
         smoothness_weight: 1.5,
         max_step_m: 0.375,
-        ..TemporalConfig::default()
+        ..TemporalConfig::reference()
     };
     let parameters = Parameters::<E>::new(ParameterList::default(), 0);
     let arena = Arena::default();

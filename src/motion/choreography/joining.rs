@@ -3,7 +3,7 @@
 use super::super::kinematics::Poses;
 use super::super::lowpass::lowpass;
 use super::super::quaternion::{
-    Quaternion, dot, from_axis_angle, make_sign_continuous, mul, rotate,
+    Quaternion, from_axis_angle, make_sign_continuous, mul, rotate, slerp,
 };
 use super::primitive::{Repertoire, UP, lowpass_orientation};
 use super::selection::Step;
@@ -160,26 +160,9 @@ fn hermite(
     })
 }
 
-/// Spherical linear interpolation along the shorter arc, `sin((1-s)θ) q_a + sin(sθ) q_b` over `sin θ`.
-///
-/// Source: Shoemake, Animating rotation with quaternion curves, SIGGRAPH 1985.
-fn slerp(a: Quaternion, b: Quaternion, s: f64) -> Quaternion {
-    let cosine = dot(a, b);
-    let b = if cosine < 0.0 { b.map(|c| -c) } else { b };
-    let angle = cosine.abs().min(1.0).acos();
-    // Nearly equal orientations: the limit of both weights.
-    let (wa, wb) = if angle < 1e-6 {
-        (1.0 - s, s)
-    } else {
-        (((1.0 - s) * angle).sin() / angle.sin(), (s * angle).sin() / angle.sin())
-    };
-    super::super::quaternion::normalize(std::array::from_fn(|c| wa * a[c] + wb * b[c]))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::motion::quaternion::angular_velocity;
 
     #[test]
     fn hermite_curves_meet_both_ends_with_their_velocities() {
@@ -193,17 +176,5 @@ mod tests {
             assert!((start / 0.4 - from.1[i]).abs() < 1e-4, "{start}");
             assert!((end / 0.4 - to.1[i]).abs() < 1e-4, "{end}");
         }
-    }
-
-    #[test]
-    fn slerp_turns_evenly_along_the_shorter_arc() {
-        let (a, b) = (from_axis_angle(UP, 0.2), from_axis_angle(UP, 1.4).map(|c| -c));
-        for i in 0..=6 {
-            let s = f64::from(i) / 6.0;
-            let q = slerp(a, b, s);
-            let turned = angular_velocity(a, q, 1.0)[1];
-            assert!((turned - 1.2 * s).abs() < 1e-12, "{s}: {turned}");
-        }
-        assert_eq!(slerp(a, a, 0.3), a);
     }
 }

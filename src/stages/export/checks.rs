@@ -281,7 +281,15 @@ impl Checking<'_> {
     ) -> anyhow::Result<(OnnxCheckRow, Array3<f32>)> {
         let (x, audio) = (Self::noise(case, 12), Self::audio(music, case));
         let run = |engine: &dyn Engine| {
-            sample(engine, sampling, x.clone(), audio.view(), None, |_, _| (), None)
+            sample(
+                engine,
+                sampling,
+                (x.clone(), sampling.schedule.len()),
+                audio.view(),
+                None,
+                |_, _| (),
+                None,
+            )
         };
         let (a, onnx_s) = timed(|| run(onnx))?;
         let (b, eager_s) = timed(|| run(eager))?;

@@ -64,7 +64,15 @@ pub fn look(
             Stream::new(0, 0).normal(0, x.as_slice_mut().expect("in order"));
             let sampling = Sampling { config: &config, schedule: &schedule, guidance: 1.0 };
             let started = Instant::now();
-            let latent = sample(&*engine, sampling, x, audio.view(), None, |_, _| (), None)?;
+            let latent = sample(
+                &*engine,
+                sampling,
+                (x, schedule.len()),
+                audio.view(),
+                None,
+                |_, _| (),
+                None,
+            )?;
             engine.decode(latent.view())?;
             Ok(started.elapsed().as_secs_f64())
         };

@@ -1,0 +1,281 @@
+//! Where two windows of a track share frames: both are brought to one motion there.
+//!
+//! Every window stands where its own first frame stands, over the origin and facing +Z, because that is
+//! what networks are trained on. What two neighbours share is therefore the same motion only after the
+//! earlier one's part is placed like a window of its own.
+
+use ndarray::{Array2, ArrayView2, ArrayViewMut2, s};
+
+use crate::motion::quaternion::{Quaternion, dot, slerp};
+use crate::motion::{Channel, MOTION_DIM, Placement};
+
+/// Makes a window and the next agree on what they share; both in metres, `[T, 25]`.
+///
+/// The shared frames become a blend that begins as the earlier window and ends as the later one, seen from
+/// the later window in it and from the earlier one in that. `shift` frames of the earlier window come
+/// before the later one's first.
+pub fn agree(earlier: &mut Array2<f32>, later: &mut Array2<f32>, shift: usize) {
+    let (blend, placement) = blended(earlier.view(), later.view(), shift);
+    later.slice_mut(s![..blend.nrows(), ..]).assign(&blend);
+    let mut back = blend;
+    placement.restore(&mut back);
+    let sign_of = earlier.slice(s![shift..shift + 1, ..]).to_owned();
+    align_signs(sign_of.view(), &mut back.view_mut());
+    earlier.slice_mut(s![shift.., ..]).assign(&back);
+}
+
+/// Brings the beginning of a window to the end of one that does not change any more.
+pub fn follow(earlier: ArrayView2<f32>, later: &mut Array2<f32>, shift: usize) {
+    let (blend, _) = blended(earlier, later.view(), shift);
+    later.slice_mut(s![..blend.nrows(), ..]).assign(&blend);
+}
+
+/// Returns the frames that two windows share, placed as the later one is, and where the earlier one has
+/// the first of them.
+fn blended(
+    earlier: ArrayView2<f32>,
+    later: ArrayView2<f32>,
+    shift: usize,
+) -> (Array2<f32>, Placement) {
+    let mut a = earlier.slice(s![shift.., ..]).to_owned();
+    let placement = Placement::of_first(a.view()).unwrap_or_default();
+    placement.remove(&mut a);
+    let n = a.nrows().min(later.nrows());
+    let blend = cross_fade(a.slice(s![..n, ..]), later.slice(s![..n, ..]));
+    (blend, placement)
+}
+
+/// Fades one motion into another, `[T, 25]` each: all of the first at the first frame, all of the second
+/// behind the last.
+///
+/// The weight is 3u² − 2u³, u = t / T, so that both ends join smoothly. Orientations are turned along the
+/// shorter arc, phases round the shorter way of the bar.
+pub fn cross_fade(a: ArrayView2<f32>, b: ArrayView2<f32>) -> Array2<f32> {
+    let n = a.nrows();
+    let mut blend = a.to_owned();
+    for (t, (mut row, b)) in blend.rows_mut().into_iter().zip(b.rows()).enumerate() {
+        let u = t as f64 / n.max(1) as f64;
+        let w = u * u * (3.0 - 2.0 * u);
+        let at = |i: usize| f64::from(b[i]);
+        for channel in Channel::ALL {
+            match channel {
+                Channel::Quaternion => {
+                    let first = channel.range().start;
+                    let from: Quaternion = std::array::from_fn(|i| f64::from(row[first + i]));
+                    let to: Quaternion = std::array::from_fn(|i| at(first + i));
+                    for (i, x) in channel.range().zip(between(from, to, w)) {
+                        row[i] = x as f32;
+                    }
+                }
+                Channel::Phase => {
+                    let i = channel.range().start;
+                    let from = f64::from(row[i]);
+                    // The shorter way, which may lead over a downbeat. Where it does not nothing is wrapped:
+                    // estimates on their way to a phase may lie outside [0, 1).
+                    let n_bars = (at(i) - from).round();
+                    let x = from + w * (at(i) - from - n_bars);
+                    row[i] = if n_bars == 0.0 { x } else { x.rem_euclid(1.0) } as f32;
+                }
+                _ => {
+                    for i in channel.range() {
+                        let from = f64::from(row[i]);
+                        row[i] = (from + w * (at(i) - from)) as f32;
+                    }
+                }
+            }
+        }
+    }
+    blend
+}
+
+/// Turns from one orientation to another along the shorter arc; lengths, which estimates have, are blended
+/// apart.
+fn between(from: Quaternion, to: Quaternion, w: f64) -> Quaternion {
+    let (a, b) = (dot(from, from).sqrt(), dot(to, to).sqrt());
+    if !(a > 1e-9 && b > 1e-9) {
+        return std::array::from_fn(|i| from[i] + w * (to[i] - from[i]));
+    }
+    let length = a + w * (b - a);
+    slerp(from.map(|x| x / a), to.map(|x| x / b), w).map(|x| x * length)
+}
+
+/// Gives all orientations the sign that is nearer to the first frame of what they follow.
+fn align_signs(like: ArrayView2<f32>, frames: &mut ArrayViewMut2<f32>) {
+    let columns = Channel::Quaternion.range();
+    let (Some(a), Some(b)) = (like.rows().into_iter().next(), frames.rows().into_iter().next())
+    else {
+        return;
+    };
+    let sum: f32 = columns.clone().map(|i| a[i] * b[i]).sum();
+    if sum < 0.0 {
+        frames.slice_mut(s![.., columns]).mapv_inplace(|x| -x);
+    }
+}
+
+/// Puts the windows of a track one after another, as they are finished.
+#[derive(Debug, Default)]
+pub struct Joiner {
+    /// The frames of the latest window where it lies in the world; those before are given out.
+    latest: Option<Array2<f32>>,
+}
+
+impl Joiner {
+    /// Begins with a track that stands at the origin and faces +Z.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Takes the next window, `shift` frames behind the one before; returns the frames that no later window
+    /// changes, in the world.
+    pub fn push(&mut self, mut window: Array2<f32>, shift: usize) -> Array2<f32> {
+        let Some(before) = self.latest.take() else {
+            self.latest = Some(window);
+            return Array2::zeros((0, MOTION_DIM));
+        };
+        let shared = before.slice(s![shift.., ..]);
+        let own = Placement::of_first(window.view()).unwrap_or_default();
+        own.remove(&mut window);
+        Placement::of_first(shared).unwrap_or_default().restore(&mut window);
+        align_signs(shared, &mut window.view_mut());
+        let n = shared.nrows().min(window.nrows());
+        let blend = cross_fade(shared.slice(s![..n, ..]), window.slice(s![..n, ..]));
+        window.slice_mut(s![..n, ..]).assign(&blend);
+        self.latest = Some(window);
+        before.slice(s![..shift, ..]).to_owned()
+    }
+
+    /// Returns the frames of the last window.
+    pub fn finish(self) -> Array2<f32> {
+        self.latest.unwrap_or_else(|| Array2::zeros((0, MOTION_DIM)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::generation::windows::Windows;
+    use crate::motion::kinematics::{Poses, frames_of};
+    use crate::motion::quaternion::{from_axis_angle, make_sign_continuous, mul};
+    use crate::units::FPS;
+    use ndarray::{Axis, concatenate};
+
+    /// A walk along a curve that turns more than once round, leaning.
+    fn walk(n: usize) -> Array2<f32> {
+        let pose = |t: usize| {
+            let s = t as f64 / FPS;
+            let lean = from_axis_angle([1.0, 0.0, 0.0], 0.2 * (3.0 * s).sin());
+            let turn = from_axis_angle([0.0, 1.0, 0.0], 1.1 * s);
+            ([2.0 * (0.7 * s).sin(), 0.9 + 0.05 * (9.0 * s).cos(), 0.4 * s], mul(turn, lean))
+        };
+        let (position_m, mut orientation): (Vec<_>, Vec<_>) = (0..n + 2).map(pose).unzip();
+        make_sign_continuous(&mut orientation);
+        let mut frames = frames_of(&Poses { position_m, orientation }, n);
+        for (t, mut row) in frames.rows_mut().into_iter().enumerate() {
+            row[16] = (t as f32 / 53.0).fract();
+            row[20] = (t as f32 * 0.01).sin();
+        }
+        frames
+    }
+
+    fn windows_of(track: &Array2<f32>, windows: &Windows) -> Vec<Array2<f32>> {
+        let cut = |i: usize| {
+            let mut window = track.slice(s![windows.frames(i), ..]).to_owned();
+            Placement::of_first(window.view()).expect("frames").remove(&mut window);
+            window
+        };
+        (0..windows.len()).map(cut).collect()
+    }
+
+    fn same(a: &Array2<f32>, b: &Array2<f32>, tolerance: f32) {
+        assert_eq!(a.dim(), b.dim());
+        for ((t, i), x) in a.indexed_iter() {
+            // One rotation has two quaternions.
+            let quaternion = Channel::Quaternion.range();
+            let sign = |m: &Array2<f32>| m[[t, quaternion.start]].signum();
+            let y = if quaternion.contains(&i) { b[[t, i]] * sign(a) * sign(b) } else { b[[t, i]] };
+            assert!((x - y).abs() <= tolerance, "channel {i} at {t}: {x} and {y}");
+        }
+    }
+
+    #[test]
+    fn windows_of_a_motion_are_joined_to_that_motion() {
+        let track = {
+            let mut track = walk(431);
+            Placement::of_first(track.view()).expect("frames").remove(&mut track);
+            track
+        };
+        for (length, overlap) in [(120, 30), (97, 1), (64, 40)] {
+            let windows = Windows::new(431, length, overlap);
+            let mut joiner = Joiner::new();
+            let mut parts: Vec<Array2<f32>> = Vec::new();
+            for (i, window) in windows_of(&track, &windows).into_iter().enumerate() {
+                parts.push(joiner.push(window, windows.shift(i)));
+            }
+            parts.push(joiner.finish());
+            let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
+            let joined = concatenate(Axis(0), &views).expect("of 25 channels");
+            // Placements are found anew at every seam, each off by the rounding of 10 m; accelerations
+            // are up to 5 m/s².
+            same(&joined, &track, 5e-5);
+        }
+    }
+
+    #[test]
+    fn windows_that_agree_stay_as_they_are() {
+        let track = walk(200);
+        let windows = Windows::new(200, 120, 30);
+        let cut = windows_of(&track, &windows);
+        let (mut a, mut b) = (cut[0].clone(), cut[1].clone());
+        agree(&mut a, &mut b, windows.shift(1));
+        // Rounding of numbers up to 5, turned there and back.
+        same(&a, &cut[0], 1e-5);
+        same(&b, &cut[1], 1e-5);
+        follow(a.view(), &mut b, windows.shift(1));
+        same(&b, &cut[1], 1e-5);
+    }
+
+    #[test]
+    fn windows_that_disagree_meet() {
+        let track = walk(200);
+        let windows = Windows::new(200, 120, 30);
+        let shift = windows.shift(1);
+        let cut = windows_of(&track, &windows);
+        let (mut a, mut b) = (cut[0].clone(), cut[1].clone());
+        b.column_mut(1).mapv_inplace(|y| y + 0.3);
+        b.column_mut(16).mapv_inplace(|x| (x + 0.9).fract());
+        agree(&mut a, &mut b, shift);
+        let n = 120 - shift;
+        assert_eq!(
+            a[[shift, 1]],
+            cut[0][[shift, 1]],
+            "the first shared frame is the earlier one's"
+        );
+        for t in 0..n {
+            let u = t as f64 / n as f64;
+            let w = (u * u * (3.0 - 2.0 * u)) as f32;
+            let expected = cut[0][[shift + t, 1]] + 0.3 * w;
+            assert!(
+                (a[[shift + t, 1]] - expected).abs() < 1e-5 && (b[[t, 1]] - expected).abs() < 1e-5
+            );
+            // A tenth of a bar back, not nine tenths on.
+            let expected = (cut[0][[shift + t, 16]] - 0.1 * w).rem_euclid(1.0);
+            let off = (b[[t, 16]] - expected).abs();
+            assert!(!(1e-5..=1.0 - 1e-5).contains(&off), "{t}: {} for {expected}", b[[t, 16]]);
+        }
+        assert_eq!(a.slice(s![..shift, ..]), cut[0].slice(s![..shift, ..]));
+        assert_eq!(b.slice(s![n.., ..]), {
+            let mut rest = cut[1].slice(s![n.., ..]).to_owned();
+            rest.column_mut(1).mapv_inplace(|y| y + 0.3);
+            rest.column_mut(16).mapv_inplace(|x| (x + 0.9).fract());
+            rest
+        });
+    }
+
+    #[test]
+    fn estimates_without_a_length_are_blended_as_numbers() {
+        let (a, b) = (Array2::zeros((3, MOTION_DIM)), Array2::from_elem((3, MOTION_DIM), 0.5));
+        let blend = cross_fade(a.view(), b.view());
+        assert!(blend.iter().all(|x| x.is_finite()));
+        assert_eq!((blend[[0, 9]], blend[[0, 3]]), (0.0, 0.0));
+    }
+}

@@ -1,0 +1,260 @@
+//! Motion for a track of any length: windows sampled together where they meet, and joined.
+//!
+//! Windows that share frames are brought to agree on them at every step of the sampling, so that each is
+//! sampled with its neighbours in view (Bar-Tal et al., "MultiDiffusion", ICML 2023, arXiv 2302.08113, for
+//! images; Tseng et al., "EDGE", CVPR 2023, arXiv 2211.10658, section 4.3, for dance; here the shared
+//! frames are first placed where each window stands). A long track is sampled in runs of windows, of which
+//! the next begins from the last window of the one before: memory does not grow with the track, and what
+//! is finished can be watched.
+
+use ndarray::{Array2, Array3, ArrayView2, Axis, s};
+
+use crate::autodiff::Stream;
+use crate::diffusion::Refine;
+use crate::motion::style::STYLE_DIM;
+use crate::motion::{MOTION_DIM, Normalizer, Placement};
+
+use super::control::Constraints;
+use super::engine::{Engine, EngineError};
+use super::sampling::{Sampling, sample};
+use super::seam::{Joiner, agree, follow};
+use super::windows::Windows;
+
+/// Windows that are sampled at once. What is sampled depends on it, so that it is no setting: four are a
+/// quarter of a minute, and as large a batch as two cores profit from.
+pub const RUN_WINDOWS: usize = 4;
+
+/// Frames that neighbouring windows share, by default: one second.
+pub const OVERLAP_FRAMES: usize = 30;
+
+/// What motion is made with.
+#[derive(Clone, Copy)]
+pub struct Generator<'a> {
+    pub engine: &'a dyn Engine,
+    pub sampling: Sampling<'a>,
+    pub normalizer: &'a Normalizer,
+    /// Frames of a window, as the model was trained.
+    pub window_frames: usize,
+    /// Frames that neighbours share, below those of a window.
+    pub overlap_frames: usize,
+}
+
+/// What motion is made for.
+#[derive(Clone, Copy, Debug)]
+pub struct Track<'a> {
+    /// Features as the table has them, \[T, 163\].
+    pub features: ArrayView2<'a, f32>,
+    pub seed: u64,
+    /// Normalised style, for a model that takes one.
+    pub style: Option<[f32; STYLE_DIM]>,
+    pub constraints: Option<Constrained<'a>>,
+    pub primed: Option<Primed<'a>>,
+}
+
+/// Constraints, and how strictly they are kept.
+#[derive(Clone, Copy, Debug)]
+pub struct Constrained<'a> {
+    pub constraints: &'a Constraints,
+    /// Share of the way that an estimate is bent at every step: 1 is in-painting.
+    pub strength: f64,
+    /// Whether the finished motion is bent the rest of the way.
+    pub is_exact: bool,
+}
+
+/// Motion that sampling begins from instead of noise alone.
+#[derive(Clone, Copy, Debug)]
+pub struct Primed<'a> {
+    /// Motion for every window of the track, in its own place: windows × frames, \[n T, 25\] in metres.
+    pub motion: ArrayView2<'a, f32>,
+    /// Steps of the diffusion that are left to sample, out of all that were trained.
+    pub n_left: usize,
+}
+
+impl Generator<'_> {
+    /// Returns how a track of `n_frames` is cut.
+    pub fn windows(&self, n_frames: usize) -> Windows {
+        Windows::new(n_frames, self.window_frames, self.overlap_frames)
+    }
+
+    /// Makes motion for a track, and gives out its frames in order, `[…, 25]` in metres, as they are final.
+    ///
+    /// The track begins at the origin and faces +Z, unless constraints say otherwise. Same track and seed,
+    /// same frames: the noise of a frame depends on nothing but its number and the seed.
+    ///
+    /// # Errors
+    /// What the engine or `emit` says; what the sampler refuses.
+    pub fn run<E: From<EngineError>>(
+        &self,
+        track: &Track,
+        mut emit: impl FnMut(Array2<f32>) -> Result<(), E>,
+    ) -> Result<(), E> {
+        let windows = self.windows(track.features.nrows());
+        let start = track.constraints.map(|c| c.constraints.placement()).unwrap_or_default();
+        let give = |mut frames: Array2<f32>, emit: &mut dyn FnMut(Array2<f32>) -> Result<(), E>| {
+            if frames.nrows() == 0 {
+                return Ok(());
+            }
+            start.restore(&mut frames);
+            emit(frames)
+        };
+        let mut joiner = Joiner::new();
+        let mut before: Option<Window> = None;
+        for run in windows.runs(RUN_WINDOWS) {
+            let first = match &before {
+                Some(Window { motion, place }) => {
+                    place.of_inner(placement_at(motion, windows.shift(run.start)))
+                }
+                None => start,
+            };
+            let job = Run { windows: &windows, range: run.clone(), before: before.as_ref(), first };
+            let latent = self.sample_run(track, &job)?;
+            let decoded = self.engine.decode(latent.view())?;
+            for (i, window) in run.clone().zip(decoded.outer_iter()) {
+                let shift = windows.shift(i);
+                give(joiner.push(window.to_owned(), shift), &mut emit)?;
+            }
+            let motions = self.motions(&latent);
+            let place = job.places(&motions).pop().unwrap_or(first);
+            before = motions.into_iter().last().map(|motion| Window { motion, place });
+        }
+        give(joiner.finish(), &mut emit)
+    }
+
+    /// Samples the windows of a run together. → \[windows, frames, 25\], normalised
+    fn sample_run(&self, track: &Track, run: &Run) -> Result<Array3<f32>, EngineError> {
+        let (n, frames) = (run.range.len(), run.windows.length());
+        let audio = stacked(track.features, run, frames);
+        let style = track
+            .style
+            .map(|style| Array2::from_shape_fn((n, STYLE_DIM), |(_, channel)| style[channel]));
+        let mut x = Array3::zeros((n, frames, MOTION_DIM));
+        run.fill(track.seed, 0, x.as_slice_mut().expect("an array made in order"));
+        let mut n_left = self.sampling.schedule.len();
+        if let Some(primed) = &track.primed {
+            n_left = primed.n_left.clamp(1, n_left);
+            let mut x0 = Array3::zeros(x.raw_dim());
+            for (i, mut window) in run.range.clone().zip(x0.outer_iter_mut()) {
+                window.assign(&primed.motion.slice(s![i * frames..(i + 1) * frames, ..]));
+                self.normalizer.normalize(window);
+            }
+            x = self.sampling.schedule.add_noise(x0.view(), x.view(), &vec![n_left - 1; n]);
+        }
+        let mut refine = |x0: &mut Array3<f32>| self.refine(track, run, x0);
+        let has_company = n > 1 || run.before.is_some() || track.constraints.is_some();
+        let refine: Option<Refine> = if has_company { Some(&mut refine) } else { None };
+        // Draw 0 is the noise that sampling begins with.
+        let noise = |draw: usize, z: &mut [f32]| run.fill(track.seed, draw as u64 + 1, z);
+        let style = style.as_ref().map(|style| style.view());
+        sample(self.engine, self.sampling, (x, n_left), audio.view(), style, noise, refine)
+    }
+
+    /// Brings the estimates of a run's windows to agree with each other, with what came before, and with what
+    /// is asked of the track.
+    fn refine(&self, track: &Track, run: &Run, x0: &mut Array3<f32>) {
+        let estimated = self.motions(x0);
+        let mut motions = estimated.clone();
+        if let Some(before) = run.before {
+            follow(before.motion.view(), &mut motions[0], run.shift(0));
+        }
+        for i in 1..motions.len() {
+            let (earlier, later) = motions.split_at_mut(i);
+            agree(&mut earlier[i - 1], &mut later[0], run.shift(i));
+        }
+        if let Some(Constrained { constraints, strength, .. }) = track.constraints {
+            let places = run.places(&motions);
+            for ((i, motion), place) in run.range.clone().zip(&mut motions).zip(places) {
+                let frames = run.windows.frames(i);
+                if constraints.touch(&frames) {
+                    place.restore(motion);
+                    constraints.bend(motion, frames.start, strength);
+                    place.remove(motion);
+                }
+            }
+        }
+        // What nothing has changed keeps its bits.
+        for ((mut x0, motion), estimated) in x0.outer_iter_mut().zip(&motions).zip(&estimated) {
+            for ((mut x0, row), before) in
+                x0.rows_mut().into_iter().zip(motion.rows()).zip(estimated.rows())
+            {
+                if row != before {
+                    x0.assign(&row);
+                    self.normalizer.normalize(x0.insert_axis(Axis(0)));
+                }
+            }
+        }
+    }
+
+    /// Returns windows in metres.
+    fn motions(&self, latent: &Array3<f32>) -> Vec<Array2<f32>> {
+        let motion = |window: ArrayView2<f32>| {
+            let mut motion = window.to_owned();
+            self.normalizer.denormalize(motion.view_mut());
+            motion
+        };
+        latent.outer_iter().map(motion).collect()
+    }
+}
+
+/// A window that does not change any more.
+struct Window {
+    /// As it was sampled, in its own place, \[T, 25\].
+    motion: Array2<f32>,
+    /// Where it stands in the world.
+    place: Placement,
+}
+
+/// Windows that are sampled together.
+struct Run<'a> {
+    windows: &'a Windows,
+    range: std::ops::Range<usize>,
+    before: Option<&'a Window>,
+    /// Where the first of them stands in the world.
+    first: Placement,
+}
+
+impl Run<'_> {
+    /// How far window i of the run lies behind the one before it.
+    fn shift(&self, i: usize) -> usize {
+        self.windows.shift(self.range.start + i)
+    }
+
+    /// Returns where the windows stand in the world.
+    fn places(&self, motions: &[Array2<f32>]) -> Vec<Placement> {
+        let mut place = self.first;
+        let mut places = Vec::with_capacity(motions.len());
+        for i in 0..motions.len() {
+            if i > 0 {
+                place = place.of_inner(placement_at(&motions[i - 1], self.shift(i)));
+            }
+            places.push(place);
+        }
+        places
+    }
+
+    /// Fills the run's windows, \[windows, frames, 25\], with the noise of a draw: that of a frame is the same
+    /// in every window that has it.
+    fn fill(&self, seed: u64, draw: u64, z: &mut [f32]) {
+        let stream = Stream::new(seed, draw);
+        let size = self.windows.length() * MOTION_DIM;
+        for (i, z) in self.range.clone().zip(z.chunks_exact_mut(size)) {
+            stream.normal(self.windows.frames(i).start * MOTION_DIM, z);
+        }
+    }
+}
+
+/// Returns where a motion stands at a frame.
+fn placement_at(motion: &Array2<f32>, frame: usize) -> Placement {
+    Placement::of_first(motion.slice(s![frame.., ..])).unwrap_or_default()
+}
+
+/// Returns the features of a run's windows, \[windows, frames, 163\].
+fn stacked(features: ArrayView2<f32>, run: &Run, frames: usize) -> Array3<f32> {
+    let mut audio = Array3::zeros((run.range.len(), frames, features.ncols()));
+    for (i, mut window) in run.range.clone().zip(audio.outer_iter_mut()) {
+        window.assign(&features.slice(s![run.windows.frames(i), ..]));
+    }
+    audio
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,217 @@
+use ndarray::{Array3, ArrayView3, concatenate};
+use proptest::prelude::*;
+
+use super::*;
+use crate::diffusion::{DiffusionConfig, Prediction, Sampler, SamplerConfig, Schedule, Spacing};
+use crate::generation::control::Wanted;
+use crate::generation::engine::Inputs;
+use crate::motion::kinematics::{Poses, frames_of};
+use crate::motion::quaternion::{from_axis_angle, make_sign_continuous, mul};
+use crate::motion::{Channel, ChannelLimits};
+use crate::units::FPS;
+
+const N_FEATURES: usize = 163;
+
+/// A model that knows one motion by heart: the first feature of a frame is its number.
+struct ByHeart {
+    track: Array2<f32>,
+    /// How far every window's estimate lies beside the motion, by the number of its first frame, m.
+    offset_m: fn(usize) -> f32,
+    normalizer: Normalizer,
+}
+
+impl Engine for ByHeart {
+    fn name(&self) -> &'static str {
+        "by heart"
+    }
+
+    fn n_workers(&self) -> usize {
+        1
+    }
+
+    fn predict(&self, inputs: &Inputs) -> Result<Array3<f32>, EngineError> {
+        inputs.check(N_FEATURES)?;
+        let mut predicted = Array3::zeros(inputs.x.raw_dim());
+        for (mut window, audio) in predicted.outer_iter_mut().zip(inputs.audio.outer_iter()) {
+            let first = audio[[0, 0]] as usize;
+            let mut known = self.track.slice(s![first..first + audio.nrows(), ..]).to_owned();
+            Placement::of_first(known.view()).expect("frames").remove(&mut known);
+            known.column_mut(1).mapv_inplace(|y| y + (self.offset_m)(first));
+            self.normalizer.normalize(known.view_mut());
+            window.assign(&known);
+        }
+        Ok(predicted)
+    }
+
+    fn decode(&self, latent: ArrayView3<f32>) -> Result<Array3<f32>, EngineError> {
+        let mut motion = latent.to_owned();
+        motion.outer_iter_mut().for_each(|window| self.normalizer.denormalize(window));
+        Ok(motion)
+    }
+}
+
+/// A walk along a curve, leaning and turning; it begins at the origin and faces +Z.
+fn walk(n: usize) -> Array2<f32> {
+    let pose = |t: usize| {
+        let s = t as f64 / FPS;
+        let lean = from_axis_angle([1.0, 0.0, 0.0], 0.2 * (3.0 * s).sin());
+        let turn = from_axis_angle([0.0, 1.0, 0.0], 1.1 * s);
+        ([2.0 * (0.7 * s).sin(), 0.9 + 0.05 * (9.0 * s).cos(), 0.4 * s], mul(turn, lean))
+    };
+    let (position_m, mut orientation): (Vec<_>, Vec<_>) = (0..n + 2).map(pose).unzip();
+    make_sign_continuous(&mut orientation);
+    let mut frames = frames_of(&Poses { position_m, orientation }, n);
+    for (t, mut row) in frames.rows_mut().into_iter().enumerate() {
+        row[16] = (t as f32 / 53.0).fract();
+    }
+    Placement::of_first(frames.view()).expect("frames").remove(&mut frames);
+    frames
+}
+
+fn numbered(n: usize) -> Array2<f32> {
+    let mut features = Array2::zeros((n, N_FEATURES));
+    features.column_mut(0).assign(&ndarray::Array1::range(0.0, n as f32, 1.0));
+    features
+}
+
+fn schedule() -> Schedule {
+    let config = DiffusionConfig {
+        n_steps: 50,
+        prediction: Prediction::Sample,
+        clip_range: None,
+        ..DiffusionConfig::default()
+    };
+    Schedule::new(&config).expect("a schedule")
+}
+
+fn sampler() -> SamplerConfig {
+    let sampler = Sampler::Ddim { eta: 0.5 };
+    SamplerConfig { sampler, n_steps: 3, spacing: Spacing::Trailing, clip: true }
+}
+
+/// Returns the motion, and how many frames came at once.
+fn run(
+    engine: &ByHeart,
+    seed: u64,
+    constraints: Option<Constrained>,
+    overlap: usize,
+) -> (Array2<f32>, Vec<usize>) {
+    let (schedule, config) = (schedule(), sampler());
+    let generator = Generator {
+        engine,
+        sampling: Sampling { config: &config, schedule: &schedule, guidance: 1.0 },
+        normalizer: &engine.normalizer,
+        window_frames: 40,
+        overlap_frames: overlap,
+    };
+    let features = numbered(engine.track.nrows());
+    let track = Track { features: features.view(), seed, style: None, constraints, primed: None };
+    let mut parts: Vec<Array2<f32>> = Vec::new();
+    generator
+        .run(&track, |frames| {
+            parts.push(frames);
+            Ok::<_, EngineError>(())
+        })
+        .expect("a motion");
+    let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
+    let sizes = parts.iter().map(Array2::nrows).collect();
+    (concatenate(Axis(0), &views).expect("25 channels"), sizes)
+}
+
+fn by_heart(n: usize, offset_m: fn(usize) -> f32) -> ByHeart {
+    let track = walk(n);
+    let normalizer = Normalizer::fit(track.view()).0;
+    ByHeart { track, offset_m, normalizer }
+}
+
+fn largest_difference(a: &Array2<f32>, b: &Array2<f32>) -> f32 {
+    assert_eq!(a.dim(), b.dim());
+    let quaternion = Channel::Quaternion.range();
+    let off = |((t, i), x): ((usize, usize), &f32)| {
+        // q and -q are one turn.
+        let same = (x - b[[t, i]]).abs();
+        if quaternion.contains(&i) { same.min((x + b[[t, i]]).abs()) } else { same }
+    };
+    a.indexed_iter().map(off).fold(0.0, f32::max)
+}
+
+#[test]
+fn what_a_model_knows_comes_out_at_any_length() {
+    for n in [1, 7, 40, 41, 173, 401] {
+        let engine = by_heart(n, |_| 0.0);
+        let (motion, sizes) = run(&engine, 3, None, 10);
+        assert_eq!(sizes.iter().sum::<usize>(), n);
+        // Placed anew at up to 13 seams, of accelerations up to 5 m/s² and positions up to 10 m.
+        let off = largest_difference(&motion, &engine.track);
+        assert!(off < 2e-4, "{n} frames: {off:e}");
+    }
+}
+
+#[test]
+fn frames_come_as_their_windows_are_final() {
+    let (_, sizes) = run(&by_heart(401, |_| 0.0), 3, None, 10);
+    // 401 frames are 14 windows of 40, the last of which comes at once.
+    assert_eq!(sizes.len(), 14, "{sizes:?}");
+    assert!(sizes[..13].iter().all(|n| (27..=28).contains(n)) && sizes[13] == 40, "{sizes:?}");
+}
+
+#[test]
+fn windows_that_disagree_are_joined_smoothly() {
+    // Every other window believes that the floor is 20 cm higher.
+    let engine = by_heart(173, |first| if first % 2 == 0 { 0.2 } else { 0.0 });
+    let (motion, _) = run(&engine, 3, None, 20);
+    let step = |frames: &Array2<f32>, t: usize| (frames[[t + 1, 1]] - frames[[t, 1]]).abs();
+    let most = |frames: &Array2<f32>| (0..172).map(|t| step(frames, t)).fold(0.0, f32::max);
+    // 20 cm over 20 frames by 3u² − 2u³ are at most 1.5 cm a frame; the walk itself moves as much.
+    assert!(most(&motion) < most(&engine.track) + 0.0151, "{}", most(&motion));
+}
+
+#[test]
+fn a_track_passes_its_constraints() {
+    let engine = by_heart(173, |_| 0.0);
+    let wanted = vec![
+        (0, Wanted::Value { channel: 0, value: 1.5 }),
+        (80, Wanted::Value { channel: 1, value: 1.2 }),
+        (150, Wanted::Value { channel: 1, value: 0.5 }),
+    ];
+    let constraints = Constraints::new(wanted, 173, ChannelLimits::Wide).expect("constraints");
+    let constrained = Constrained { constraints: &constraints, strength: 1.0, is_exact: true };
+    let (motion, _) = run(&engine, 3, Some(constrained), 10);
+    for miss in constraints.errors(motion.view()) {
+        // The windows are placed one after another, and neighbours that share a frame are faded.
+        assert!(miss.error < 1e-4, "{miss:?}");
+    }
+    assert!((motion[[0, 0]] - 1.5).abs() < 1e-6);
+    // Far from any constraint it is the motion that the model knows, 1.5 m to the side.
+    assert!((motion[[40, 0]] - engine.track[[40, 0]] - 1.5).abs() < 1e-4);
+    assert!((motion[[110, 1]] - engine.track[[110, 1]]).abs() < 1e-4);
+}
+
+#[test]
+fn noise_belongs_to_frames_and_seeds() {
+    let windows = Windows::new(101, 40, 10);
+    let place = Placement::default();
+    let fill = |range: std::ops::Range<usize>, seed, draw| {
+        let mut z = vec![0.0_f32; range.len() * 40 * MOTION_DIM];
+        Run { windows: &windows, range, before: None, first: place }.fill(seed, draw, &mut z);
+        z
+    };
+    let all = fill(0..windows.len(), 5, 0);
+    let shift = windows.shift(1);
+    let window = 40 * MOTION_DIM;
+    // What two windows share has one noise, and a window has the same in any run.
+    assert_eq!(all[shift * MOTION_DIM..window], all[window..window + (40 - shift) * MOTION_DIM]);
+    assert_eq!(fill(1..2, 5, 0), all[window..2 * window]);
+    assert!(fill(1..2, 5, 1) != fill(1..2, 5, 0) && fill(1..2, 6, 0) != fill(1..2, 5, 0));
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(12))]
+
+    #[test]
+    fn the_same_seed_gives_the_same_bits(n in 1usize..250, seed in any::<u64>()) {
+        let engine = by_heart(n, |first| (first % 5) as f32 * 0.01);
+        let bits = |motion: Array2<f32>| motion.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+        prop_assert_eq!(bits(run(&engine, seed, None, 10).0), bits(run(&engine, seed, None, 10).0));
+    }
+}
