@@ -18,9 +18,7 @@ pub use card::{
     CardError, FileEntry, MODEL_FORMAT, ModelCard, Networks, Provenance, file_names, own_channels,
     own_features,
 };
-pub use control::{
-    Constraints, ControlError, Miss, REACH_FRAMES, Wanted, continuing, facing,
-};
+pub use control::{Constraints, ControlError, Miss, REACH_FRAMES, Wanted, continuing, facing};
 pub use eager::EagerEngine;
 pub use engine::{Engine, EngineError, Inputs};
 pub use pool::Pool;
