@@ -1,7 +1,9 @@
 //! `plot`: pictures of what files and tables hold.
 
+mod excerpt;
 mod features;
-mod nearest;
+mod motion;
+pub(super) mod nearest;
 mod output;
 mod training;
 
@@ -24,13 +26,15 @@ pub enum Kind {
     Features(features::Params),
     /// draw the losses of a training run over its steps
     Training(training::Params),
+    /// draw a motion: its channels over time, its path
+    Motion(motion::Params),
 }
 
 impl Stage for Plot {
     const NAME: &'static str = "plot";
-    const ABOUT: &'static str = "draw features and training as PNG or SVG";
+    const ABOUT: &'static str = "draw features, training and motion as PNG or SVG";
     const CONTRACT: Contract = Contract {
-        reads: "an audio file, or features, extractions and beats; training_log",
+        reads: "an audio file, or features, extractions and beats; training_log; motion or generated, or a motion file",
         writes: "an image file",
     };
     type Params = Params;
@@ -39,6 +43,7 @@ impl Stage for Plot {
         match params.kind {
             Kind::Features(params) => features::run(&params),
             Kind::Training(params) => training::run(&params),
+            Kind::Motion(params) => motion::run(&params),
         }
     }
 }

@@ -1,0 +1,353 @@
+//! The motions that a plot or a page shows: files, a phrase of a store, or what was generated for it.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use anyhow::{anyhow, bail, ensure};
+use ndarray::Array2;
+
+use super::Stage as _;
+use super::generate::generation_id;
+use super::ingest::{Ingest, read_beats, read_trajectory};
+use super::plot::nearest::nearest;
+use crate::motion::{Trajectory, exchange, npy};
+use crate::store::tables::{self, BeatRow, FailureRow, GenerationRow, PhraseRow};
+use crate::store::{ClientOptions, ItemTables, Location, Row as _, Snapshot, StoreError};
+
+/// Most motions that one page shows.
+const MAX_SHOWN: usize = 16;
+
+/// What the user wants to look at.
+#[derive(Clone, Debug, clap::Args)]
+pub struct MotionParams {
+    /// Motion file with 25 channels per frame at 30 fps, FILE.npy or FILE.csv.
+    #[arg(long, value_name = "FILE", num_args = 1..)]
+    pub motion: Vec<PathBuf>,
+    /// Beats to mark instead of those that the store has: a file with one time in seconds per line.
+    #[arg(long, value_name = "FILE")]
+    pub beats: Option<PathBuf>,
+    /// Folder or bucket of the tables, for --phrase.
+    #[arg(long, value_name = "URL")]
+    pub store: Option<String>,
+    /// Instead of --motion: the phrase whose motion in the store is shown.
+    #[arg(long, value_name = "ID")]
+    pub phrase: Option<String>,
+    /// With --phrase: the generation whose motion is shown, instead of the phrase's own.
+    #[arg(long, value_name = "NAME")]
+    pub run: Option<String>,
+    /// With --run: which of the motions that were generated for the phrase, counted from 0 [default: the
+    /// first in a plot, all in a page]
+    #[arg(long = "sample", value_name = "N", value_delimiter = ',')]
+    pub samples: Vec<usize>,
+}
+
+/// How many motions have room.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Room {
+    /// A plot's.
+    One,
+    /// A page's.
+    Many,
+}
+
+/// What is shown.
+#[derive(Clone, Debug)]
+pub struct Subject {
+    /// What stands over it.
+    pub title: String,
+    /// One or more.
+    pub shown: Vec<Shown>,
+    pub beats_s: Vec<f64>,
+    /// What the store says of the phrase.
+    pub phrase: Option<PhraseRow>,
+}
+
+/// A motion and what is known of it.
+#[derive(Clone, Debug)]
+pub struct Shown {
+    pub name: String,
+    /// Its values may be anything.
+    pub motion: Trajectory,
+    pub facts: Vec<(String, String)>,
+}
+
+impl MotionParams {
+    /// Reads what the user wants to look at.
+    ///
+    /// # Errors
+    /// One sentence for what is not there, cannot be read, or has no room.
+    pub fn read(&self, room: Room, options: &ClientOptions) -> anyhow::Result<Subject> {
+        let mut subject = match (self.motion.as_slice(), &self.phrase, &self.store) {
+            ([_, ..], Some(phrase), _) => {
+                bail!("--motion and --phrase {phrase} name two things to show; give one of them")
+            }
+            (files @ [_, ..], None, _) => of_files(files, room)?,
+            ([], Some(phrase), Some(store)) => {
+                self.of_store(&Location::open(store, options)?, phrase, room)?
+            }
+            ([], Some(phrase), None) => {
+                bail!("--phrase {phrase} is a name in a store; say which with --store")
+            }
+            ([], None, _) => {
+                bail!("nothing to show: give --motion FILE, or --store URL and --phrase ID")
+            }
+        };
+        if let Some(path) = &self.beats {
+            let place = path.display().to_string();
+            let beats = read_beats(&place, &bytes_of(path)?).map_err(|f| anyhow!(f.message))?;
+            subject.beats_s = beats.times_s().to_vec();
+        }
+        Ok(subject)
+    }
+
+    fn of_store(&self, store: &Location, phrase: &str, room: Room) -> anyhow::Result<Subject> {
+        let rows = ItemTables::take(store, phrase)?;
+        let known: Option<PhraseRow> = rows.rows()?.pop();
+        let (title, shown) = match &self.run {
+            Some(run) => {
+                (format!("{phrase} by {run}"), of_run(store, run, phrase, &self.samples, room)?)
+            }
+            None => {
+                let Some(frames) = rows.frames(tables::motion())? else {
+                    return Err(missing(store, phrase, &rows, known.is_some())?);
+                };
+                let facts = known.as_ref().map(facts_of_phrase).unwrap_or_default();
+                let motion = Trajectory::new(frames)?;
+                (phrase.to_owned(), vec![Shown { name: phrase.to_owned(), motion, facts }])
+            }
+        };
+        let mut beats: Vec<BeatRow> = rows.rows()?;
+        beats.sort_by_key(|beat| beat.beat);
+        let beats_s = beats.into_iter().map(|beat| beat.time_s).collect();
+        Ok(Subject { title, shown, beats_s, phrase: known })
+    }
+}
+
+fn of_files(files: &[PathBuf], room: Room) -> anyhow::Result<Subject> {
+    check_room(files.len(), "--motion", room)?;
+    let mut shown = Vec::new();
+    for path in files {
+        let motion = read_motion(path)?;
+        shown.push(Shown { name: name_of(path), motion, facts: Vec::new() });
+    }
+    let title = match files {
+        [first, rest @ ..] if !rest.is_empty() => {
+            format!("{} and {} more", name_of(first), rest.len())
+        }
+        _ => shown.first().map(|shown| shown.name.clone()).unwrap_or_default(),
+    };
+    Ok(Subject { title, shown, beats_s: Vec::new(), phrase: None })
+}
+
+fn name_of(path: &Path) -> String {
+    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+}
+
+/// Refuses more motions than have room.
+fn check_room(n: usize, flag: &str, room: Room) -> anyhow::Result<()> {
+    match room {
+        Room::One if n > 1 => bail!("a plot shows one motion, and {flag} names {n}; give one"),
+        Room::Many if n > MAX_SHOWN => {
+            bail!("a page shows up to {MAX_SHOWN} motions, and {flag} names {n}; give fewer")
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Reads a motion file, `.npy` or `.csv`, of shape `[T, 25]`; its values are not looked at.
+///
+/// # Errors
+/// One sentence that names the file.
+pub fn read_motion(path: &Path) -> anyhow::Result<Trajectory> {
+    let place = path.display().to_string();
+    let extension = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
+    match extension.as_deref() {
+        Some("npy") => {
+            read_trajectory(&place, &bytes_of(path)?).map_err(|failure| anyhow!(failure.message))
+        }
+        Some("csv") => {
+            let text = String::from_utf8(bytes_of(path)?)
+                .map_err(|_| anyhow!("{place}: is not UTF-8 text; write it as CSV again"))?;
+            let frames = exchange::read_csv(&text).map_err(|e| anyhow!("{place}: {e}"))?;
+            Trajectory::new(frames).map_err(|e| anyhow!("{place}: {e}"))
+        }
+        _ => bail!("{place}: is named like no motion; name a .npy or .csv file of 25 channels"),
+    }
+}
+
+/// Reads a whole file that may be one.
+fn bytes_of(path: &Path) -> anyhow::Result<Vec<u8>> {
+    let place = path.display();
+    let unreadable = |e: std::io::Error| {
+        anyhow!("{place}: cannot be opened ({e}); check that it is still there")
+    };
+    ensure!(!path.is_dir(), "{place}: is a folder; name a file in it");
+    let n_bytes = std::fs::metadata(path).map_err(unreadable)?.len();
+    ensure!(
+        n_bytes <= npy::MAX_ARRAY_BYTES,
+        "{place}: has {n_bytes} bytes, more than the {} that are read; split it",
+        npy::MAX_ARRAY_BYTES
+    );
+    std::fs::read(path).map_err(unreadable)
+}
+
+/// Reads the motions of a phrase that a run generated, with what the table says of each.
+fn of_run(
+    store: &Location,
+    run: &str,
+    phrase: &str,
+    wanted: &[usize],
+    room: Room,
+) -> anyhow::Result<Vec<Shown>> {
+    let (mut runs, mut phrases) = (BTreeSet::new(), BTreeSet::new());
+    let table = Snapshot::take(store, GenerationRow::schema())?;
+    let rows: Vec<GenerationRow> = table.rows_where(|row: &GenerationRow| {
+        let is_of_run = row.run == run;
+        let (names, name) =
+            if is_of_run { (&mut phrases, &row.phrase_id) } else { (&mut runs, &row.run) };
+        if !names.contains(name) {
+            names.insert(name.clone());
+        }
+        is_of_run && row.phrase_id == phrase
+    })?;
+    if rows.is_empty() && !phrases.is_empty() {
+        let nearest = nearest(phrase, phrases);
+        bail!(
+            "store {store}: run \"{run}\" has no motion for phrase \"{phrase}\"; nearest: {nearest}"
+        );
+    }
+    if rows.is_empty() && !runs.is_empty() {
+        bail!(
+            "store {store} has no generated motion of run \"{run}\"; nearest: {}",
+            nearest(run, runs)
+        );
+    }
+    if rows.is_empty() {
+        bail!(
+            "store {store} has no generated motion; run motiongen generate --store {store} first"
+        );
+    }
+
+    // By number: how many candidates there were, and the one that was kept.
+    let mut samples: BTreeMap<usize, (usize, Option<GenerationRow>)> = BTreeMap::new();
+    for row in rows {
+        let Ok(sample) = usize::try_from(row.sample) else { continue };
+        let (n_candidates, kept) = samples.entry(sample).or_default();
+        *n_candidates += 1;
+        if row.selected {
+            *kept = Some(row);
+        }
+    }
+    let place = format!("store {store}: run \"{run}\"");
+    let numbers: BTreeSet<usize> = match (wanted, room) {
+        ([], Room::One) => samples.keys().copied().take(1).collect(),
+        ([], Room::Many) => samples.keys().copied().collect(),
+        _ => wanted.iter().copied().collect(),
+    };
+    check_room(numbers.len(), "--sample", room)?;
+    let mut shown = Vec::new();
+    for number in numbers {
+        let Some((n_candidates, Some(row))) = samples.get(&number) else {
+            let known: Vec<String> = samples.keys().map(usize::to_string).collect();
+            bail!(
+                "{place} has no sample {number} of phrase \"{phrase}\"; ask for one of its own: {}",
+                known.join(", ")
+            );
+        };
+        let motion = Trajectory::new(generated_frames(store, run, phrase, number)?)?;
+        let facts = facts_of_generation(row, *n_candidates);
+        shown.push(Shown { name: format!("sample {number}"), motion, facts });
+    }
+    Ok(shown)
+}
+
+/// Reads the frames of a generated motion, `[T, 25]`: the one place that knows how `generated` names them.
+///
+/// # Errors
+/// [`StoreError`], or one sentence where the table has no such motion.
+pub fn generated_frames(
+    store: &Location,
+    run: &str,
+    phrase: &str,
+    sample: usize,
+) -> anyhow::Result<Array2<f32>> {
+    let name = generation_id(run, phrase, sample);
+    let mut found = None;
+    let table = Snapshot::take(store, tables::generated())?;
+    table.visit_items(&BTreeSet::from([name.clone()]), |_, frames| {
+        found = Some(frames);
+        Ok::<(), StoreError>(())
+    })?;
+    found.ok_or_else(|| {
+        anyhow!(
+            "store {store} has no frames of {name}, though it lists the motion; run motiongen \
+             generate again with --force"
+        )
+    })
+}
+
+/// Returns why a phrase has no motion in the store, and the way out.
+fn missing(
+    store: &Location,
+    phrase: &str,
+    rows: &ItemTables,
+    is_known: bool,
+) -> anyhow::Result<anyhow::Error> {
+    let failures: Vec<FailureRow> = rows.rows()?;
+    if let Some(failure) = failures.into_iter().find(|failure| failure.stage == Ingest::NAME) {
+        return Ok(anyhow!(
+            "store {store} has no motion of phrase \"{phrase}\", since {} failed on it: {}",
+            failure.stage,
+            failure.message
+        ));
+    }
+    if is_known {
+        return Ok(anyhow!(
+            "store {store}: phrase \"{phrase}\" has no motion of its own; name the run that generated \
+             motion for it with --run"
+        ));
+    }
+    let phrases: Vec<PhraseRow> = Snapshot::take(store, PhraseRow::schema())?.rows()?;
+    if phrases.is_empty() {
+        return Ok(anyhow!(
+            "store {store} has no phrases; run motiongen ingest --source … --store {store} first"
+        ));
+    }
+    let nearest = nearest(phrase, phrases.into_iter().map(|row| row.phrase_id));
+    Ok(anyhow!("store {store} has no phrase \"{phrase}\"; nearest: {nearest}"))
+}
+
+fn facts_of_phrase(row: &PhraseRow) -> Vec<(String, String)> {
+    let mut facts = vec![("split", row.split.clone())];
+    facts.extend(row.motion_format.clone().map(|format| ("format", format)));
+    facts.extend(row.tempo_bpm.map(|bpm| ("tempo", format!("{bpm:.1} bpm"))));
+    facts.push(("source", row.source.clone()));
+    named(facts)
+}
+
+/// Returns what is told of a generated motion, which was the best of `n_candidates`.
+pub fn facts_of_generation(row: &GenerationRow, n_candidates: usize) -> Vec<(String, String)> {
+    let mut facts = vec![
+        ("model", row.model.clone()),
+        ("run", row.run.clone()),
+        ("engine", row.engine.clone()),
+        ("sampler", format!("{}, {} steps", row.sampler, row.n_steps)),
+        ("guidance", row.guidance.to_string()),
+        // The table keeps the bits of a number without sign.
+        ("seed", (row.seed as u64).to_string()),
+    ];
+    if n_candidates > 1 {
+        facts.push(("candidates", n_candidates.to_string()));
+    }
+    facts.extend(row.score.map(|score| ("score", format!("{score:.3}"))));
+    facts.push(("checks", format!("{} of {} passed", row.checks_passed, row.n_checks)));
+    facts.extend(row.locking.map(|r2| ("bar locking R²", format!("{r2:.3}"))));
+    facts.extend(row.control_error_mm.map(|mm| ("control", format!("within {mm:.1} mm"))));
+    facts.extend(row.control_error_deg.map(|deg| ("control", format!("within {deg:.1}°"))));
+    facts.push(("real-time factor", format!("{:.2}", row.real_time_factor)));
+    named(facts)
+}
+
+fn named(facts: Vec<(&str, String)>) -> Vec<(String, String)> {
+    facts.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
+}

@@ -1,0 +1,69 @@
+//! Pages that play motion: one file of HTML, complete in itself.
+//!
+//! A page shows a body on its way through space, plays the music to it, and draws channels over time.
+//! It asks nothing of any network, works from a folder without a server, and holds its numbers as
+//! they are: 32-bit floats. The scripts are `motion.js` (numbers), `stage.js` and `body.js` (space),
+//! `charts.js` (time) and `page.js` (clock and controls).
+
+mod page;
+
+use ndarray::Array2;
+
+pub use page::page;
+
+/// What a page shows.
+#[derive(Clone, Debug, PartialEq)]
+pub struct View {
+    /// What stands over the page.
+    pub title: String,
+    /// Motions to choose from, the first of which is shown at first.
+    pub samples: Vec<ViewSample>,
+    /// Beats in seconds on the clock of motion and audio; what is not finite is left out.
+    pub beats_s: Vec<f64>,
+    pub audio: Option<Audio>,
+}
+
+/// A motion and what is known of it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ViewSample {
+    pub name: String,
+    /// `[T, 25]` at [`crate::units::FPS`]; what is not finite is a gap.
+    pub frames: Array2<f32>,
+    /// Names and values, in the order in which they are listed.
+    pub facts: Vec<(String, String)>,
+}
+
+/// An audio file.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Audio {
+    /// What [`mime_of`] says of the file's extension.
+    pub mime: String,
+    pub bytes: Vec<u8>,
+}
+
+/// Returns the media type of an audio file by its extension, in any case; a general one for others,
+/// of which browsers look at the bytes.
+pub fn mime_of(extension: &str) -> &'static str {
+    match extension.to_ascii_lowercase().as_str() {
+        "mp3" => "audio/mpeg",
+        "wav" => "audio/wav",
+        "flac" => "audio/flac",
+        "ogg" | "oga" | "opus" => "audio/ogg",
+        "m4a" | "mp4" => "audio/mp4",
+        "aac" => "audio/aac",
+        "aif" | "aiff" => "audio/aiff",
+        _ => "application/octet-stream",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn media_types_follow_the_extension() {
+        let found = ["mp3", "WAV", "opus", "m4a", "txt", ""].map(mime_of);
+        let general = "application/octet-stream";
+        assert_eq!(found, ["audio/mpeg", "audio/wav", "audio/ogg", "audio/mp4", general, general]);
+    }
+}

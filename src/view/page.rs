@@ -1,0 +1,284 @@
+//! Writes a page.
+
+use std::fmt::Write as _;
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use ndarray::Array2;
+use serde::Serialize;
+
+use super::{Audio, View, ViewSample};
+use crate::motion::{CHANNEL_NAMES, MOTION_DIM};
+use crate::units::FPS;
+
+/// The page, with slots such as `{{title}}`.
+const TEMPLATE: &str = include_str!("page.html");
+const STYLE: &str = include_str!("page.css");
+/// Parts of one script, in the order in which they build on each other.
+const SCRIPTS: [&str; 5] = [
+    include_str!("motion.js"),
+    include_str!("stage.js"),
+    include_str!("body.js"),
+    include_str!("charts.js"),
+    include_str!("page.js"),
+];
+
+/// Returns the page as HTML. The same view gives the same text.
+///
+/// Whatever comes from outside is text there: no title, name or fact can become markup or script.
+pub fn page(view: &View) -> String {
+    let mut out = String::with_capacity(size_bytes(view));
+    for (i, piece) in TEMPLATE.split("{{").enumerate() {
+        let slot = if i == 0 { None } else { piece.split_once("}}") };
+        let Some((name, rest)) = slot else {
+            out.push_str(piece);
+            continue;
+        };
+        match name {
+            "title" => write_escaped(&mut out, &view.title),
+            "style" => out.push_str(STYLE),
+            "audio" => write_audio(&mut out, view.audio.as_ref()),
+            "data" => out.push_str(&data(view)),
+            "script" => SCRIPTS.iter().for_each(|script| out.push_str(script)),
+            _ => {}
+        }
+        out.push_str(rest);
+    }
+    out
+}
+
+/// Returns about how long the page will be.
+fn size_bytes(view: &View) -> usize {
+    let in_base64 = |n_bytes: usize| n_bytes.div_ceil(3) * 4;
+    let of = |sample: &ViewSample| in_base64(size_of::<f32>() * sample.frames.len());
+    let motions: usize = view.samples.iter().map(of).sum();
+    let audio = view.audio.as_ref().map_or(0, |audio| in_base64(audio.bytes.len()));
+    let own: usize = SCRIPTS.iter().map(|script| script.len()).sum();
+    motions + audio + own + STYLE.len() + TEMPLATE.len() + (16 << 10)
+}
+
+fn write_audio(out: &mut String, audio: Option<&Audio>) {
+    let Some(Audio { mime, bytes }) = audio else { return };
+    out.push_str("<audio id=\"audio\" preload=\"auto\" src=\"data:");
+    write_escaped(out, mime);
+    out.push_str(";base64,");
+    STANDARD.encode_string(bytes, out);
+    out.push_str("\"></audio>\n");
+}
+
+/// What the script reads.
+#[derive(Serialize)]
+struct Data<'a> {
+    fps: f64,
+    channels: [&'static str; MOTION_DIM],
+    beats: Vec<f64>,
+    samples: Vec<Sample<'a>>,
+}
+
+#[derive(Serialize)]
+struct Sample<'a> {
+    name: &'a str,
+    facts: &'a [(String, String)],
+    frames: String,
+}
+
+/// Returns the data as JSON that can stand in a script element.
+fn data(view: &View) -> String {
+    let mut beats: Vec<f64> = view.beats_s.iter().copied().filter(|s| s.is_finite()).collect();
+    beats.sort_by(f64::total_cmp);
+    let samples = view.samples.iter().map(|sample| Sample {
+        name: &sample.name,
+        facts: &sample.facts,
+        frames: floats(&sample.frames),
+    });
+    let data = Data { fps: FPS, channels: CHANNEL_NAMES, beats, samples: samples.collect() };
+    let json = serde_json::to_string(&data)
+        .expect("invariant: the data hold only strings and finite numbers");
+    inert(&json)
+}
+
+/// Returns numbers, row by row, as base64 of their little-endian bytes.
+fn floats(frames: &Array2<f32>) -> String {
+    debug_assert_eq!(frames.ncols(), MOTION_DIM, "channels of a motion");
+    let bytes: Vec<u8> = frames.iter().flat_map(|value| value.to_le_bytes()).collect();
+    STANDARD.encode(bytes)
+}
+
+/// Returns JSON with every sign escaped by which a string could end the script element around it, or
+/// a line of script. These stand in strings alone, where JSON may write them so.
+fn inert(json: &str) -> String {
+    let mut out = String::with_capacity(json.len());
+    for c in json.chars() {
+        match c {
+            '<' | '>' | '&' | '\u{2028}' | '\u{2029}' => {
+                // A string takes all that is written to it.
+                let _ = write!(out, "\\u{:04x}", u32::from(c));
+            }
+            c => out.push(c),
+        }
+    }
+    out
+}
+
+/// Writes text between tags or in a quoted attribute; control characters become replacement characters.
+fn write_escaped(out: &mut String, text: &str) {
+    for c in text.chars() {
+        match c {
+            '<' => out.push_str("&lt;"),
+            '>' => out.push_str("&gt;"),
+            '&' => out.push_str("&amp;"),
+            '"' => out.push_str("&quot;"),
+            '\'' => out.push_str("&#39;"),
+            c if c.is_control() => out.push(char::REPLACEMENT_CHARACTER),
+            c => out.push(c),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn sample(name: &str, n_frames: usize) -> ViewSample {
+        let frames = Array2::from_shape_fn((n_frames, MOTION_DIM), |(t, i)| {
+            t as f32 + i as f32 / 32.0 - 1.5
+        });
+        let facts = vec![("seed".to_owned(), "7".to_owned())];
+        ViewSample { name: name.to_owned(), frames, facts }
+    }
+
+    fn view(title: &str, samples: Vec<ViewSample>) -> View {
+        View { title: title.to_owned(), samples, beats_s: vec![0.5, 1.0], audio: None }
+    }
+
+    /// Returns what the script of a page reads.
+    fn data_of(page: &str) -> serde_json::Value {
+        let (_, rest) = page.split_once("id=\"data\">").expect("data");
+        let (json, _) = rest.split_once("</script>").expect("the end of the data");
+        serde_json::from_str(json).expect("JSON")
+    }
+
+    fn floats_of(base64: &serde_json::Value) -> Vec<f32> {
+        let bytes = STANDARD.decode(base64.as_str().expect("text")).expect("base64");
+        bytes.as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect()
+    }
+
+    #[test]
+    fn every_slot_is_filled_and_every_script_is_there() {
+        let page = page(&view("A walk", vec![sample("0", 3)]));
+        let slots: Vec<&str> = TEMPLATE
+            .split("{{")
+            .skip(1)
+            .map(|piece| piece.split_once("}}").expect("an end of the slot").0)
+            .collect();
+        assert_eq!(slots, ["title", "style", "title", "audio", "data", "script"]);
+        assert!(page.starts_with("<!DOCTYPE html>\n<html lang=\"en\">\n"));
+        assert!(page.contains("<title>A walk</title>") && page.contains("<h1>A walk</h1>"));
+        for part in SCRIPTS {
+            assert!(page.contains(part));
+            // What would end the element that the script stands in.
+            assert!(!part.contains("</script") && !part.contains("<!--"));
+        }
+        assert!(page.contains(STYLE) && !STYLE.contains("</style"));
+        for name in ["motiongenReady", "window.motiongen = {", "frame:", "seek,", "play,", "pause,"]
+        {
+            assert!(page.contains(name), "no {name}");
+        }
+        assert!(!page.contains("<audio"));
+    }
+
+    #[test]
+    fn nothing_is_asked_of_a_network() {
+        let mut view = view("t", vec![sample("0", 3)]);
+        view.audio = Some(Audio { mime: "audio/mpeg".to_owned(), bytes: vec![1, 2, 3] });
+        let page = page(&view);
+        for request in
+            ["http://", "https://", "//cdn", "@import", "url(", "import(", "fetch(", "XMLHttp"]
+        {
+            assert!(!page.contains(request), "{request}");
+        }
+        // The only source is the embedded audio.
+        let sources: Vec<&str> = page.split(" src=\"").skip(1).map(|rest| &rest[..16]).collect();
+        assert_eq!(sources, ["data:audio/mpeg;"]);
+        assert!(!page.contains(" href="));
+    }
+
+    #[test]
+    fn numbers_are_there_bit_by_bit() {
+        let mut broken = sample("b", 2);
+        broken.frames[[1, 3]] = f32::NAN;
+        broken.frames[[0, 24]] = f32::NEG_INFINITY;
+        let mut view = view("t", vec![sample("a", 7), broken.clone()]);
+        view.beats_s = vec![1.5, f64::NAN, 0.25, f64::INFINITY];
+        let data = data_of(&page(&view));
+        assert_eq!(data["fps"], 30.0);
+        assert_eq!(data["channels"][9], "quaternion_w");
+        assert_eq!(data["channels"].as_array().map(Vec::len), Some(25));
+        assert_eq!(data["beats"], serde_json::json!([0.25, 1.5]));
+        assert_eq!(data["samples"][0]["facts"], serde_json::json!([["seed", "7"]]));
+        let found = floats_of(&data["samples"][0]["frames"]);
+        assert_eq!(found.len(), 7 * 25);
+        // Frame 6, channel 2: 6 + 2/32 - 1.5.
+        assert_eq!(found[6 * 25 + 2], 4.5625);
+        let found = floats_of(&data["samples"][1]["frames"]);
+        assert!(found[25 + 3].is_nan());
+        assert_eq!(found[24], f32::NEG_INFINITY);
+        // The order of axes in memory does not matter.
+        let turned = broken.frames.t().as_standard_layout().into_owned().reversed_axes();
+        assert_eq!(floats(&turned), floats(&broken.frames));
+    }
+
+    #[test]
+    fn text_from_outside_stays_text() {
+        let hostile = "</script><script>alert('1')</script>\u{2028}\u{2029}<!-- \"&amp;";
+        let mut bad = sample(hostile, 1);
+        bad.facts = vec![(hostile.to_owned(), hostile.to_owned())];
+        let mut view = view(hostile, vec![bad]);
+        view.audio = Some(Audio { mime: "a\"><script>".to_owned(), bytes: Vec::new() });
+        let page = page(&view);
+        assert_eq!(page.matches("</script>").count(), 2, "of the data and of the script");
+        assert_eq!(page.matches("<script").count(), 2);
+        let title = "&lt;/script&gt;&lt;script&gt;alert(&#39;1&#39;)";
+        assert_eq!(page.matches(title).count(), 2, "in title and heading");
+        assert!(page.contains("src=\"data:a&quot;&gt;&lt;script&gt;;base64,\"></audio>"));
+        let (_, json) = page.split_once("id=\"data\">").expect("data");
+        let (json, _) = json.split_once("</script>").expect("its end");
+        assert!(!json.contains(['<', '>', '&', '\u{2028}', '\u{2029}']));
+        let data = data_of(&page);
+        assert_eq!(data["samples"][0]["name"], hostile);
+        assert_eq!(data["samples"][0]["facts"][0][1], hostile);
+    }
+
+    #[test]
+    fn the_audio_is_a_data_uri() {
+        // RFC 4648, section 10.
+        let cases =
+            [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foobar", "Zm9vYmFy")];
+        for (bytes, base64) in cases {
+            let mut view = view("t", vec![sample("0", 1)]);
+            let bytes = bytes.as_bytes().to_vec();
+            view.audio = Some(Audio { mime: "audio/ogg".to_owned(), bytes });
+            let wanted = format!(
+                "<audio id=\"audio\" preload=\"auto\" src=\"data:audio/ogg;base64,{base64}\"></audio>\n"
+            );
+            assert!(page(&view).contains(&wanted), "{base64}");
+        }
+    }
+
+    #[test]
+    fn a_page_without_motion_is_a_page() {
+        let data = data_of(&page(&view("", Vec::new())));
+        assert_eq!(data["samples"], serde_json::json!([]));
+    }
+
+    proptest! {
+        #[test]
+        fn names_are_read_back(name in any::<String>()) {
+            let page = page(&view(&name, vec![sample(&name, 1)]));
+            prop_assert_eq!(page.matches("</script>").count(), 2);
+            let data = data_of(&page);
+            prop_assert_eq!(data["samples"][0]["name"].as_str(), Some(name.as_str()));
+        }
+    }
+}
