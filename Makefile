@@ -103,6 +103,11 @@ bench-inference: build/engine-venv/ready setup ## measure inference beside PyTor
 	build/engine-venv/bin/python benches/inference.py \
 	  --bin $(TARGET)/release/examples/inference-bench $(BENCH_ARGS)
 
+.PHONY: bench-generation
+bench-generation: build/bench-venv/ready setup ## measure generation, whole songs and in bulk [BENCH_ARGS='--model DIR']
+	$(CARGO) build --locked --release --no-default-features --bin motiongen
+	build/bench-venv/bin/python benches/generation.py --bin $(TARGET)/release/motiongen $(BENCH_ARGS)
+
 .PHONY: bench-room
 bench-room: ## build the room autodiff alone, from nothing
 	$(PYTHON) benches/room.py

@@ -1,6 +1,6 @@
 # The demo: real music and real motion capture (tests/data) become tables, the music's features are
 # extracted, phrases to train on are constructed from both, small networks are trained on them and
-# fine-tuned, they become ONNX files, and queries answer.
+# fine-tuned, they become ONNX files, motion is made for all songs, and queries answer.
 #
 #   make demo                              builds first
 #   make -f pipelines/demo.mk BIN=…        with executables that are there already
@@ -11,6 +11,8 @@ STORE  ?= $(OUT)/store
 CONFIG ?= pipelines/demo.toml
 RUN    ?= demo
 MODEL  ?= demo
+# The song that is looked at.
+SONG   ?= $(firstword $(sort $(wildcard $(DATA)/music/gunroar/*.ogg)))
 
 .DEFAULT_GOAL := demo
 include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
@@ -26,6 +28,7 @@ demo:
 	@echo "answers  $(ANSWERS)"
 	@echo "plot     $(PLOT)"
 	@echo "model    $(STORE)/models/$(MODEL)"
+	@echo "motion   $(PAGE) (open it in a browser)"
 	@echo "ask on   $(MOTIONGEN) query --store $(STORE) \"select …\""
 
 # ingest: both sources into one store.
@@ -59,6 +62,15 @@ $(PLOT): $(FINETUNED)
 EXPORTED := $(STAMPS)/export-$(MODEL).done
 $(EXPORTED): $(FINETUNED) $(CONFIG) $(MOTIONGEN)
 	$(call stage,$(MOTIONGEN) export --config $(CONFIG) --store $(STORE) --run $(RUN) --model $(MODEL) --force)
+
+# generate: motion for every song in tables, and for one of them in files that can be looked at.
+GENERATED := $(STAMPS)/generate-$(MODEL).done
+$(GENERATED): $(EXPORTED) $(CONFIG) $(MOTIONGEN)
+	$(call stage,$(MOTIONGEN) generate --config $(CONFIG) --store $(STORE) --model $(MODEL))
+PAGE := $(OUT)/motion/$(basename $(notdir $(SONG))).html
+$(PAGE): $(EXPORTED) $(CONFIG) $(MOTIONGEN)
+	$(MOTIONGEN) generate --config $(CONFIG) --model $(STORE)/models/$(MODEL) --audio $(SONG) \
+	  --output $(OUT)/motion --format npy,glb,png,html --force
 
 # query: what the tables tell.
 define SPLITS
@@ -98,6 +110,11 @@ define CHECKS
 select model, check, precision, n_samples, n_frames, round(max_abs * 1000000, 2) as max_difference_e6,
 passed from onnx_checks order by model, check, n_samples, n_frames
 endef
+define GENERATIONS
+select g.phrase_id, round(g.n_frames / 30.0, 1) as seconds, g.n_windows as windows, round(g.score, 3) as score,
+g.checks_passed, g.n_checks, round(g.locking, 3) as bar_locking, round(g.real_time_factor, 3) as real_time_factor
+from generations g where g.selected order by g.phrase_id limit 8
+endef
 # Lines become spaces on the way to the shell.
 define newline
 
@@ -107,7 +124,7 @@ comma := ,
 ask = @{ echo; echo '$(1)'; $(MOTIONGEN) query --config $(CONFIG) --store $(STORE) \
 	'$(subst $(newline), ,$($(2)))'; } | tee --append $@.new
 
-$(ANSWERS): $(INGESTED) $(EXTRACTED) $(LIBRARY) $(FINETUNED) $(EXPORTED) $(PLOT)
+$(ANSWERS): $(INGESTED) $(EXTRACTED) $(LIBRARY) $(FINETUNED) $(EXPORTED) $(PLOT) $(GENERATED) $(PAGE)
 	@rm -f $@.new
 	@{ echo; echo 'What is there?'; $(MOTIONGEN) query --store $(STORE) --tables; } | tee $@.new
 	$(call ask,How much is in each split?,SPLITS)
@@ -117,4 +134,5 @@ $(ANSWERS): $(INGESTED) $(EXTRACTED) $(LIBRARY) $(FINETUNED) $(EXPORTED) $(PLOT)
 	$(call ask,What was constructed to train on?,CONSTRUCTED)
 	$(call ask,What did training bring?,TRAINING)
 	$(call ask,Does onnxruntime answer what was trained?,CHECKS)
+	$(call ask,What was danced$(comma) and how well?,GENERATIONS)
 	@mv $@.new $@

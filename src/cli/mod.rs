@@ -18,6 +18,7 @@ use clap::{Arg, ArgAction, ArgMatches, Command, FromArgMatches as _};
 use crate::stages::export::Export;
 use crate::stages::extract::Extract;
 use crate::stages::finetune::Finetune;
+use crate::stages::generate::Generate;
 use crate::stages::ingest::Ingest;
 use crate::stages::library::Library;
 use crate::stages::model::Model;
@@ -25,6 +26,7 @@ use crate::stages::plot::Plot;
 #[cfg(feature = "query")]
 use crate::stages::query::Query;
 use crate::stages::train::Train;
+use crate::stages::view::View;
 use crate::stages::{Stage, Summary};
 use progress::Bars;
 
@@ -51,8 +53,10 @@ fn entries() -> Vec<Entry> {
         Entry::of::<Train>(),
         Entry::of::<Finetune>(),
         Entry::of::<Export>(),
+        Entry::of::<Generate>(),
         Entry::of::<Model>(),
         Entry::of::<Plot>(),
+        Entry::of::<View>(),
         #[cfg(feature = "query")]
         Entry::of::<Query>(),
     ]

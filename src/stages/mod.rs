@@ -5,15 +5,18 @@ pub mod extract;
 pub mod failure;
 pub mod feature_file;
 pub mod finetune;
+pub mod generate;
 pub mod ingest;
 pub mod library;
 pub mod model;
 mod model_files;
+mod motion_source;
 pub mod plot;
 #[cfg(feature = "query")]
 pub mod query;
 pub mod train;
 mod trained;
+pub mod view;
 
 use std::io::{self, Write};
 

@@ -113,6 +113,18 @@ impl OpenModel {
         Ok(Self { card, folder: fetched, place, is_verified: true })
     }
 
+    /// Opens a model in a folder of this machine.
+    ///
+    /// # Errors
+    /// One sentence about what is missing or of another kind.
+    pub fn of_folder(folder: &Path) -> anyhow::Result<Self> {
+        let store = Location::local(folder)?;
+        let bytes = store.read(file_names::CARD)?;
+        let card = ModelCard::read(&bytes, &store.url_of(file_names::CARD))?;
+        let place = folder.display().to_string();
+        Ok(Self { card, folder: folder.to_owned(), place, is_verified: false })
+    }
+
     /// Makes an engine: onnxruntime's or ours, and what to tell of the choice.
     ///
     /// # Errors

@@ -182,7 +182,7 @@ rows! {
         score: Option<f64>, "", "Score of the selection, from 0 to 1; none where a value is not finite.";
         checks_passed: i32, "checks", "Sanity checks passed, of the reference's and the strict ones.";
         n_checks: i32, "checks", "Sanity checks made.";
-        locking: Option<f64>, "", "Share of the vertical velocity's variance that follows the bar, R²; none without beats.";
+        locking: Option<f64>, "", "R² of the vertical velocity with the bar's phase, less its mean at wrong tempi; none without beats.";
         velocity_error: f64, "m/s", "Mean |v − 30 Δp| of the motion as it was decoded, before post-processing.";
         control_error_mm: Option<f64>, "mm", "Largest distance from a constraint on the position.";
         control_error_deg: Option<f64>, "°", "Largest angle from a constraint on the orientation.";

@@ -1,0 +1,222 @@
+//! Without tables: audio files become motions in a folder.
+
+use std::fs::File;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::{Context as _, bail};
+use ndarray::ArrayView2;
+
+use super::Done;
+use super::maker::{Made, Maker, Music};
+use super::outputs::{self, Format, Output};
+use crate::motion::exchange::{csv_header, write_csv_rows};
+use crate::motion::{Beats, BeatsError};
+use crate::stages::Progress;
+use crate::stages::extract::{Extracted, Origin, Rules, extract};
+use crate::stages::failure::{Failure, FailureKind};
+use crate::store::{Content, SourceFile, StoreError};
+
+/// Larger files are read as they are decoded.
+const IN_MEMORY_BYTES: u64 = 64 << 20;
+/// Longest audio.
+const MAX_DURATION_S: f64 = 24.0 * 3600.0;
+
+/// What is asked for.
+pub struct Target<'a> {
+    pub audio: &'a [PathBuf],
+    pub folder: &'a Path,
+    pub formats: &'a [Format],
+    pub stream: Option<&'a str>,
+    pub n_samples: usize,
+    pub dry_run: bool,
+    pub force: bool,
+}
+
+/// A file's features and beats.
+type Heard = Result<(Extracted, Option<Beats>), Failure>;
+
+/// Makes motions for files, one file after another.
+///
+/// # Errors
+/// When the folder cannot be written; files that cannot be danced to are part of what was done.
+pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::Result<Done> {
+    let mut done = Done::default();
+    let mut names = std::collections::BTreeMap::new();
+    let mut stream = target.stream.map(open_stream).transpose()?;
+    std::fs::create_dir_all(target.folder)
+        .with_context(|| format!("while making {}", target.folder.display()))?;
+    let mut tasks = Vec::new();
+    for path in target.audio {
+        let stem = path.file_stem().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+        if let Some(other) = names.insert(stem.clone(), path) {
+            bail!(
+                "{} and {} would both be called {stem}; generate them into two folders",
+                other.display(),
+                path.display()
+            );
+        }
+        for sample in 0..target.n_samples {
+            let name =
+                if target.n_samples == 1 { stem.clone() } else { format!("{stem}.{sample}") };
+            let is_there = target.formats.iter().all(|format| {
+                target.folder.join(format!("{name}.{}", format.extension())).exists()
+            });
+            if is_there && !target.force {
+                done.n_unchanged += 1;
+            } else {
+                tasks.push((path, stem.clone(), name, sample));
+            }
+        }
+    }
+    done.n_todo = tasks.len() as u64;
+    if target.dry_run {
+        return Ok(done);
+    }
+    progress.start("generate", "motions", tasks.len() as u64);
+    let mut heard: Option<(&PathBuf, Heard)> = None;
+    for (path, stem, name, sample) in tasks {
+        if heard.as_ref().is_none_or(|(known, _)| *known != path) {
+            progress.say(&format!("features of {stem}"));
+            heard = Some((path, listen(path)));
+        }
+        let Some((_, music)) = &heard else { continue };
+        let outcome = music.as_ref().map_err(Clone::clone).and_then(|(extracted, beats)| {
+            let source = path.display().to_string();
+            let music = Music {
+                phrase_id: &stem,
+                source: &source,
+                features: extracted.frames.view(),
+                beats: beats.clone(),
+                begins_bar: true,
+            };
+            progress.say(&format!("motion for {stem}"));
+            let mut watch = |frames: ArrayView2<f32>| match &mut stream {
+                Some(stream) => stream.write(frames),
+                None => Ok(()),
+            };
+            let made = maker.make(&music, sample, &mut watch)?;
+            // Only the first motion is streamed.
+            stream = None;
+            Ok(made)
+        });
+        match outcome {
+            Ok(made) => {
+                let beats_s: &[f64] = match music {
+                    Ok((_, Some(beats))) => beats.times_s(),
+                    _ => &[],
+                };
+                let output = Output {
+                    name: &name,
+                    frames: made.frames.view(),
+                    beats_s,
+                    audio: path,
+                    facts: facts(&made),
+                };
+                match outputs::write(&output, target.formats, target.folder) {
+                    Ok(written) => {
+                        done.add_made(&made);
+                        done.told.push((told(&name, &made), written));
+                    }
+                    Err(e) => {
+                        let source = path.display().to_string();
+                        let message = format!("{e:#}");
+                        let failure = Failure::new(FailureKind::Unwritable, &source, message);
+                        done.failed.push((name, failure));
+                    }
+                }
+            }
+            Err(failure) => done.failed.push((name, failure)),
+        }
+        progress.advance(1);
+    }
+    progress.finish();
+    Ok(done)
+}
+
+/// Extracts the features of a file, and its beats: those of a beats file beside it, else the tracked ones.
+pub(in crate::stages) fn listen(path: &Path) -> Heard {
+    let name = path.display().to_string();
+    let io = |e: io::Error| StoreError::Io { action: "read", place: name.clone(), source: e };
+    if path.is_dir() {
+        let message = format!("{name}: is a folder; name the files in it");
+        return Err(Failure::new(FailureKind::NotAFile, &name, message));
+    }
+    let size_bytes = std::fs::metadata(path).map_or(0, |meta| meta.len());
+    let content = if size_bytes <= IN_MEMORY_BYTES {
+        std::fs::read(path).map(|bytes| Content::Bytes(bytes.into())).map_err(io)
+    } else {
+        File::open(path).map(Content::File).map_err(io)
+    };
+    let rules = Rules { tuning: None, max_duration_s: MAX_DURATION_S, timeout: Duration::MAX };
+    let file = SourceFile { path: name.clone(), size_bytes, fingerprint: String::new() };
+    let extracted = extract(Origin::Audio, &file, content, |_| true, &rules)?;
+    let beside = path.with_extension("beats.txt");
+    let beats = if beside.exists() {
+        let read = |e: &dyn std::fmt::Display| {
+            let message = format!("{}: {e}", beside.display());
+            Failure::new(FailureKind::BeatsFormat, &beside.display().to_string(), message)
+        };
+        let text = std::fs::read_to_string(&beside).map_err(|e| read(&e))?;
+        Some(Beats::parse(&text).map_err(|e: BeatsError| read(&e))?)
+    } else {
+        let times_s: Vec<f64> = extracted.beats.iter().map(|beat| beat.1).collect();
+        Beats::new(times_s, None, None).ok()
+    };
+    Ok((extracted, beats))
+}
+
+fn told(name: &str, made: &Made) -> String {
+    let row = made.rows.iter().find(|row| row.selected);
+    let score = row.and_then(|row| row.score).map_or("none".to_owned(), |x| format!("{x:.3}"));
+    let checks = row
+        .map_or(String::new(), |row| format!("{} of {} checks", row.checks_passed, row.n_checks));
+    let duration_s = crate::units::frames_to_s(made.frames.nrows());
+    let factor = made.seconds / duration_s.max(f64::MIN_POSITIVE);
+    format!(
+        "{name}: {duration_s:.1} s of motion in {:.1} s ({factor:.2} × real time), score {score}, {checks}",
+        made.seconds
+    )
+}
+
+/// What a page tells of a motion.
+fn facts(made: &Made) -> Vec<(String, String)> {
+    let Some(row) = made.rows.iter().find(|row| row.selected) else { return Vec::new() };
+    let mut facts = vec![
+        ("model", row.model.clone()),
+        ("engine", row.engine.clone()),
+        ("sampler", format!("{}, {} steps", row.sampler, row.n_steps)),
+        ("guidance", format!("{}", row.guidance)),
+        ("seed", format!("{}", row.seed as u64)),
+        ("candidates", format!("{}", made.rows.len())),
+        ("checks", format!("{} of {} passed", row.checks_passed, row.n_checks)),
+        ("real-time factor", format!("{:.2}", row.real_time_factor)),
+    ];
+    facts.extend(row.score.map(|x| ("score", format!("{x:.3}"))));
+    facts.extend(row.locking.map(|x| ("bar locking R²", format!("{x:.3}"))));
+    facts.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
+}
+
+/// Frames on their way to a player, as CSV.
+struct Stream {
+    out: Box<dyn Write>,
+    n_frames: usize,
+}
+
+fn open_stream(target: &str) -> anyhow::Result<Stream> {
+    let mut out: Box<dyn Write> = match target {
+        "-" => Box::new(io::stdout()),
+        path => Box::new(File::create(path).with_context(|| format!("while writing {path}"))?),
+    };
+    out.write_all(csv_header().as_bytes())?;
+    Ok(Stream { out, n_frames: 0 })
+}
+
+impl Stream {
+    fn write(&mut self, frames: ArrayView2<f32>) -> io::Result<()> {
+        write_csv_rows(frames, self.n_frames, &mut self.out)?;
+        self.n_frames += frames.nrows();
+        self.out.flush()
+    }
+}

@@ -1,0 +1,260 @@
+//! One phrase: its music becomes motions, of which the best are kept.
+
+use std::time::Instant;
+
+use ndarray::{Array2, ArrayView2, Axis, concatenate};
+
+use super::params::Settings;
+use crate::evaluation::{Score, score};
+use crate::generation::{
+    Constrained, Constraints, EngineError, Generator, ModelCard, Primed, Track,
+};
+use crate::motion::postprocess::process;
+use crate::motion::{Beats, Channel, MOTION_DIM, bar_phase};
+use crate::stages::failure::{Failure, FailureKind, guarded};
+use crate::store::tables::GenerationRow;
+use crate::store::{TimestampUs, digest};
+use crate::units::{FPS, frames_to_s};
+
+/// What is danced to.
+pub struct Music<'a> {
+    pub phrase_id: &'a str,
+    /// What messages and failures name.
+    pub source: &'a str,
+    /// \[T, 163\]
+    pub features: ArrayView2<'a, f32>,
+    pub beats: Option<Beats>,
+    /// Whether the first of the beats begins a bar.
+    pub begins_bar: bool,
+}
+
+/// A motion that was kept, and what is known of all its candidates.
+#[derive(Debug)]
+pub struct Made {
+    /// \[T, 25\]
+    pub frames: Array2<f32>,
+    pub rows: Vec<GenerationRow>,
+    pub seconds: f64,
+}
+
+/// What makes motion.
+pub struct Maker<'a> {
+    pub generator: Generator<'a>,
+    pub card: &'a ModelCard,
+    /// Digest of the model's weights.
+    pub weights: &'a str,
+    pub run: &'a str,
+    pub settings: &'a Settings,
+}
+
+/// Returns the name of a motion in tables.
+pub fn generation_id(run: &str, phrase_id: &str, sample: usize) -> String {
+    format!("{run}/{phrase_id}/{sample}")
+}
+
+/// Returns the seed of a candidate: it depends on nothing but what names it.
+pub fn seed_of(seed: u64, phrase_id: &str, sample: usize, candidate: usize) -> u64 {
+    let text = format!("{seed}\n{phrase_id}\n{sample}\n{candidate}");
+    u64::from_str_radix(&digest(text.as_bytes())[..16], 16)
+        .expect("a digest has hexadecimal digits")
+}
+
+impl Maker<'_> {
+    /// Makes one sample; `watch` sees the frames of its first candidate as they are final.
+    ///
+    /// # Errors
+    /// A [`Failure`] that names the phrase's music.
+    pub fn make(
+        &self,
+        music: &Music,
+        sample: usize,
+        watch: &mut dyn FnMut(ArrayView2<f32>) -> std::io::Result<()>,
+    ) -> Result<Made, Failure> {
+        guarded(music.source, || self.candidates(music, sample, watch))
+    }
+
+    fn candidates(
+        &self,
+        music: &Music,
+        sample: usize,
+        watch: &mut dyn FnMut(ArrayView2<f32>) -> std::io::Result<()>,
+    ) -> Result<Made, Failure> {
+        let started = Instant::now();
+        let n_frames = music.features.nrows();
+        let constraints = self.constraints(music)?;
+        let phase = music.beats.as_ref().map(|beats| {
+            let times_s: Vec<f64> = (0..n_frames).map(frames_to_s).collect();
+            bar_phase(&times_s, beats)
+        });
+        let mut best: Option<(f64, usize, Array2<f32>)> = None;
+        let mut rows = Vec::with_capacity(self.settings.best_of);
+        for candidate in 0..self.settings.best_of {
+            let begun = Instant::now();
+            let seed = seed_of(self.settings.seed, music.phrase_id, sample, candidate);
+            let mut unseen = |_: ArrayView2<f32>| Ok(());
+            let watcher: &mut dyn FnMut(ArrayView2<f32>) -> std::io::Result<()> =
+                if candidate == 0 { &mut *watch } else { &mut unseen };
+            let decoded = self.sample(music, seed, constraints.as_ref(), watcher)?;
+            let velocity_error = velocity_error(decoded.view());
+            let mut frames = decoded;
+            let bars = phase.as_deref().filter(|_| music.begins_bar);
+            process(&self.settings.postprocess, &mut frames, bars);
+            let score = score(
+                frames.view(),
+                self.settings.postprocess.limits,
+                phase.as_deref(),
+                velocity_error,
+            );
+            let misses = constraints.as_ref().map(|c| c.errors(frames.view())).unwrap_or_default();
+            let worst = |group: Channel, factor: f64| {
+                let of_group = misses.iter().filter(|miss| miss.what.starts_with(group.name()));
+                of_group.map(|miss| miss.error * factor).reduce(f64::max)
+            };
+            let generate_s = begun.elapsed().as_secs_f64();
+            let found = Found {
+                sample,
+                candidate,
+                seed,
+                score: &score,
+                velocity_error,
+                control: [
+                    worst(Channel::Position, 1e3),
+                    worst(Channel::Quaternion, 1.0_f64.to_degrees()),
+                ],
+                generate_s,
+            };
+            rows.push(self.row(music, n_frames, &found));
+            // The first of equals, so that one candidate more changes nothing else.
+            let value = score.total.unwrap_or(f64::NEG_INFINITY);
+            if best.as_ref().is_none_or(|(known, ..)| value > *known) {
+                best = Some((value, candidate, frames));
+            }
+        }
+        let (_, selected, frames) = best.expect("at least one candidate is sampled");
+        rows[selected].selected = true;
+        Ok(Made { frames, rows, seconds: started.elapsed().as_secs_f64() })
+    }
+
+    fn constraints(&self, music: &Music) -> Result<Option<Constraints>, Failure> {
+        let Some(asked) = &self.settings.constraints else { return Ok(None) };
+        let limits = self.settings.postprocess.limits;
+        match asked.of_track(music.features.nrows(), limits) {
+            Ok(constraints) => Ok(Some(constraints)),
+            Err(e) => Err(Failure::new(FailureKind::Constraint, music.source, e)),
+        }
+    }
+
+    /// Samples and decodes a whole track, bent to its constraints.
+    fn sample(
+        &self,
+        music: &Music,
+        seed: u64,
+        constraints: Option<&Constraints>,
+        watch: &mut dyn FnMut(ArrayView2<f32>) -> std::io::Result<()>,
+    ) -> Result<Array2<f32>, Failure> {
+        let strength = self.settings.constraint_strength;
+        let is_exact = !self.settings.soft;
+        let track = Track {
+            features: music.features,
+            seed,
+            style: self.settings.style,
+            constraints: constraints.map(|constraints| Constrained {
+                constraints,
+                strength,
+                is_exact,
+            }),
+            primed: None::<Primed>,
+        };
+        let mut parts: Vec<Array2<f32>> = Vec::new();
+        self.generator
+            .run(&track, |frames| -> Result<(), Stop> {
+                watch(frames.view()).map_err(Stop::Watcher)?;
+                parts.push(frames);
+                Ok(())
+            })
+            .map_err(|stop| match stop {
+                Stop::Engine(e) => Failure::new(FailureKind::Engine, music.source, e),
+                Stop::Watcher(e) => Failure::new(
+                    FailureKind::Unwritable,
+                    music.source,
+                    format!("frames could not be streamed: {e}"),
+                ),
+            })?;
+        let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
+        let mut frames =
+            concatenate(Axis(0), &views).unwrap_or_else(|_| Array2::zeros((0, MOTION_DIM)));
+        if let Some(Constrained { constraints, is_exact: true, .. }) = track.constraints {
+            constraints.bend(&mut frames, 0, 1.0);
+        }
+        Ok(frames)
+    }
+
+    fn row(&self, music: &Music, n_frames: usize, found: &Found) -> GenerationRow {
+        let settings = self.settings;
+        let n_windows = self.generator.windows(n_frames).len();
+        GenerationRow {
+            generation: generation_id(self.run, music.phrase_id, found.sample),
+            run: self.run.to_owned(),
+            phrase_id: music.phrase_id.to_owned(),
+            sample: found.sample as i32,
+            candidate: found.candidate as i32,
+            selected: false,
+            seed: found.seed as i64,
+            model: self.card.name.clone(),
+            weights: self.weights.to_owned(),
+            engine: self.generator.engine.name().to_owned(),
+            sampler: settings.sampler.sampler.name().to_owned(),
+            n_steps: settings.sampler.n_steps as i32,
+            guidance: settings.guidance,
+            eta: settings.eta(),
+            primed_by: None,
+            n_frames: n_frames as i64,
+            n_windows: n_windows as i32,
+            score: found.score.total,
+            checks_passed: found.score.n_passed as i32,
+            n_checks: found.score.n_checks as i32,
+            locking: found.score.locking,
+            velocity_error: found.velocity_error,
+            control_error_mm: found.control[0],
+            control_error_deg: found.control[1],
+            generate_s: found.generate_s,
+            real_time_factor: found.generate_s / frames_to_s(n_frames).max(f64::MIN_POSITIVE),
+            time: TimestampUs::now(),
+        }
+    }
+}
+
+/// What was found of a candidate.
+struct Found<'a> {
+    sample: usize,
+    candidate: usize,
+    seed: u64,
+    score: &'a Score,
+    velocity_error: f64,
+    /// Largest misses: mm, degrees.
+    control: [Option<f64>; 2],
+    generate_s: f64,
+}
+
+/// Why sampling stopped.
+enum Stop {
+    Engine(EngineError),
+    Watcher(std::io::Error),
+}
+
+impl From<EngineError> for Stop {
+    fn from(e: EngineError) -> Self {
+        Self::Engine(e)
+    }
+}
+
+/// Mean |v − 30 Δp|, m/s.
+fn velocity_error(frames: ArrayView2<f32>) -> f64 {
+    let at = |t: usize, i: usize| f64::from(frames[[t, i]]);
+    let (p, v) = (Channel::Position.range().start, Channel::Velocity.range().start);
+    let n = frames.nrows().saturating_sub(1);
+    let errors = (0..n).flat_map(|t| {
+        (0..3).map(move |i| (at(t, v + i) - FPS * (at(t + 1, p + i) - at(t, p + i))).abs())
+    });
+    errors.sum::<f64>() / (3 * n.max(1)) as f64
+}

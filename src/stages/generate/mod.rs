@@ -1,0 +1,270 @@
+//! `generate`: music becomes motion, in the tables `generated` and `generations`, or in files.
+
+mod constraints_file;
+mod files;
+mod maker;
+mod outputs;
+mod params;
+mod tracks;
+
+use std::collections::BTreeMap;
+use std::io::{self, Write};
+use std::num::NonZeroUsize;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use anyhow::bail;
+
+use super::failure::Failure;
+use super::model_files::{OpenModel, sha256};
+use super::{Contract, Progress, Stage, Summary};
+use crate::diffusion::Schedule;
+use crate::generation::{Engine, Generator, ModelCard, Sampling, file_names};
+use crate::store::{Location, Shard};
+use crate::units::frames_to_s;
+
+use maker::{Made, Maker};
+use params::Settings;
+pub use params::{Params, SamplerName, Tracks};
+
+pub(in crate::stages) use files::listen;
+pub(in crate::stages) use maker::generation_id;
+
+/// Motions and failures that the summary spells out.
+const N_SHOWN: usize = 10;
+
+/// The stage.
+pub struct Generate;
+
+impl Stage for Generate {
+    const NAME: &'static str = "generate";
+    const ABOUT: &'static str = "make motion for music of any length";
+    const CONTRACT: Contract = Contract {
+        reads: "models/MODEL; phrases, features, extractions, beats, or audio files",
+        writes: "generated, generations, failures, or files",
+    };
+    type Params = Params;
+
+    fn run(params: Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
+        let started = Instant::now();
+        let store = match &params.store {
+            Some(url) => Some(Location::open(url, &params.client.options())?),
+            None => None,
+        };
+        let model = open_model(&params, store.as_ref())?;
+        let settings = Settings::new(&params, &model.card)?;
+        let run = params.run.clone().unwrap_or_else(|| model.card.name.clone());
+        super::train::session::check_run_name(&run)?;
+        // A single track is fastest with all threads in one worker; many keep a worker each busy.
+        let is_single = params.audio.len() == 1 || params.phrase.len() == 1;
+        let n_workers = if is_single { NonZeroUsize::MIN } else { params.engine.threads };
+        let (engine, note): (Box<dyn Engine>, _) = model.engine(&params.engine, n_workers)?;
+        if let Some(note) = note {
+            progress.note(&note);
+        }
+        let schedule = Schedule::new(&model.card.diffusion)?;
+        let card = &model.card;
+        let weights = weights_digest(card);
+        let sampling = Sampling {
+            config: &settings.sampler,
+            schedule: &schedule,
+            guidance: settings.guidance,
+        };
+        let maker = Maker {
+            generator: Generator {
+                engine: &*engine,
+                sampling,
+                normalizer: &card.normalizer,
+                window_frames: card.window_frames,
+                overlap_frames: settings.overlap_frames,
+            },
+            card,
+            weights: &weights,
+            run: &run,
+            settings: &settings,
+        };
+        let n_samples = params.samples.get();
+        let (place, done) = match (&params.output, &store) {
+            (Some(folder), _) => {
+                let target = files::Target {
+                    audio: &params.audio,
+                    folder,
+                    formats: &params.format,
+                    stream: params.stream.as_deref(),
+                    n_samples,
+                    dry_run: params.dry_run,
+                    force: params.force,
+                };
+                (Place::Folder(folder.clone()), files::run(&maker, &target, progress)?)
+            }
+            (None, Some(store)) => {
+                let target = tracks::Target {
+                    store,
+                    shard: Shard::parse(&params.shard, |name| std::env::var(name).ok())?,
+                    params_hash: &settings.digest(&weights),
+                    force: params.force,
+                    dry_run: params.dry_run,
+                    tracks: params.tracks,
+                    split: params.split.as_deref(),
+                    phrases: &params.phrase,
+                    n_samples,
+                    n_workers: NonZeroUsize::new(engine.n_workers()).unwrap_or(NonZeroUsize::MIN),
+                };
+                let place = Place::Store { store: store.to_string(), run: run.clone() };
+                (place, tracks::run(&maker, &target, progress)?)
+            }
+            (None, None) => bail!("nothing to do: give --store, or --audio with --output"),
+        };
+        let took_s = started.elapsed().as_secs_f64();
+        let made_with = format!(
+            "model {}, {} ({}), {} in {} steps, guidance {}",
+            card.name,
+            engine.name(),
+            engine.n_workers(),
+            settings.sampler.sampler.name(),
+            settings.sampler.n_steps,
+            settings.guidance
+        );
+        Ok(Box::new(Report { place, done, made_with, dry_run: params.dry_run, took_s }))
+    }
+}
+
+/// Opens the model of a store, or in a folder.
+fn open_model(params: &Params, store: Option<&Location>) -> anyhow::Result<OpenModel> {
+    let folder = Path::new(&params.model);
+    if folder.join(file_names::CARD).is_file() {
+        return OpenModel::of_folder(folder);
+    }
+    match store {
+        Some(store) => OpenModel::of_store(store, &params.model, &params.engine.cache()),
+        None => bail!(
+            "there is no model in the folder {}; name the folder of a model (STORE/models/NAME), or give \
+             --store beside its name",
+            params.model
+        ),
+    }
+}
+
+/// Returns one digest for both networks of a model.
+fn weights_digest(card: &ModelCard) -> String {
+    let both = format!("{}\n{}\n", card.weights_sha256.unet, card.weights_sha256.decoder);
+    sha256(both.as_bytes())
+}
+
+/// What became of the motions.
+#[derive(Debug, Default)]
+struct Done {
+    n_todo: u64,
+    todo_s: f64,
+    n_unchanged: u64,
+    n_made: u64,
+    made_s: f64,
+    n_frames: u64,
+    n_candidates: u64,
+    n_checks_failed: u64,
+    is_interrupted: bool,
+    /// A line on each motion that was written to files, and the files.
+    told: Vec<(String, Vec<PathBuf>)>,
+    failed: Vec<(String, Failure)>,
+}
+
+impl Done {
+    fn add_made(&mut self, made: &Made) {
+        self.n_made += 1;
+        self.n_frames += made.frames.nrows() as u64;
+        self.made_s += frames_to_s(made.frames.nrows());
+        self.n_candidates += made.rows.len() as u64;
+        let failed = made.rows.iter().any(|row| row.selected && row.checks_passed < row.n_checks);
+        self.n_checks_failed += u64::from(failed);
+    }
+
+    fn add(&mut self, outcomes: &BTreeMap<String, Result<Made, Failure>>) {
+        for (name, outcome) in outcomes {
+            match outcome {
+                Ok(made) => self.add_made(made),
+                Err(failure) => self.failed.push((name.clone(), failure.clone())),
+            }
+        }
+    }
+}
+
+enum Place {
+    Store { store: String, run: String },
+    Folder(PathBuf),
+}
+
+struct Report {
+    place: Place,
+    done: Done,
+    made_with: String,
+    dry_run: bool,
+    took_s: f64,
+}
+
+impl Summary for Report {
+    fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
+        let Self { place, done, made_with, took_s, .. } = self;
+        match place {
+            Place::Store { store, .. } => writeln!(out, "generate → {store}")?,
+            Place::Folder(folder) => writeln!(out, "generate → {}", folder.display())?,
+        }
+        writeln!(out, "  {made_with}")?;
+        if self.dry_run {
+            let Done { n_todo, todo_s, n_unchanged, .. } = done;
+            let length = if *todo_s > 0.0 { format!(" ({todo_s:.1} s)") } else { String::new() };
+            writeln!(
+                out,
+                "  would make {n_todo} motions{length}, leave {n_unchanged} as they are"
+            )?;
+            return Ok(());
+        }
+        let n_failed = done.failed.len();
+        if done.n_todo == 0 {
+            writeln!(out, "  nothing to do: {} motions are up to date", done.n_unchanged)?;
+        } else {
+            writeln!(
+                out,
+                "  {} motions made ({:.1} s, {} frames), {} up to date, {n_failed} failed; {took_s:.1} s, {:.2} \
+                 of the music's length",
+                done.n_made,
+                done.made_s,
+                done.n_frames,
+                done.n_unchanged,
+                *took_s / done.made_s.max(f64::MIN_POSITIVE)
+            )?;
+        }
+        if done.n_candidates > done.n_made {
+            writeln!(out, "  the best of {} candidates", done.n_candidates)?;
+        }
+        if done.n_checks_failed > 0 {
+            writeln!(out, "  {} of them fail a sanity check", done.n_checks_failed)?;
+        }
+        for (line, files) in done.told.iter().take(N_SHOWN) {
+            writeln!(out, "  {line}")?;
+            for file in files {
+                writeln!(out, "    {}", file.display())?;
+            }
+        }
+        for (name, failure) in done.failed.iter().take(N_SHOWN) {
+            writeln!(out, "  failed [{}] {name}: {}", failure.kind.name(), failure.message)?;
+        }
+        if n_failed > N_SHOWN {
+            writeln!(out, "  … and {} more", n_failed - N_SHOWN)?;
+        }
+        if let Place::Store { store, run } = place {
+            if done.is_interrupted {
+                writeln!(out, "  stopped as asked; the same command goes on with what is missing")?;
+            }
+            writeln!(
+                out,
+                "  motiongen query --store {store} \"select phrase_id, score, real_time_factor from \
+                 generations where run = '{run}' and selected\""
+            )?;
+        }
+        Ok(())
+    }
+
+    fn n_failed(&self) -> u64 {
+        self.done.failed.len() as u64
+    }
+}

@@ -1,0 +1,345 @@
+//! What the user asks of generate, and what follows from it.
+
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+
+use anyhow::{bail, ensure};
+use serde::Serialize;
+
+use super::constraints_file::Asked;
+use super::outputs::Format;
+use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
+use crate::generation::{ModelCard, OVERLAP_FRAMES};
+use crate::motion::postprocess::{Coherence, Hemisphere, PostProcessConfig, SavitzkyGolay};
+use crate::motion::style::STYLE_DIM;
+use crate::motion::{Channel, ChannelLimits};
+use crate::stages::ClientParams;
+use crate::stages::model_files::EngineParams;
+use crate::stages::motion_source::read_motion;
+use crate::store::{Shard, digest};
+
+/// Raised when generate writes something else for the same model, music and settings.
+const OUTPUT_VERSION: u32 = 1;
+
+/// The samplers by the names of the flag.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum SamplerName {
+    /// Every step that was trained, with fresh noise at each.
+    Ddpm,
+    /// 20 to 100 steps.
+    Ddim,
+    /// DPM-Solver++(2M): 8 to 20 steps.
+    #[default]
+    DpmSolver,
+}
+
+/// Which phrases of a store.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Tracks {
+    /// Those with music of their own.
+    #[default]
+    Songs,
+    /// Those that library constructed.
+    Constructed,
+    /// All with features.
+    All,
+}
+
+/// What the user asks for.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Params {
+    /// Folder or bucket of the tables; its model and, without --audio, its phrases.
+    #[arg(long, value_name = "URL")]
+    pub store: Option<String>,
+    /// Name of a model of the store, or the folder of one.
+    #[arg(long, value_name = "NAME|DIR")]
+    pub model: String,
+    /// Audio files to dance to, instead of the store's phrases.
+    #[arg(long, value_name = "FILE", num_args = 1.., requires = "output")]
+    pub audio: Vec<PathBuf>,
+    /// With --audio: the folder for motions, pictures and pages.
+    #[arg(long, value_name = "DIR", requires = "audio")]
+    pub output: Option<PathBuf>,
+    /// With --audio: what is written of each motion.
+    #[arg(long, value_enum, value_name = "FORMAT", value_delimiter = ',', num_args = 1..,
+          default_values_t = Format::DEFAULT)]
+    pub format: Vec<Format>,
+    /// With --audio: writes the frames of the first motion as CSV, as soon as they are final; - is the
+    /// standard output.
+    #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-", requires = "audio")]
+    pub stream: Option<String>,
+    /// Name under which tables keep the motions [default: the model's]
+    #[arg(long, value_name = "NAME")]
+    pub run: Option<String>,
+    /// Which phrases of the store.
+    #[arg(long, value_enum, default_value_t = Tracks::Songs, help_heading = "Phrases")]
+    pub tracks: Tracks,
+    /// Only phrases of this split: train, validation or test.
+    #[arg(long, value_name = "SPLIT", help_heading = "Phrases")]
+    pub split: Option<String>,
+    /// Only these phrases.
+    #[arg(long, value_name = "ID", num_args = 1.., help_heading = "Phrases")]
+    pub phrase: Vec<String>,
+    /// Part of the job that this process does: i/n, or auto inside an array job.
+    #[arg(long, value_name = "I/N", default_value_t = Shard::WHOLE.to_string(), help_heading = "Phrases")]
+    pub shard: String,
+    /// Motions for each phrase.
+    #[arg(long, value_name = "N", default_value_t = NonZeroUsize::MIN, help_heading = "Sampling")]
+    pub samples: NonZeroUsize,
+    /// Candidates for each motion, of which the one with the best score is kept.
+    #[arg(long, value_name = "N", default_value_t = NonZeroUsize::MIN, help_heading = "Sampling")]
+    pub best_of: NonZeroUsize,
+    /// How noise becomes motion.
+    #[arg(long, value_enum, default_value_t = SamplerName::DpmSolver, help_heading = "Sampling")]
+    pub sampler: SamplerName,
+    /// Steps of the sampler [default: 10 of dpm-solver, 20 of ddim, all of ddpm]
+    #[arg(long, value_name = "N", help_heading = "Sampling")]
+    pub steps: Option<usize>,
+    /// Which steps of the diffusion are visited.
+    #[arg(long, value_enum, default_value_t = Spacing::Trailing, help_heading = "Sampling")]
+    pub spacing: Spacing,
+    /// 1 follows the music, more exaggerates it, 0 ignores it.
+    #[arg(long, value_name = "X", default_value_t = 4.0, help_heading = "Sampling")]
+    pub guidance: f64,
+    /// Share of the noise that ddim renews at every step, 0 to 1.
+    #[arg(long, value_name = "X", default_value_t = 0.0, help_heading = "Sampling")]
+    pub eta: f64,
+    /// Seed of all noise.
+    #[arg(long, value_name = "N", default_value_t = 0, help_heading = "Sampling")]
+    pub seed: u64,
+    /// Eight style values from -1 to 1, for a model that takes a style.
+    #[arg(long, value_name = "S0,…,S7", value_delimiter = ',', num_args = 1.., allow_hyphen_values = true,
+          help_heading = "Sampling")]
+    pub style: Vec<f32>,
+    /// Frames that neighbouring windows of a long track share.
+    #[arg(long, value_name = "N", default_value_t = OVERLAP_FRAMES, help_heading = "Sampling")]
+    pub overlap: usize,
+    /// TOML or JSON file of poses and values that the motion must have (docs/generate.md).
+    #[arg(long, value_name = "FILE", help_heading = "Control")]
+    pub constraints: Option<PathBuf>,
+    /// Share of the way to a constraint that every step of the sampling goes, 0 to 1.
+    #[arg(long, value_name = "X", default_value_t = 1.0, help_heading = "Control")]
+    pub constraint_strength: f64,
+    /// Leave the rest of the way, instead of bending the finished motion to every constraint.
+    #[arg(long, help_heading = "Control")]
+    pub soft: bool,
+    #[command(flatten)]
+    pub postprocess: PostProcessParams,
+    #[command(flatten)]
+    pub engine: EngineParams,
+    #[command(flatten)]
+    pub client: ClientParams,
+    /// Say what would be done, and do nothing.
+    #[arg(long)]
+    pub dry_run: bool,
+    /// Make every motion again, made or not.
+    #[arg(long)]
+    pub force: bool,
+}
+
+/// What is done to decoded motion.
+#[derive(Clone, Debug, clap::Args)]
+pub struct PostProcessParams {
+    /// Leave decoded motion as it is.
+    #[arg(long, help_heading = "Post-processing")]
+    pub raw: bool,
+    /// How far each channel may go.
+    #[arg(long, value_enum, default_value_t = ChannelLimits::Wide, help_heading = "Post-processing")]
+    pub limits: ChannelLimits,
+    /// Signs of quaternions: continuous in time, or w ≥ 0 in every frame as in the reference.
+    #[arg(long, value_enum, default_value_t = Hemisphere::Sequential, help_heading = "Post-processing")]
+    pub hemisphere: Hemisphere,
+    /// Frames of a weighted mean of the orientations; an odd number [default: none]
+    #[arg(long, value_name = "N", help_heading = "Post-processing")]
+    pub smooth_quaternions: Option<usize>,
+    /// Never let the phase fall within a bar.
+    #[arg(long, help_heading = "Post-processing")]
+    pub monotonic_phase: bool,
+    /// Leave the phase as it was decoded, instead of the phase of the music's bars.
+    #[arg(long, help_heading = "Post-processing")]
+    pub decoded_phase: bool,
+    /// Velocities, accelerations and angular velocities: as decoded, half of each as in the reference, or
+    /// derived from positions and orientations.
+    #[arg(long, value_enum, default_value_t = Coherence::Derive, help_heading = "Post-processing")]
+    pub coherence: Coherence,
+    /// Frames of the reference's moving average; an odd number [default: none]
+    #[arg(long, value_name = "N", help_heading = "Post-processing")]
+    pub moving_average: Option<usize>,
+    /// Smooths by polynomials of an order over a window of frames [default: none]
+    #[arg(long, value_name = "WINDOW,ORDER", value_delimiter = ',', num_args = 1..,
+          help_heading = "Post-processing")]
+    pub savitzky_golay: Vec<usize>,
+}
+
+impl PostProcessParams {
+    /// Returns the configuration.
+    ///
+    /// # Errors
+    /// A window that is even or an order that is too high, in a sentence.
+    pub fn config(&self) -> anyhow::Result<PostProcessConfig> {
+        let mut config = PostProcessConfig {
+            limits: self.limits,
+            hemisphere: self.hemisphere,
+            smooth_quaternions: self.smooth_quaternions.is_some(),
+            enforce_phase_monotonic: self.monotonic_phase,
+            relock_phase: !self.decoded_phase,
+            coherence: self.coherence,
+            apply_smoothing: self.moving_average.is_some(),
+            savitzky_golay: match self.savitzky_golay[..] {
+                [] => None,
+                [window, order] => Some(SavitzkyGolay { window, order }),
+                _ => bail!("--savitzky-golay takes two numbers: WINDOW,ORDER, such as 7,3"),
+            },
+            ..PostProcessConfig::default()
+        };
+        if let Some(window) = self.smooth_quaternions {
+            config.quat_smooth_window = window;
+        }
+        if let Some(size) = self.moving_average {
+            config.smoothing_kernel_size = size;
+        }
+        if self.raw {
+            config = PostProcessConfig {
+                normalize_quaternions: false,
+                clamp_phase: false,
+                relock_phase: false,
+                clamp_values: false,
+                limits: self.limits,
+                coherence: Coherence::Keep,
+                ..PostProcessConfig::default()
+            };
+        }
+        config.check()?;
+        Ok(config)
+    }
+}
+
+/// What determines a motion beside the model and the music.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    pub sampler: SamplerConfig,
+    pub guidance: f64,
+    pub seed: u64,
+    pub best_of: usize,
+    pub style: Option<[f32; STYLE_DIM]>,
+    pub overlap_frames: usize,
+    pub postprocess: PostProcessConfig,
+    pub constraints: Option<Asked>,
+    pub constraint_strength: f64,
+    pub soft: bool,
+}
+
+impl Settings {
+    /// Reads what the user asks for, for a model.
+    ///
+    /// # Errors
+    /// One sentence for what this model or any sampler cannot do.
+    pub fn new(params: &Params, card: &ModelCard) -> anyhow::Result<Self> {
+        let schedule = Schedule::new(&card.diffusion)?;
+        let (sampler, n_steps) = match params.sampler {
+            SamplerName::Ddpm => (Sampler::Ddpm, schedule.len()),
+            SamplerName::Ddim => (Sampler::Ddim { eta: params.eta }, 20),
+            SamplerName::DpmSolver => (Sampler::DpmSolver, 10),
+        };
+        let n_steps = params.steps.unwrap_or_else(|| n_steps.min(schedule.len()));
+        let sampler = SamplerConfig { sampler, n_steps, spacing: params.spacing, clip: true };
+        sampler.check(schedule.len())?;
+        ensure!(
+            params.guidance >= 0.0 && params.guidance.is_finite(),
+            "--guidance {} is below 0; give 1 to follow the music, more to exaggerate it",
+            params.guidance
+        );
+        ensure!(
+            params.overlap < card.window_frames,
+            "--overlap {} is not below the {} frames of a window of model {}; give a smaller number",
+            params.overlap,
+            card.window_frames,
+            card.name
+        );
+        let strength = params.constraint_strength;
+        ensure!(
+            (0.0..=1.0).contains(&strength),
+            "--constraint-strength {strength} is no share; give a number from 0 to 1"
+        );
+        let constraints = match &params.constraints {
+            Some(path) => Some(Asked::read(path, |path| Ok(read_motion(path)?.into_array()))?),
+            None => None,
+        };
+        Ok(Self {
+            sampler,
+            guidance: params.guidance,
+            seed: params.seed,
+            best_of: params.best_of.get(),
+            style: style(&params.style, card)?,
+            overlap_frames: params.overlap,
+            postprocess: params.postprocess.config()?,
+            constraints,
+            constraint_strength: strength,
+            soft: params.soft,
+        })
+    }
+
+    /// Returns η, for a sampler that has one.
+    pub fn eta(&self) -> Option<f64> {
+        match self.sampler.sampler {
+            Sampler::Ddim { eta } => Some(eta),
+            Sampler::Ddpm | Sampler::DpmSolver => None,
+        }
+    }
+
+    /// Returns the digest of everything but the music that determines motions.
+    pub fn digest(&self, weights: &str) -> String {
+        // A struct is written in the order of its fields in every build; a map of serde_json is not.
+        #[derive(Serialize)]
+        struct Digested<'a> {
+            output_version: u32,
+            weights: &'a str,
+            sampler: &'a SamplerConfig,
+            guidance: f64,
+            seed: u64,
+            best_of: usize,
+            style: Option<[f32; STYLE_DIM]>,
+            overlap_frames: usize,
+            postprocess: &'a PostProcessConfig,
+            constraints: Option<String>,
+            constraint_strength: f64,
+            soft: bool,
+        }
+        let digested = Digested {
+            output_version: OUTPUT_VERSION,
+            weights,
+            sampler: &self.sampler,
+            guidance: self.guidance,
+            seed: self.seed,
+            best_of: self.best_of,
+            style: self.style,
+            overlap_frames: self.overlap_frames,
+            postprocess: &self.postprocess,
+            constraints: self.constraints.as_ref().map(|asked| format!("{asked:?}")),
+            constraint_strength: self.constraint_strength,
+            soft: self.soft,
+        };
+        let text = serde_json::to_string(&digested).expect("numbers and texts become JSON");
+        digest(text.as_bytes())
+    }
+}
+
+/// Returns a style in the model's units.
+fn style(values: &[f32], card: &ModelCard) -> anyhow::Result<Option<[f32; STYLE_DIM]>> {
+    if values.is_empty() {
+        return Ok(None);
+    }
+    ensure!(
+        card.unet.style_dim > 0,
+        "model {} takes no style; leave --style out, or train one with --style",
+        card.name
+    );
+    let Ok(mut style) = <[f32; STYLE_DIM]>::try_from(values) else {
+        bail!("--style has {} values; give {STYLE_DIM}, from -1 to 1", values.len());
+    };
+    for (i, x) in Channel::Style.range().zip(&mut style) {
+        ensure!((-1.0..=1.0).contains(x), "--style has {x}; give values from -1 to 1");
+        *x = (*x - card.normalizer.centre[i]) / card.normalizer.scale[i];
+    }
+    Ok(Some(style))
+}

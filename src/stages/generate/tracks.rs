@@ -1,0 +1,314 @@
+//! The phrases of a store, made batch by batch.
+//!
+//! As in extract, a batch is a range of the phrases' stable hash, cut by the table of phrases alone: whoever
+//! does it, whenever, writes the same motions under the same name. Phrases of a batch are made side by side,
+//! and the batch is committed when its last one is done.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::num::NonZeroUsize;
+use std::sync::Mutex;
+
+use anyhow::{bail, ensure};
+use ndarray::Array2;
+
+use super::maker::{Made, Maker, Music, generation_id};
+use super::params::Tracks;
+use super::{Done, Generate};
+use crate::motion::Beats;
+use crate::stages::extract::pool::{self, lock};
+use crate::stages::failure::{Failure, FailureKind};
+use crate::stages::{Progress, Stage as _};
+use crate::store::tables::{self, BeatRow, ExtractionRow, FailureRow, GenerationRow, PhraseRow};
+use crate::store::{
+    Commit, Item, Label, Ledger, Location, Row as _, Shard, Snapshot, StoreError, TimestampUs,
+    batch_of,
+};
+use crate::units::frames_to_s;
+
+/// Where the items of this stage come from, as its commits name it.
+const ITEMS_FROM: &str = "phrases";
+/// Most music in a batch, about: what a kill can cost.
+const MAX_BATCH_S: f64 = 600.0;
+/// Most phrases in a batch, about.
+const MAX_BATCH_PHRASES: usize = 64;
+
+/// The store and what is asked of it.
+pub struct Target<'a> {
+    pub store: &'a Location,
+    pub shard: Shard,
+    pub params_hash: &'a str,
+    pub force: bool,
+    pub dry_run: bool,
+    pub tracks: Tracks,
+    pub split: Option<&'a str>,
+    /// Only these; all where empty.
+    pub phrases: &'a [String],
+    pub n_samples: usize,
+    pub n_workers: NonZeroUsize,
+}
+
+/// A phrase to be danced to.
+struct Task {
+    batch: u64,
+    row: PhraseRow,
+    n_frames: usize,
+    /// Samples that are missing.
+    samples: Vec<usize>,
+}
+
+type Outcome = Result<Made, Failure>;
+
+/// Makes what `target` lacks.
+///
+/// # Errors
+/// When the store cannot be read or written; what was committed stays.
+pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::Result<Done> {
+    let ledger = Ledger::read(target.store, Generate::NAME)?;
+    let mut done = Done::default();
+    let tasks = plan(maker, target, &ledger, &mut done)?;
+    done.n_todo = tasks.iter().map(|task| task.samples.len() as u64).sum();
+    done.todo_s =
+        tasks.iter().map(|task| frames_to_s(task.n_frames) * task.samples.len() as f64).sum();
+    if target.dry_run || tasks.is_empty() {
+        return Ok(done);
+    }
+    target.store.sweep()?;
+    progress.start_audio("generate", done.todo_s.ceil() as u64);
+    let mut batches: BTreeMap<u64, Vec<Task>> = BTreeMap::new();
+    for task in tasks {
+        batches.entry(task.batch).or_default().push(task);
+    }
+    for tasks in batches.into_values() {
+        let outcomes = make_batch(maker, target, &tasks, progress)?;
+        done.add(&outcomes);
+        commit(maker, target, &ledger, &tasks, outcomes)?;
+        if progress.is_interrupted() {
+            done.is_interrupted = true;
+            break;
+        }
+    }
+    progress.finish();
+    Ok(done)
+}
+
+/// Returns the phrases that lack motions, in the order in which they are made.
+fn plan(
+    maker: &Maker,
+    target: &Target,
+    ledger: &Ledger,
+    done: &mut Done,
+) -> anyhow::Result<Vec<Task>> {
+    let store = target.store;
+    let rows: Vec<PhraseRow> = Snapshot::take(store, PhraseRow::schema())?.rows()?;
+    if rows.is_empty() {
+        bail!(
+            "store {store} has no phrases; run first: motiongen ingest --source … --store {store}"
+        );
+    }
+    for id in target.phrases {
+        ensure!(rows.iter().any(|row| row.phrase_id == *id), "store {store} has no phrase {id}");
+    }
+    let extractions: Vec<ExtractionRow> = Snapshot::take(store, ExtractionRow::schema())?.rows()?;
+    let extracted: HashMap<&str, i64> =
+        extractions.iter().map(|row| (row.phrase_id.as_str(), row.n_frames)).collect();
+    let is_wanted = |row: &PhraseRow| {
+        let of_kind = match target.tracks {
+            Tracks::All => true,
+            Tracks::Constructed => row.is_constructed(),
+            Tracks::Songs => !row.is_constructed() && (row.has_audio || row.has_features),
+        };
+        let is_named = target.phrases.is_empty() || target.phrases.contains(&row.phrase_id);
+        let is_kind = of_kind || (!target.phrases.is_empty() && is_named);
+        is_kind && is_named && target.split.is_none_or(|split| row.split == split)
+    };
+    let n_frames = |row: &PhraseRow| {
+        let own = row.n_feature_frames.filter(|_| row.is_constructed());
+        let n = extracted.get(row.phrase_id.as_str()).copied().or(own).unwrap_or(0);
+        usize::try_from(n).unwrap_or(0)
+    };
+    let mut tasks: Vec<Task> = rows
+        .into_iter()
+        .filter(|row| is_wanted(row))
+        .map(|row| Task { batch: 0, n_frames: n_frames(&row), row, samples: Vec::new() })
+        .collect();
+    let total_s: f64 =
+        tasks.iter().map(|task| frames_to_s(task.n_frames) * target.n_samples as f64).sum();
+    let by_length = (total_s / MAX_BATCH_S).ceil() as u64;
+    let by_count = tasks.len().div_ceil(MAX_BATCH_PHRASES) as u64;
+    // A power of two, so that shards in powers of two hold whole batches.
+    let n_batches = by_length.max(by_count).max(1).next_power_of_two();
+    tasks.retain(|task| target.shard.takes(&task.row.phrase_id));
+    for task in &mut tasks {
+        let id = &task.row.phrase_id;
+        task.batch = batch_of(id, n_batches);
+        let is_missing = |sample: &usize| {
+            target.force
+                || !ledger.get(&generation_id(maker.run, id, *sample)).is_some_and(|known| {
+                    known.params_hash == target.params_hash
+                        && known.item.succeeded()
+                        && known.item.input_hash == task.row.content_hash
+                })
+        };
+        task.samples = (0..target.n_samples).filter(is_missing).collect();
+        done.n_unchanged += (target.n_samples - task.samples.len()) as u64;
+    }
+    tasks.retain(|task| !task.samples.is_empty());
+    tasks.sort_by(|a, b| (a.batch, &a.row.phrase_id).cmp(&(b.batch, &b.row.phrase_id)));
+    Ok(tasks)
+}
+
+/// Makes the phrases of a batch side by side.
+fn make_batch(
+    maker: &Maker,
+    target: &Target,
+    tasks: &[Task],
+    progress: &dyn Progress,
+) -> anyhow::Result<BTreeMap<String, Outcome>> {
+    let wanted: BTreeSet<String> = tasks.iter().map(|task| task.row.phrase_id.clone()).collect();
+    let mut music: HashMap<String, Array2<f32>> = HashMap::new();
+    Snapshot::take(target.store, tables::features())?.visit_items(&wanted, |id, frames| {
+        music.insert(id.to_owned(), frames);
+        Ok::<_, StoreError>(())
+    })?;
+    let beats = beats_of(target.store, &wanted)?;
+    // The longest first, so that no worker is left with it at the end.
+    let mut order: Vec<(&Task, usize)> = tasks
+        .iter()
+        .flat_map(|task| task.samples.iter().map(move |&sample| (task, sample)))
+        .collect();
+    order.sort_by_key(|(task, sample)| {
+        (std::cmp::Reverse(task.n_frames), &task.row.phrase_id, *sample)
+    });
+    let mut queue = order.into_iter();
+    let outcomes = Mutex::new(BTreeMap::new());
+    pool::run(
+        target.n_workers,
+        || queue.next(),
+        |(task, sample): (&Task, usize)| -> anyhow::Result<()> {
+            let id = &task.row.phrase_id;
+            let outcome = match music.get(id) {
+                Some(features) => {
+                    let numbered = beats.get(id).map(Vec::as_slice).unwrap_or_default();
+                    let music = Music {
+                        phrase_id: id,
+                        source: url_of(&task.row),
+                        features: features.view(),
+                        beats: beats_in_bars(numbered, &task.row),
+                        // An excerpt may begin anywhere in a bar.
+                        begins_bar: !task.row.is_constructed(),
+                    };
+                    maker.make(&music, sample, &mut |_| Ok(()))
+                }
+                None => Err(without_features(&task.row, target.store)),
+            };
+            progress.advance(frames_to_s(task.n_frames).round() as u64);
+            lock(&outcomes).insert(generation_id(maker.run, id, sample), outcome);
+            Ok(())
+        },
+    )?;
+    Ok(outcomes.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner))
+}
+
+fn url_of(row: &PhraseRow) -> &str {
+    row.audio_url.as_deref().or(row.features_url.as_deref()).unwrap_or(&row.source)
+}
+
+fn without_features(row: &PhraseRow, store: &Location) -> Failure {
+    let id = &row.phrase_id;
+    let message = if row.has_audio || row.has_features {
+        format!("phrase {id}: has no features; run motiongen extract --store {store} first")
+    } else {
+        format!("phrase {id}: has no audio and no features, so that there is nothing to dance to")
+    };
+    Failure::new(FailureKind::NoMusic, url_of(row), message)
+}
+
+/// Returns the beats of some phrases, in order.
+fn beats_of(
+    store: &Location,
+    wanted: &BTreeSet<String>,
+) -> Result<HashMap<String, Vec<f64>>, StoreError> {
+    let rows: Vec<BeatRow> = Snapshot::take(store, BeatRow::schema())?.rows()?;
+    let mut found: HashMap<String, Vec<(i32, f64)>> = HashMap::new();
+    for row in rows.into_iter().filter(|row| wanted.contains(&row.phrase_id)) {
+        found.entry(row.phrase_id).or_default().push((row.beat, row.time_s));
+    }
+    let in_order = |(id, mut beats): (String, Vec<(i32, f64)>)| {
+        beats.sort_by_key(|beat| beat.0);
+        (id, beats.into_iter().map(|beat| beat.1).collect())
+    };
+    Ok(found.into_iter().map(in_order).collect())
+}
+
+/// Counts beats in bars; `None` for too few beats to tell a tempo.
+fn beats_in_bars(times_s: &[f64], row: &PhraseRow) -> Option<Beats> {
+    let beats_per_bar = row.beats_per_bar.and_then(|n| u32::try_from(n).ok());
+    Beats::new(times_s.to_vec(), None, beats_per_bar).ok()
+}
+
+/// Writes a batch: its motions, what is known of them, and what failed.
+fn commit(
+    maker: &Maker,
+    target: &Target,
+    ledger: &Ledger,
+    tasks: &[Task],
+    outcomes: BTreeMap<String, Outcome>,
+) -> anyhow::Result<()> {
+    let rows: HashMap<String, (&PhraseRow, usize)> = tasks
+        .iter()
+        .flat_map(|task| task.samples.iter().map(move |&sample| (task, sample)))
+        .map(|(task, sample)| {
+            (generation_id(maker.run, &task.row.phrase_id, sample), (&task.row, sample))
+        })
+        .collect();
+    let mut commit = Commit::new(target.store, Generate::NAME, target.params_hash, ITEMS_FROM);
+    let (mut generations, mut failures) = (Vec::new(), Vec::new());
+    for (id, outcome) in outcomes {
+        let (row, sample) = rows[&id];
+        let failure = outcome.as_ref().err().map(Failure::digest);
+        let input_hash = row.content_hash.clone();
+        let is_known_failure = failure.is_some()
+            && ledger.get(&id).is_some_and(|known| {
+                known.params_hash == target.params_hash
+                    && known.item.input_hash == input_hash
+                    && known.item.failure == failure
+            });
+        if is_known_failure {
+            continue;
+        }
+        match outcome {
+            Ok(made) => {
+                let labels = [
+                    Label::Text(maker.run.to_owned()),
+                    Label::Text(row.phrase_id.clone()),
+                    Label::Number(sample as i32),
+                ];
+                let part = commit.part(tables::GENERATED, tables::generated)?;
+                part.write_labelled_frames(&id, &labels, made.frames.view())?;
+                generations.extend(made.rows);
+            }
+            Err(failure) => failures.push(FailureRow {
+                stage: Generate::NAME.to_owned(),
+                phrase_id: id.clone(),
+                source: url_of(row).to_owned(),
+                kind: failure.kind.name().to_owned(),
+                message: failure.message,
+                time: TimestampUs::now(),
+            }),
+        }
+        let fingerprint = input_hash.clone();
+        commit.settle(Item { id, fingerprint, input_hash, failure }, ledger);
+    }
+    if !generations.is_empty() {
+        commit
+            .part(GenerationRow::schema().name, GenerationRow::schema)?
+            .write_rows(&generations)?;
+    }
+    if !failures.is_empty() {
+        commit.part(FailureRow::schema().name, FailureRow::schema)?.write_rows(&failures)?;
+    }
+    if !commit.is_empty() {
+        commit.publish()?;
+    }
+    Ok(())
+}

@@ -1,0 +1,316 @@
+//! `motiongen generate`, as a user runs it: tables and files, killed, sharded, and with bad input.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::Duration;
+
+use motiongen::motion::npy::write as npy;
+use motiongen::store::tables::{GENERATED, GenerationRow};
+use ndarray::Array2;
+
+use crate::support::{Dir, Output, confined, failures, finish, motiongen, rows, run, write};
+use crate::train::{make_store, train};
+
+const TRAINED: [&str; 4] =
+    ["--steps=20", "--decoder-steps=15", "--warmup-steps=5", "--prediction=x0"];
+
+/// A store of 16 phrases of 19 to 67 frames, with a model of windows of 24.
+fn modelled(dir: &Dir) -> PathBuf {
+    let store = make_store(dir);
+    let output = train(&store, "run", &TRAINED);
+    assert_eq!(output.code, 0, "{output:?}");
+    let export = ["export", "--run=run", "--model=m", "--quiet", "--store"];
+    let output = run(export.iter().map(AsRef::as_ref).chain([store.as_os_str()]));
+    assert_eq!(output.code, 0, "{output:?}");
+    store
+}
+
+fn command(store: &Path, more: &[&str]) -> Command {
+    let mut command = motiongen();
+    let flag = |argument: &str| argument.split('=').next().unwrap_or_default().to_owned();
+    let given: Vec<String> = more.iter().map(|argument| flag(argument)).collect();
+    let usual = ["--model=m", "--quiet", "--overlap=7", "--engine=eager", "--steps=4"];
+    let usual = usual.iter().filter(|argument| !given.contains(&flag(argument)));
+    command.arg("generate").arg("--store").arg(store).args(usual).args(more);
+    command
+}
+
+#[track_caller]
+fn generate(store: &Path, more: &[&str]) -> Output {
+    let output = finish(&mut command(store, more));
+    assert_eq!(output.code, 0, "{output:?}");
+    output
+}
+
+/// The parts of generated motion: names and bytes.
+fn parts(store: &Path) -> BTreeMap<String, Vec<u8>> {
+    let Ok(entries) = std::fs::read_dir(store.join(GENERATED)) else { return BTreeMap::new() };
+    entries
+        .map(|entry| entry.expect("an entry").path())
+        .map(|path| {
+            let name = path.file_name().expect("a name").to_string_lossy().into_owned();
+            (name, std::fs::read(path).expect("a part"))
+        })
+        .collect()
+}
+
+/// All generated frames as the query says them: by motion and frame, every number in full.
+fn frames(store: &Path) -> String {
+    let sql = "select * from generated order by generation, frame";
+    let output = run(["query", "--store", &store.display().to_string(), sql, "--format", "csv"]);
+    assert_eq!(output.code, 0, "{output:?}");
+    output.stdout
+}
+
+fn generations(store: &Path) -> Vec<GenerationRow> {
+    let mut rows: Vec<GenerationRow> = rows(store);
+    rows.sort_by(|a, b| (&a.generation, a.candidate).cmp(&(&b.generation, b.candidate)));
+    rows
+}
+
+fn copy(from: &Path, to: &Path) {
+    let status = Command::new("cp").arg("-r").arg(from).arg(to).status().expect("cp");
+    assert!(status.success());
+}
+
+#[test]
+fn every_phrase_gets_motion_of_its_length_and_again_nothing_is_done() {
+    let dir = Dir::new();
+    let store = modelled(&dir);
+    let planned = generate(&store, &["--dry-run", "--samples=2"]);
+    assert!(planned.stdout.contains("would make 32 motions"), "{planned:?}");
+    assert!(parts(&store).is_empty());
+
+    let output = generate(&store, &["--samples=2", "--run=first", "--seed=9"]);
+    assert!(output.stdout.contains("  32 motions made ("), "{output:?}");
+    let rows = generations(&store);
+    assert_eq!(rows.len(), 32);
+    for row in &rows {
+        assert_eq!(row.generation, format!("first/{}/{}", row.phrase_id, row.sample));
+        assert!(row.selected && row.candidate == 0 && row.engine == "eager", "{row:?}");
+        assert_eq!((row.n_steps, row.sampler.as_str(), row.guidance), (4, "DPM-Solver++", 4.0));
+        let n_windows = (row.n_frames - 24).max(0).div_euclid(17)
+            + 1
+            + i64::from((row.n_frames - 24).max(0).rem_euclid(17) > 0);
+        assert_eq!(i64::from(row.n_windows), n_windows, "{row:?}");
+        assert!(row.velocity_error > 0.0 && row.real_time_factor > 0.0);
+    }
+    let seeds: std::collections::BTreeSet<i64> = rows.iter().map(|row| row.seed).collect();
+    assert_eq!(seeds.len(), 32, "every motion has noise of its own");
+    let store_url = store.display().to_string();
+    let sql = "select generation, count(*) as n from generated group by generation";
+    let counted = run(["query", "--store", &store_url, sql, "--format", "csv"]);
+    let counts: BTreeMap<&str, i64> = counted
+        .stdout
+        .lines()
+        .skip(1)
+        .map(|line| line.rsplit_once(',').expect("two columns"))
+        .map(|(name, n)| (name, n.parse().expect("a number")))
+        .collect();
+    let expected: BTreeMap<&str, i64> =
+        rows.iter().map(|row| (row.generation.as_str(), row.n_frames)).collect();
+    assert_eq!(counts, expected, "as many frames as the music has");
+
+    let before = parts(&store);
+    let again = generate(&store, &["--samples=2", "--run=first", "--seed=9"]);
+    assert!(again.stdout.contains("  nothing to do: 32 motions are up to date"), "{again:?}");
+    assert_eq!(parts(&store), before);
+    // One sample more is all that is missing; another name has motions of its own.
+    let more = generate(&store, &["--samples=3", "--run=first", "--seed=9"]);
+    assert!(more.stdout.contains("  16 motions made (") && more.stdout.contains(", 32 up to date"));
+    let other = generate(&store, &["--run=second", "--seed=9"]);
+    assert!(other.stdout.contains("  16 motions made ("), "{other:?}");
+    assert_eq!(generations(&store).len(), 64);
+}
+
+#[test]
+fn shards_threads_and_a_kill_change_no_byte() {
+    let dir = Dir::new();
+    let store = modelled(&dir);
+    let [one, sharded, killed] = ["one", "sharded", "killed"].map(|name| dir.at(name));
+    for to in [&one, &sharded, &killed] {
+        copy(&store, to);
+    }
+    generate(&one, &["--threads=1", "--samples=2"]);
+    for shard in ["--shard=1/2", "--shard=0/2"] {
+        generate(&sharded, &["--threads=2", "--samples=2", shard]);
+    }
+    assert_eq!(frames(&sharded), frames(&one));
+    for wait_ms in [30, 90, 200, 400] {
+        let mut child = command(&killed, &["--samples=2"]).spawn().expect("started");
+        std::thread::sleep(Duration::from_millis(wait_ms));
+        // It may have ended by itself; then there is nothing left to kill.
+        let _ = child.kill();
+        child.wait().expect("ended");
+    }
+    generate(&killed, &["--samples=2"]);
+    assert_eq!(parts(&killed), parts(&one));
+    let without_times = |store: &Path| {
+        let mut rows = generations(store);
+        for row in &mut rows {
+            (row.generate_s, row.real_time_factor) = (0.0, 0.0);
+            row.time = motiongen::store::TimestampUs(0);
+        }
+        rows
+    };
+    assert_eq!(without_times(&killed), without_times(&one));
+}
+
+#[test]
+fn the_best_candidate_is_kept_and_all_are_known() {
+    let dir = Dir::new();
+    let store = modelled(&dir);
+    let output = generate(&store, &["--best-of=3"]);
+    assert!(output.stdout.contains("  the best of 48 candidates"), "{output:?}");
+    let rows = generations(&store);
+    assert_eq!(rows.len(), 48);
+    for candidates in rows.chunks(3) {
+        assert!(candidates.iter().all(|row| row.generation == candidates[0].generation));
+        let selected: Vec<_> = candidates.iter().filter(|row| row.selected).collect();
+        assert_eq!(selected.len(), 1);
+        let best = candidates.iter().filter_map(|row| row.score).fold(f64::NEG_INFINITY, f64::max);
+        assert_eq!(selected[0].score, Some(best), "{candidates:?}");
+    }
+}
+
+#[test]
+fn what_cannot_be_made_is_recorded_and_the_rest_is_made() {
+    let dir = Dir::new();
+    let store = modelled(&dir);
+    // At 1.0 s (frame 30) only phrases of more than 30 frames can be asked for anything.
+    let constraints = dir.write("c.toml", "[[keyframe]]\ntime_s = 1.0\nposition_y = 0.5\n");
+    let asked = constraints.display().to_string();
+    let output = finish(&mut command(&store, &["--constraints", &asked]));
+    assert_eq!(output.code, 1, "{output:?}");
+    let failed = failures(&store);
+    let rows = generations(&store);
+    assert_eq!((failed.len() + rows.len(), rows.iter().all(|row| row.n_frames > 30)), (16, true));
+    for row in failed.values() {
+        assert_eq!((row.stage.as_str(), row.kind.as_str()), ("generate", "constraint"));
+        assert!(
+            row.message.starts_with(
+                "a constraint on position_y is at frame 30 (1.00 s), but the track has 19 frames (0.63 s); \
+                 move it or leave it out"
+            ),
+            "{row:?}"
+        );
+    }
+    for row in &rows {
+        assert!(row.control_error_mm.is_some_and(|mm| mm < 0.01), "{row:?}");
+    }
+    // Without the constraint the failures are gone.
+    generate(&store, &[]);
+    assert!(failures(&store).is_empty());
+}
+
+#[test]
+fn mistakes_are_named() {
+    let dir = Dir::new();
+    let store = modelled(&dir);
+    let said = |more: &[&str]| {
+        let output = finish(&mut command(&store, more));
+        assert_eq!(output.code, 2, "{output:?}");
+        output.stderr.lines().next().unwrap_or_default().to_owned()
+    };
+    assert_eq!(
+        said(&["--overlap=24"]),
+        "error: --overlap 24 is not below the 24 frames of a window of model m; give a smaller number"
+    );
+    assert_eq!(
+        said(&["--guidance=-1"]),
+        "error: --guidance -1 is below 0; give 1 to follow the music, more to exaggerate it"
+    );
+    assert_eq!(
+        said(&["--style=0,0,0,0,0,0,0,0"]),
+        "error: model m takes no style; leave --style out, or train one with --style"
+    );
+    assert_eq!(
+        said(&["--phrase", "nobody"]),
+        format!("error: store {} has no phrase nobody", store.display())
+    );
+    assert!(said(&["--smooth-quaternions=4"]).contains("odd"));
+    let contradiction = dir.write(
+        "c.toml",
+        "[[keyframe]]\nframe = 3\nposition_y = 0.5\n[[keyframe]]\nframe = 3\nposition_y = 0.75\n",
+    );
+    let asked = contradiction.display().to_string();
+    let output = finish(&mut command(&store, &["--constraints", &asked]));
+    assert_eq!(output.code, 1, "{output:?}");
+    let row = failures(&store).into_values().next().expect("a failure");
+    assert_eq!(
+        row.message,
+        "position_y at frame 3 must be 0.5 and 0.75 at once; keep one of the two"
+    );
+}
+
+#[test]
+fn a_song_becomes_files_and_a_stream() {
+    let dir = Dir::new();
+    let store = modelled(&dir);
+    let model = store.join("models/m").display().to_string();
+    let song = dir.write("song.wav", crate::support::files::wav(3.1)).display().to_string();
+    let (out, stream) = (dir.at("out"), dir.at("stream.csv").display().to_string());
+    let mut command = motiongen();
+    command.args(["generate", "--model", &model, "--audio", &song, "--quiet", "--engine=eager"]);
+    command.args(["--overlap=7", "--steps=3", "--stream", &stream, "--output"]).arg(&out);
+    command.args(["--format", "npy,csv,parquet,bvh,glb,png,svg,html"]);
+    let output = finish(&mut command);
+    assert_eq!(output.code, 0, "{output:?}");
+    assert!(output.stdout.contains("song: 3.1 s of motion in "), "{output:?}");
+    let mut sizes = BTreeMap::new();
+    for extension in ["npy", "csv", "parquet", "bvh", "glb", "png", "svg", "html"] {
+        let bytes = std::fs::read(out.join(format!("song.{extension}"))).expect("a file");
+        sizes.insert(extension, bytes.len());
+    }
+    // 94 frames: a header of 128 bytes and 25 numbers of 4 bytes each.
+    assert_eq!(sizes["npy"], 128 + 94 * 25 * 4);
+    let csv = std::fs::read_to_string(out.join("song.csv")).expect("text");
+    assert_eq!(csv.lines().count(), 95);
+    assert_eq!(std::fs::read_to_string(&stream).expect("text").lines().count(), 95);
+    let again = finish(&mut command);
+    assert!(again.stdout.contains("nothing to do: 1 motions are up to date"), "{again:?}");
+}
+
+#[test]
+fn a_motion_is_continued_and_a_broken_one_refused() {
+    let dir = Dir::new();
+    let store = modelled(&dir);
+    let mut before = Array2::<f32>::zeros((20, 25));
+    before.column_mut(9).fill(1.0);
+    before.column_mut(1).fill(0.9);
+    before
+        .column_mut(2)
+        .assign(&Array2::from_shape_fn((20, 1), |(t, _)| 3.0 + t as f32 * 0.01).column(0));
+    let values: Vec<f32> = before.iter().copied().collect();
+    write(&dir.at("before.npy"), npy(&[20, 25], &values));
+    let asked = dir.write("c.toml", "continue_from = { file = \"before.npy\", frames = 5 }\n");
+    let asked = asked.display().to_string();
+    generate(&store, &["--constraints", &asked]);
+    let query = "select phrase_id, position_z from generated where frame = 4";
+    let output = run(["query", "--store", &store.display().to_string(), query, "--format", "csv"]);
+    for line in output.stdout.lines().skip(1) {
+        let z: f64 = line.rsplit(',').next().expect("a number").parse().expect("a number");
+        assert!((z - 3.19).abs() < 1e-4, "{line}");
+    }
+    write(&dir.at("before.npy"), b"no array");
+    let output = finish(&mut command(&store, &["--constraints", &asked]));
+    assert_eq!(output.code, 2, "{output:?}");
+    assert!(output.stderr.contains("before.npy"), "{output:?}");
+}
+
+#[test]
+fn memory_does_not_grow_with_the_track() {
+    let dir = Dir::new();
+    let store = modelled(&dir);
+    let model = store.join("models/m").display().to_string();
+    let song = dir.write("long.wav", crate::support::files::wav(600.0)).display().to_string();
+    let mut command = motiongen();
+    command.args(["generate", "--model", &model, "--audio", &song, "--quiet", "--engine=eager"]);
+    command
+        .args(["--steps=1", "--guidance=1", "--overlap=7", "--format=npy", "--output"])
+        .arg(dir.at("out"));
+    // Ten minutes are 18,000 frames: 12 MB of features and 2 MB of motion.
+    let output = finish(&mut confined(&command, 600 << 20));
+    assert_eq!(output.code, 0, "{output:?}");
+}
