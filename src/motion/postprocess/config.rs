@@ -57,6 +57,14 @@ pub struct SavitzkyGolay {
     pub order: usize,
 }
 
+impl Default for SavitzkyGolay {
+    /// A third of a second, cubic: what makes the jerk of generated motion that of captured motion, and
+    /// leaves how far it follows the bar (docs/generate.md).
+    fn default() -> Self {
+        Self { window: 11, order: 3 }
+    }
+}
+
 /// What [`super::process`] does, in the names and the order of the reference design (section 9.1).
 ///
 /// Defaults are the reference's but for four: signs are continuous in time, velocities and the like are
@@ -131,6 +139,16 @@ impl Default for PostProcessConfig {
 }
 
 impl PostProcessConfig {
+    /// Returns the configuration without any smoothing, for motion that was smoothed before.
+    pub fn without_smoothing(&self) -> Self {
+        Self {
+            smooth_quaternions: false,
+            apply_smoothing: false,
+            savitzky_golay: None,
+            ..self.clone()
+        }
+    }
+
     /// Every step off: motion stays as it is, bit for bit.
     pub fn nothing() -> Self {
         Self {

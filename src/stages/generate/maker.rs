@@ -98,7 +98,13 @@ impl Maker<'_> {
             let velocity_error = velocity_error(decoded.view());
             let mut frames = decoded;
             let bars = phase.as_deref().filter(|_| music.begins_bar);
-            process(&self.settings.postprocess, &mut frames, bars);
+            let postprocess = &self.settings.postprocess;
+            process(postprocess, &mut frames, bars);
+            if let Some(constraints) = constraints.as_ref().filter(|_| !self.settings.soft) {
+                // Smoothing has moved it, by millimetres; what follows from poses follows again.
+                constraints.bend(&mut frames, 0, 1.0);
+                process(&postprocess.without_smoothing(), &mut frames, bars);
+            }
             let score = score(
                 frames.view(),
                 self.settings.postprocess.limits,

@@ -165,7 +165,8 @@ pub struct PostProcessParams {
     /// Frames of the reference's moving average; an odd number [default: none]
     #[arg(long, value_name = "N", help_heading = "Post-processing")]
     pub moving_average: Option<usize>,
-    /// Smooths by polynomials of an order over a window of frames [default: none]
+    /// Smooths by polynomials of an order over a window of frames; 0 for none [default: 11,3 with --coherence
+    /// derive]
     #[arg(long, value_name = "WINDOW,ORDER", value_delimiter = ',', num_args = 1..,
           help_heading = "Post-processing")]
     pub savitzky_golay: Vec<usize>,
@@ -186,7 +187,8 @@ impl PostProcessParams {
             coherence: self.coherence,
             apply_smoothing: self.moving_average.is_some(),
             savitzky_golay: match self.savitzky_golay[..] {
-                [] => None,
+                [] if self.coherence == Coherence::Derive => Some(SavitzkyGolay::default()),
+                [] | [0] | [0, _] => None,
                 [window, order] => Some(SavitzkyGolay { window, order }),
                 _ => bail!("--savitzky-golay takes two numbers: WINDOW,ORDER, such as 7,3"),
             },
