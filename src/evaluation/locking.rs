@@ -1,0 +1,243 @@
+//! How strongly motion is locked to the bar, against what it would be at wrong tempi.
+//!
+//! R² of a short signal is not small by chance, so it is held against R² of the same signal with the bar's
+//! phase running at tempi that the music does not have.
+
+use crate::motion::locking::{N_HARMONICS, bar_locking};
+
+use super::interval::mean_and_deviation;
+
+/// Slowest and fastest of the wrong tempi, as multiples of the music's.
+const TEMPO_RATIOS: [f64; 2] = [0.55, 1.8];
+/// Wrong tempi keep away from the fractions of these small numbers, whose bars share beats with the music.
+const SIMPLE: std::ops::RangeInclusive<u32> = 1..=4;
+/// Least distance from such a fraction, as a natural logarithm.
+const MIN_LOG_DISTANCE: f64 = 0.04;
+/// Tempi among which wrong ones are chosen.
+const N_CANDIDATES: usize = 4000;
+/// A fall of the phase by more than this begins a new bar.
+const WRAP: f64 = 0.5;
+/// A fit says nothing of as many values as it has numbers: a constant, and a cosine and a sine for each
+/// harmonic.
+const N_FITTED: usize = 1 + 2 * N_HARMONICS;
+/// Scores over wrong tempi that spread less than this do not spread.
+const MIN_DEVIATION: f64 = 1e-12;
+
+/// A stretch of a signal, such as vertical velocity, and the bars that had passed at each frame.
+#[derive(Clone, Copy, Debug)]
+pub struct Passage<'a> {
+    pub signal: &'a [f64],
+    /// Counted on from bar to bar: see [`unwrapped`] and [`since_start`].
+    pub bars: &'a [f64],
+}
+
+/// R² with the bar, and what it is at wrong tempi.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BarLocking {
+    /// Share of the variance that follows the bar, in [0, 1]; the mean over fits.
+    pub r2: f64,
+    /// Mean over wrong tempi.
+    pub wrong_mean: f64,
+    /// `(r2 - wrong_mean) / s`, s the standard deviation over wrong tempi; none where they all agree.
+    pub effect: Option<f64>,
+    /// `(1 + number of wrong tempi that do as well) / (1 + number of them)`.
+    pub p: f64,
+    pub n_wrong: usize,
+    /// Fits that were made.
+    pub n_fits: usize,
+}
+
+/// Returns how strongly signals are locked to the bar, against the tempi `ratios` times the music's.
+///
+/// Each item of `fits` is one regression: a single passage for a fit of its own, or all passages of a song
+/// for one fit of them. `R²` is [`bar_locking`] of the passages of a fit one behind the other, with phases
+/// `bars · ratio`, averaged over fits. For p below 0.01 there must be a hundred ratios.
+///
+/// None where no fit has more values than the nine that are fitted, there are fewer than two ratios, or
+/// something is not finite.
+pub fn locking_against(fits: &[Vec<Passage<'_>>], ratios: &[f64]) -> Option<BarLocking> {
+    let joined = |of: fn(&Passage<'_>) -> Vec<f64>, fit: &[Passage<'_>]| -> Vec<f64> {
+        fit.iter().flat_map(of).collect()
+    };
+    let fits: Vec<(Vec<f64>, Vec<f64>)> = fits
+        .iter()
+        .map(|fit| (joined(Passage::signal, fit), joined(Passage::bars, fit)))
+        .filter(|(signal, _)| signal.len() > N_FITTED)
+        .collect();
+    let is_finite = |x: &[f64]| x.iter().all(|x| x.is_finite());
+    if fits.is_empty() || !fits.iter().all(|(signal, bars)| is_finite(signal) && is_finite(bars)) {
+        return None;
+    }
+    let r2_at = |ratio: f64| {
+        let of = |(signal, bars): &(Vec<f64>, Vec<f64>)| {
+            let phase: Vec<f64> = bars.iter().map(|x| x * ratio).collect();
+            bar_locking(signal, &phase)
+        };
+        fits.iter().map(of).sum::<f64>() / fits.len() as f64
+    };
+    let r2 = r2_at(1.0);
+    let wrong: Vec<f64> = ratios.iter().map(|&ratio| r2_at(ratio)).collect();
+    let (wrong_mean, deviation) = mean_and_deviation(&wrong)?;
+    let n_as_good = wrong.iter().filter(|&&x| x >= r2).count();
+    r2.is_finite().then(|| BarLocking {
+        r2,
+        wrong_mean,
+        effect: (deviation > MIN_DEVIATION).then(|| (r2 - wrong_mean) / deviation),
+        p: (1 + n_as_good) as f64 / (1 + wrong.len()) as f64,
+        n_wrong: wrong.len(),
+        n_fits: fits.len(),
+    })
+}
+
+impl Passage<'_> {
+    /// Frames that have both a signal and a phase.
+    fn len(&self) -> usize {
+        self.signal.len().min(self.bars.len())
+    }
+
+    fn signal(&self) -> Vec<f64> {
+        self.signal[..self.len()].to_vec()
+    }
+
+    fn bars(&self) -> Vec<f64> {
+        self.bars[..self.len()].to_vec()
+    }
+}
+
+/// Returns `n` wrong tempi as multiples of the music's: evenly from 0.55 to 1.8 on a scale of logarithms,
+/// 4 % away from the fractions of 1 to 4.
+pub fn wrong_tempi(n: usize) -> Vec<f64> {
+    let simple: Vec<f64> =
+        SIMPLE.flat_map(|a| SIMPLE.map(move |b| f64::from(a) / f64::from(b))).collect();
+    let [low, high] = TEMPO_RATIOS;
+    let apart: Vec<f64> = (0..N_CANDIDATES)
+        .map(|i| low * (high / low).powf(i as f64 / (N_CANDIDATES - 1) as f64))
+        .filter(|ratio| simple.iter().all(|s| (ratio / s).ln().abs() > MIN_LOG_DISTANCE))
+        .collect();
+    let step = n.saturating_sub(1).max(1);
+    (0..n).map(|i| apart[i * (apart.len() - 1) / step]).collect()
+}
+
+/// Returns bars that are counted on, of a bar phase that begins anew with each.
+pub fn unwrapped(phase: &[f64]) -> Vec<f64> {
+    let mut n_bars = 0.0;
+    let mut last = phase.first().copied().unwrap_or(0.0);
+    phase
+        .iter()
+        .map(|&x| {
+            if last - x > WRAP {
+                n_bars += 1.0;
+            }
+            last = x;
+            n_bars + x
+        })
+        .collect()
+}
+
+/// Returns bars since the song began, of a passage that begins `start_frames` into it: as many whole bars
+/// more as its tempo makes until there.
+///
+/// Wrong tempi then drift from the music over the whole song, so that one fit for all passages of a song is
+/// as strict as one for the song would be. Passages of a single frame stay as they are.
+pub fn since_start(bars: &[f64], start_frames: f64) -> Vec<f64> {
+    let [first, .., last] = bars else { return bars.to_vec() };
+    let bars_per_frame = (last - first) / (bars.len() - 1) as f64;
+    let before = (start_frames * bars_per_frame - first).round();
+    bars.iter().map(|x| x + before).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::f64::consts::TAU;
+
+    fn bars(n: usize, bar_frames: f64, start_frames: f64) -> Vec<f64> {
+        (0..n).map(|t| (start_frames + t as f64) / bar_frames).collect()
+    }
+
+    fn wave(bars: &[f64]) -> Vec<f64> {
+        bars.iter().map(|x| (TAU * x).sin() + 0.3 * (TAU * 2.0 * x).cos()).collect()
+    }
+
+    #[test]
+    fn a_wave_of_the_bar_is_locked_and_no_wrong_tempo_does_as_well() {
+        let bars = bars(601, 57.3, 0.0);
+        let fits = [vec![Passage { signal: &wave(&bars), bars: &bars }]];
+        let found = locking_against(&fits, &wrong_tempi(99)).expect("finite");
+        assert!((found.r2 - 1.0).abs() < 1e-9, "{found:?}");
+        // Ten bars tell tempi a tenth apart; nearer ones share a part of the wave.
+        assert!(found.wrong_mean < 0.2 && found.effect > Some(3.0), "{found:?}");
+        assert_eq!((found.p, found.n_wrong, found.n_fits), (0.01, 99, 1));
+    }
+
+    #[test]
+    fn a_wave_of_another_tempo_is_not_better_than_wrong_ones() {
+        let (own, other) = (bars(601, 57.3, 0.0), bars(601, 57.3 / 1.13, 0.0));
+        let fits = [vec![Passage { signal: &wave(&other), bars: &own }]];
+        let found = locking_against(&fits, &wrong_tempi(60)).expect("finite");
+        assert!(found.r2 < 0.1 && found.p > 0.2, "{found:?}");
+    }
+
+    #[test]
+    fn one_fit_of_a_song_sees_what_fits_of_its_passages_do_not() {
+        // Each passage follows the bar, but from another beat on.
+        let passages: Vec<Vec<f64>> =
+            (0..5).map(|i| bars(121, 60.0, f64::from(i) * 300.0)).collect();
+        let signals: Vec<Vec<f64>> = passages
+            .iter()
+            .enumerate()
+            .map(|(i, bars)| bars.iter().map(|x| (TAU * (x + i as f64 / 5.0)).sin()).collect())
+            .collect();
+        let all: Vec<Passage> = signals
+            .iter()
+            .zip(&passages)
+            .map(|(signal, bars)| Passage { signal, bars })
+            .collect();
+        let alone: Vec<Vec<Passage>> = all.iter().map(|passage| vec![*passage]).collect();
+        let ratios = wrong_tempi(20);
+        let alone = locking_against(&alone, &ratios).expect("finite");
+        let together = locking_against(&[all], &ratios).expect("finite");
+        assert!(alone.r2 > 0.99 && alone.n_fits == 5, "{alone:?}");
+        assert!(together.r2 < 0.05 && together.n_fits == 1, "{together:?}");
+    }
+
+    #[test]
+    fn wrong_tempi_are_in_order_and_none_is_simple() {
+        let ratios = wrong_tempi(199);
+        assert_eq!((ratios.len(), ratios[0], ratios[198]), (199, 0.55, 1.8));
+        assert!(ratios.windows(2).all(|pair| pair[0] < pair[1]));
+        for simple in [1.0, 2.0 / 3.0, 0.75, 4.0 / 3.0, 1.5] {
+            assert!(ratios.iter().all(|r| (r / simple - 1.0).abs() > 0.039), "{simple}");
+        }
+        assert_eq!(wrong_tempi(0), [0.0; 0]);
+        assert_eq!(wrong_tempi(1), [0.55]);
+    }
+
+    #[test]
+    fn bars_are_counted_on_and_from_the_beginning_of_the_song() {
+        let bars = unwrapped(&[0.4, 0.9, 0.4, 0.9, 0.4]);
+        assert_eq!(bars, [0.4, 0.9, 1.4, 1.9, 2.4]);
+        // Half a bar a frame: 21 frames are 10.5 bars, nearest to which is 10 bars and 0.4.
+        assert_eq!(since_start(&bars, 21.0)[0], 10.4);
+        assert_eq!(since_start(&[0.3], 21.0), [0.3]);
+        assert_eq!(unwrapped(&[]), [0.0; 0]);
+    }
+
+    #[test]
+    fn what_is_short_or_not_finite_has_no_locking() {
+        let bars = bars(60, 30.0, 0.0);
+        let mut signal = wave(&bars);
+        let ratios = wrong_tempi(9);
+        let short = Passage { signal: &signal[..9], bars: &bars };
+        assert_eq!(locking_against(&[vec![short]], &ratios), None);
+        assert_eq!(locking_against(&[], &ratios), None);
+        let whole = [vec![Passage { signal: &signal, bars: &bars }]];
+        assert_eq!(locking_against(&whole, &ratios[..1]), None);
+        // Whoever stands still is not locked, at this tempo as little as at others.
+        let still = [0.0; 60];
+        let found = locking_against(&[vec![Passage { signal: &still, bars: &bars }]], &ratios);
+        assert_eq!(found.map(|x| (x.r2, x.effect, x.p)), Some((0.0, None, 1.0)));
+        signal[5] = f64::NAN;
+        assert_eq!(locking_against(&[vec![Passage { signal: &signal, bars: &bars }]], &ratios), None);
+    }
+}
