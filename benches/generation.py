@@ -10,12 +10,10 @@ motion costs does not depend on them. Needs NumPy.
 
 import argparse
 import math
-import os
 import pathlib
 import shutil
 import subprocess
 import sys
-import time
 import wave
 
 import numpy
@@ -31,14 +29,23 @@ SONG_S = 180
 N_PHRASES = 200
 
 
+# A child begins with the memory of its parent, which counts as its own: a small parent in between.
+MEASURE = """
+import os, subprocess, sys, time
+started = time.perf_counter()
+child = subprocess.Popen(sys.argv[1:], stdout=subprocess.DEVNULL)
+_, status, usage = os.wait4(child.pid, 0)
+print(status, time.perf_counter() - started, usage.ru_maxrss * 1024 / 1e6)
+"""
+
+
 def run(command: list) -> tuple[float, float]:
     """Runs a command; returns seconds and the peak of its memory in MB."""
-    started = time.perf_counter()
-    child = subprocess.Popen([str(part) for part in command], stdout=subprocess.DEVNULL)
-    _, status, usage = os.wait4(child.pid, 0)
-    if status != 0:
+    words = [sys.executable, "-c", MEASURE, *map(str, command)]
+    status, wall_s, peak_mb = subprocess.run(words, capture_output=True, text=True).stdout.split()
+    if status != "0":
         sys.exit(f"{' '.join(map(str, command))} ended with {status}")
-    return time.perf_counter() - started, usage.ru_maxrss * 1024 / 1e6
+    return float(wall_s), float(peak_mb)
 
 
 def make_song(path: pathlib.Path) -> None:
@@ -105,6 +112,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--bin", type=pathlib.Path, required=True, help="motiongen")
     parser.add_argument("--presets", nargs="+", default=["small", "base"])
+    parser.add_argument("--phrases", type=int, default=N_PHRASES, help="of the bulk job")
+    parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--model", type=pathlib.Path, help="folder of a trained model, for its seams")
     arguments = parser.parse_args()
     motiongen = arguments.bin.resolve()
@@ -117,14 +126,13 @@ def main() -> None:
             command = [motiongen, "generate", "--model", store / "models" / preset, "--audio",
                        OUT / "song.wav", "--output", OUT / "out", "--format", "npy", "--engine", engine,
                        "--force", "--quiet"]
-            run(command)
-            wall_s, peak_mb = min(run(command) for _ in range(3))
+            wall_s, peak_mb = min(run(command) for _ in range(arguments.repeats))
             rows.append([preset, engine, f"{wall_s:.1f}", f"{wall_s / SONG_S:.3f}", f"{peak_mb:,.0f}",
                          f"{2 * weights_mb + 300:,.0f}"])
     print(f"### A song of {SONG_S} s, features included, 10 steps of DPM-Solver++, guidance\n")
     print(table(["model", "engine", "s", "real-time factor", "peak MB", "allowed MB"], rows))
     rows = []
-    ids = phrase_ids(store)
+    ids = phrase_ids(store)[: arguments.phrases]
     for preset in arguments.presets:
         for engine in ("eager", "onnx"):
             seconds = []
@@ -132,9 +140,9 @@ def main() -> None:
                 command = [motiongen, "generate", "--store", store, "--model", preset, "--engine", engine,
                            "--threads", threads, "--run", f"{preset}-{engine}-{threads}", "--force",
                            "--quiet", "--tracks", "constructed", "--phrase", *ids]
-                seconds.append(min(run(command)[0] for _ in range(2)))
+                seconds.append(min(run(command)[0] for _ in range(arguments.repeats)))
             rows.append([preset, engine, *[f"{s:.1f}" for s in seconds], f"{seconds[0] / seconds[1]:.2f}"])
-    print(f"\n### {N_PHRASES} phrases of 4 s into tables\n")
+    print(f"\n### {len(ids)} phrases of 4 s into tables\n")
     print(table(["model", "engine", "one thread, s", "two threads, s", "gain"], rows))
     if arguments.model:
         run([motiongen, "generate", "--model", arguments.model, "--audio", OUT / "song.wav", "--output",

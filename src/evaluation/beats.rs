@@ -190,7 +190,7 @@ pub fn phase_error(said: &[f64], music: &[f64]) -> Option<f64> {
 
 /// Length of the mean of `exp(2πi x)`.
 fn resultant(turns: impl Iterator<Item = f64>) -> Option<f64> {
-    let (mut n, mut cosines, mut sines) = (0, 0.0, 0.0);
+    let (mut n, mut cosines, mut sines) = (0_u32, 0.0, 0.0);
     for x in turns {
         let (sine, cosine) = (std::f64::consts::TAU * x).sin_cos();
         n += 1;
@@ -206,10 +206,10 @@ mod tests {
     use super::*;
     use crate::motion::quaternion::IDENTITY;
 
-    /// Stands still for a moment every `period` frames.
+    /// Stands still for a moment every `period` frames, half-way between two of them.
     fn pulsing(n: usize, period: f64) -> Poses {
-        let angle = |t: usize| std::f64::consts::TAU * t as f64 / period;
-        // Speed 1 - cos: its minima lie at multiples of the period.
+        let angle = |t: usize| std::f64::consts::TAU * (t as f64 - 0.5) / period;
+        // Speed 1 - cos.
         let x = |t: usize| (t as f64 - period / std::f64::consts::TAU * angle(t).sin()) / FPS;
         Poses {
             position_m: (0..n).map(|t| [x(t), 0.0, 0.0]).collect(),
@@ -229,10 +229,8 @@ mod tests {
 
     #[test]
     fn a_pulse_of_fifteen_frames_beats_every_fifteen() {
-        // The slowest step is the one that ends or begins at a multiple of 15.
-        let beats = motion_beats(&pulsing(121, 15.0));
-        assert!(beats.iter().all(|t| t % 15 <= 1), "{beats:?}");
-        assert_eq!(beats.len(), 7);
+        // The slowest step is that which ends at frame 15 i + 1; the first is kept out by the zero.
+        assert_eq!(motion_beats(&pulsing(121, 15.0)), [16, 31, 46, 61, 76, 91, 106]);
         assert_eq!(speed_envelope(&Poses::default()), [0.0; 0]);
     }
 

@@ -237,19 +237,23 @@ mod tests {
         let n = 31;
         let poses = Poses {
             position_m: (0..n).map(|t| [x(t), 1.2 + 0.3 * time_s(t), 0.0]).collect(),
-            orientation: (0..n).map(|t| from_axis_angle([0.0, 0.0, 1.0], 1.0 * time_s(t))).collect(),
+            orientation: (0..n)
+                .map(|t| from_axis_angle([0.0, 0.0, 1.0], 1.0 * time_s(t)))
+                .collect(),
         };
         let found = geometric_features(&poses, &THRESHOLDS).expect("frames");
-        let of = |name: &str| {
-            found[GEOMETRIC_NAMES.iter().position(|n| *n == name).expect("a feature")]
-        };
+        let of =
+            |name: &str| found[GEOMETRIC_NAMES.iter().position(|n| *n == name).expect("a feature")];
         for name in ["speed_above_q50", "speed_above_q90", "climbing_or_diving", "rolling"] {
             assert_eq!(of(name), 1.0, "{name}");
         }
         for name in ["radial", "high", "speeding_up"] {
             assert_eq!(of(name), 1.0, "{name}");
         }
-        assert_eq!((of("yawing"), of("pitching"), of("forward"), of("curved")), (0.0, 0.0, 0.0, 0.0));
+        assert_eq!(
+            (of("yawing"), of("pitching"), of("forward"), of("curved")),
+            (0.0, 0.0, 0.0, 0.0)
+        );
         assert!(of("sideways") > 0.5, "as long as the roll leaves x aside");
     }
 

@@ -193,11 +193,9 @@ mod tests {
 
     #[test]
     fn a_share_stays_between_nothing_and_all() {
-        let all = share_estimate(13, 13);
-        assert_eq!((all.value, all.ci_high), (Some(1.0), Some(1.0)));
-        // Where all pass the lower bound is 1 / (1 + z²/n).
-        assert!((all.ci_low.expect("some") - 1.0 / (1.0 + 1.96 * 1.96 / 13.0)).abs() < 1e-12);
-        assert_eq!(share_estimate(0, 7).ci_low, Some(0.0));
+        // Where all pass the lower bound is 1 / (1 + z²/n), and where none do the upper its rest.
+        near(share_estimate(13, 13), [1.0, 1.0 / (1.0 + 1.96 * 1.96 / 13.0), 1.0]);
+        near(share_estimate(0, 7), [0.0, 0.0, 1.0 - 1.0 / (1.0 + 1.96 * 1.96 / 7.0)]);
         assert_eq!(share_estimate(0, 0), Estimate::plain(None, 0));
     }
 

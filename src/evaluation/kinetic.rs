@@ -7,7 +7,7 @@
 use std::ops::Range;
 
 use crate::motion::Poses;
-use crate::motion::quaternion::rotate;
+use crate::motion::quaternion::{Quaternion, rotate};
 use crate::units::FPS;
 
 use super::body::{BODY_RADIUS_M, Vector, minus, norm};
@@ -54,8 +54,8 @@ pub const MARKER_NAMES: [&str; 12] = [
 pub enum Formula {
     /// `(p[t+1] - 2 p[t] + p[t-1]) / Δt²` at Δt = 1/30 s.
     Correct,
-    /// As in Bailando, Lodge, POPDG: `((p[t+1] - p[t]) / Δt - (p[t] - p[t-1] / Δt)) / Δt`, whose parenthesis is
-    /// misplaced, at Δt = 1/60 s whatever the frame rate, positions counted from the first frame's.
+    /// As in Bailando, Lodge, POPDG: `((p[t+1] - p[t]) / Δt - (p[t] - p[t-1] / Δt)) / Δt`, whose parenthesis
+    /// is misplaced, at Δt = 1/60 s whatever the frame rate, positions counted from the first frame's.
     Compat,
 }
 
@@ -117,7 +117,7 @@ pub fn marker_features(poses: &Poses, formula: Formula) -> Option<[f64; 12]> {
     }
     let origin = formula.origin(poses);
     let marker = |offset: Vector| -> Vec<Vector> {
-        let at = |(&p, &q): (&Vector, &_)| {
+        let at = |(&p, &q): (&Vector, &Quaternion)| {
             let arm = rotate(q, offset);
             minus(std::array::from_fn(|i| p[i] + arm[i]), origin)
         };
