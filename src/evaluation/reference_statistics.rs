@@ -132,8 +132,8 @@ pub enum ReferenceError {
     Unreadable { message: String },
     /// Made by a program that means something else by its numbers.
     #[error(
-        "reference statistics have version {found}, this program reads version {expected}; measure the ground \
-         truth again with this program"
+        "reference statistics have version {found}, this program reads version {expected}; \
+         measure the ground truth again with this program"
     )]
     Version { found: u32, expected: u32 },
     /// Of other data than those at hand.

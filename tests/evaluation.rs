@@ -1,0 +1,452 @@
+//! The evaluation's metrics against `tests/golden/metrics/make.py`.
+
+use std::collections::BTreeMap;
+
+use motiongen::evaluation::beats::{
+    BeatScore, beat_alignment, motion_beats, phase_coherence, phase_error, rayleigh,
+};
+use motiongen::evaluation::body::{part, poses};
+use motiongen::evaluation::consistency::consistency;
+use motiongen::evaluation::control::{
+    ControlErrors, control_errors, position_error_mm, rotation_error_deg, spread_mm,
+};
+use motiongen::evaluation::distribution::channel_distances;
+use motiongen::evaluation::diversity::{diversity, mean_distance, multimodality};
+use motiongen::evaluation::frechet::{Gaussian, frechet_distance};
+use motiongen::evaluation::geometric::{GeometricThresholds, geometric_features};
+use motiongen::evaluation::interval::{
+    Estimate, bootstrap_estimate, mean_estimate, share_estimate,
+};
+use motiongen::evaluation::kinetic::{CHUNK_FRAMES, Formula, axis_features, marker_features};
+use motiongen::evaluation::locking::{Passage, locking_against};
+use motiongen::evaluation::reference_statistics::{
+    FeatureSet, FeatureStatistics, ReferenceStatistics,
+};
+use motiongen::evaluation::sanity::checks;
+use motiongen::evaluation::training_range::TrainingRange;
+use motiongen::motion::{Channel, ChannelLimits, MOTION_DIM, Poses};
+use ndarray::{Array2, ArrayView2, s};
+use serde::Deserialize;
+
+/// Of every metric, relative to it; both sides compute in double precision.
+const TOLERANCE: f64 = 1e-6;
+/// Below this a number is nothing but rounding.
+const NOTHING: f64 = 1e-12;
+
+#[derive(Deserialize)]
+struct Golden {
+    motions: Vec<MotionRow>,
+    thresholds: GeometricThresholds,
+    training_range: TrainingRange,
+    locking: LockingRows,
+    channels: Vec<f64>,
+    features: FeatureRows,
+    control: ControlRows,
+    intervals: IntervalRows,
+}
+
+#[derive(Deserialize)]
+struct MotionRow {
+    n_frames: usize,
+    frames: Vec<f32>,
+    music_s: Vec<f64>,
+    bar_frames: f64,
+    first_frame: f64,
+    seed: u64,
+    checks: BTreeMap<String, f64>,
+    beats: BeatRows,
+    phases: BTreeMap<String, f64>,
+    axes: Vec<f64>,
+    axes_compat: Vec<f64>,
+    markers: Vec<f64>,
+    markers_compat: Vec<f64>,
+    geometric: Vec<f64>,
+    consistency: BTreeMap<String, f64>,
+}
+
+#[derive(Deserialize)]
+struct BeatRows {
+    motion_beats: Vec<usize>,
+    n_music_beats: usize,
+    motion_to_music: Vec<BeatRow>,
+    music_to_motion: Vec<BeatRow>,
+}
+
+#[derive(Deserialize)]
+struct BeatRow {
+    score: f64,
+    chance: f64,
+    lift: f64,
+    z: f64,
+}
+
+#[derive(Deserialize)]
+struct LockingRows {
+    ratios: Vec<f64>,
+    alone: LockingRow,
+    together: LockingRow,
+    mistimed: LockingRow,
+}
+
+#[derive(Deserialize)]
+struct LockingRow {
+    r2: f64,
+    wrong_mean: f64,
+    effect: f64,
+    p: f64,
+}
+
+#[derive(Deserialize)]
+struct FeatureRows {
+    truth: Vec<Vec<f64>>,
+    other: Vec<Vec<f64>>,
+    flat: Vec<Vec<f64>>,
+    mean: Vec<f64>,
+    deviation: Vec<f64>,
+    covariance: Vec<Vec<f64>>,
+    frechet: f64,
+    frechet_raw: f64,
+    frechet_flat: f64,
+    mean_distance: f64,
+    diversity: f64,
+    diversity_all: f64,
+    conditions: Vec<Vec<Vec<f64>>>,
+    multimodality: f64,
+}
+
+#[derive(Deserialize)]
+struct ControlRows {
+    samples: Vec<SampleRow>,
+    position: Vec<ControlRow>,
+    rotation: Vec<ControlRow>,
+    spread_mm: f64,
+}
+
+#[derive(Deserialize)]
+struct SampleRow {
+    at: Vec<usize>,
+    position: Vec<[f64; 3]>,
+    quaternion: Vec<[f64; 4]>,
+    mm: Vec<f64>,
+    deg: Vec<f64>,
+}
+
+#[derive(Deserialize)]
+struct ControlRow {
+    threshold: f64,
+    trajectory: f64,
+    location: f64,
+    location_by_sample: f64,
+    mean: f64,
+    mean_by_sample: f64,
+}
+
+#[derive(Deserialize)]
+struct IntervalRows {
+    values: Vec<f64>,
+    mean: [f64; 3],
+    bootstrap_of_median: [f64; 3],
+    share: [f64; 3],
+}
+
+fn golden() -> Golden {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/golden/metrics/metrics.json");
+    let text = std::fs::read_to_string(path).expect("the golden file");
+    serde_json::from_str(&text).expect("what make.py writes")
+}
+
+impl MotionRow {
+    fn frames(&self) -> Array2<f32> {
+        Array2::from_shape_vec((self.n_frames, MOTION_DIM), self.frames.clone()).expect("T × 25")
+    }
+
+    fn poses(&self) -> Poses {
+        poses(self.frames().view()).expect("finite")
+    }
+
+    fn bars(&self) -> Vec<f64> {
+        (0..self.n_frames).map(|t| (t as f64 + self.first_frame) / self.bar_frames).collect()
+    }
+
+    fn column(&self, i: usize) -> Vec<f64> {
+        self.frames().column(i).iter().map(|&x| f64::from(x)).collect()
+    }
+}
+
+fn matrix(rows: &[Vec<f64>]) -> Array2<f64> {
+    let dim = rows.first().map_or(0, Vec::len);
+    Array2::from_shape_fn((rows.len(), dim), |(i, j)| rows[i][j])
+}
+
+fn assert_near(what: &str, found: f64, wanted: f64) {
+    let is_near = (found - wanted).abs() <= TOLERANCE * wanted.abs() + NOTHING;
+    assert!(is_near, "{what}: found {found}, wanted {wanted}");
+}
+
+fn assert_all_near(what: &str, found: &[f64], wanted: &[f64]) {
+    assert_eq!(found.len(), wanted.len(), "{what}");
+    for (i, (&found, &wanted)) in found.iter().zip(wanted).enumerate() {
+        assert_near(&format!("{what} {i}"), found, wanted);
+    }
+}
+
+#[test]
+fn checks_are_the_references() {
+    for row in golden().motions {
+        let found = checks(row.frames().view(), ChannelLimits::Wide);
+        assert_eq!(row.checks.len(), 5);
+        for (name, &wanted) in &row.checks {
+            let check = found.iter().find(|check| check.name == name).expect("a check");
+            assert_near(name, check.value, wanted);
+        }
+    }
+}
+
+#[test]
+fn beats_and_their_chance_are_those_of_the_published_scores() {
+    for row in golden().motions {
+        let beats = motion_beats(&row.poses());
+        assert_eq!(beats, row.beats.motion_beats);
+        let found = beat_alignment(&beats, &row.music_s, row.n_frames, row.seed).expect("beats");
+        assert_eq!(found.n_music_beats, row.beats.n_music_beats);
+        let directions = [
+            (&found.motion_to_music, &row.beats.motion_to_music),
+            (&found.music_to_motion, &row.beats.music_to_motion),
+        ];
+        for (found, wanted) in directions {
+            assert_eq!(found.len(), wanted.len());
+            for (found, wanted) in found.iter().zip(wanted) {
+                let BeatScore { score, chance, lift, z, width_s } = *found;
+                assert_near(&format!("score at {width_s} s"), score, wanted.score);
+                assert_near(&format!("chance at {width_s} s"), chance, wanted.chance);
+                assert_near(&format!("lift at {width_s} s"), lift.expect("lift"), wanted.lift);
+                assert_near(&format!("z at {width_s} s"), z.expect("z"), wanted.z);
+            }
+        }
+    }
+}
+
+#[test]
+fn phases_are_compared_as_their_formulas_say() {
+    for row in golden().motions {
+        let music: Vec<f64> = row.bars().iter().map(|x| x.rem_euclid(1.0)).collect();
+        let said = row.column(Channel::Phase.range().start);
+        let found = [
+            ("rayleigh", rayleigh(&music, &motion_beats(&row.poses()), 4)),
+            ("phase_error", phase_error(&said, &music)),
+            ("phase_coherence", phase_coherence(&said, &music, 4)),
+        ];
+        assert_eq!(row.phases.len(), found.len());
+        for (name, found) in found {
+            assert_near(name, found.expect("finite"), row.phases[name]);
+        }
+    }
+}
+
+#[test]
+fn locking_is_a_regression_on_the_bar() {
+    let golden = golden();
+    let up = Channel::Velocity.range().start + 1;
+    let rows = &golden.motions;
+    let signals: Vec<Vec<f64>> = rows.iter().map(|row| row.column(up)).collect();
+    let bars: Vec<Vec<f64>> = rows.iter().map(MotionRow::bars).collect();
+    let late: Vec<Vec<f64>> =
+        bars.iter().map(|bars| bars.iter().map(|x| x * 0.87).collect()).collect();
+    let passage = |i: usize| Passage { signal: &signals[i], bars: &bars[i] };
+    let mistimed = |i: usize| Passage { signal: &signals[i], bars: &late[i] };
+    let cases = [
+        ("alone", (0..4).map(|i| vec![passage(i)]).collect(), &golden.locking.alone),
+        (
+            "together",
+            vec![vec![passage(0), passage(1)], vec![passage(2)]],
+            &golden.locking.together,
+        ),
+        ("mistimed", (0..4).map(|i| vec![mistimed(i)]).collect(), &golden.locking.mistimed),
+    ];
+    for (what, fits, wanted) in cases {
+        let found = locking_against(&fits, &golden.locking.ratios).expect("finite");
+        assert_near(&format!("R², {what}"), found.r2, wanted.r2);
+        assert_near(&format!("mean of wrong R², {what}"), found.wrong_mean, wanted.wrong_mean);
+        assert_near(&format!("effect, {what}"), found.effect.expect("spread"), wanted.effect);
+        assert_near(&format!("p, {what}"), found.p, wanted.p);
+    }
+}
+
+#[test]
+fn features_are_those_of_the_published_code_and_of_its_correction() {
+    let golden = golden();
+    for row in &golden.motions {
+        let chunk = part(&row.poses(), 0..CHUNK_FRAMES);
+        for (formula, axes, markers) in [
+            (Formula::Correct, &row.axes, &row.markers),
+            (Formula::Compat, &row.axes_compat, &row.markers_compat),
+        ] {
+            let found = axis_features(&chunk, formula).expect("frames");
+            assert_all_near(&format!("axes, {formula:?}"), &found, axes);
+            let found = marker_features(&chunk, formula).expect("frames");
+            assert_all_near(&format!("markers, {formula:?}"), &found, markers);
+        }
+        let found = geometric_features(&chunk, &golden.thresholds).expect("frames");
+        assert_all_near("geometric", &found, &row.geometric);
+    }
+}
+
+#[test]
+fn consistency_is_as_its_formulas_say() {
+    for row in golden().motions {
+        let found = consistency(row.frames().view(), ChannelLimits::Reference).expect("finite");
+        let found = [
+            ("velocity_error_m_s", found.velocity_error_m_s),
+            ("acceleration_error_m_s2", found.acceleration_error_m_s2),
+            ("turn_error_rad_s", found.turn_error_rad_s),
+            ("norm_error", found.norm_error),
+            ("jerk_mean_m_s3", found.jerk_mean_m_s3),
+            ("jerk_p95_m_s3", found.jerk_p95_m_s3),
+            ("log_dimensionless_jerk", found.log_dimensionless_jerk.expect("moves")),
+            ("share_over_limits", found.share_over_limits),
+        ];
+        assert_eq!(row.consistency.len(), found.len());
+        for (name, found) in found {
+            assert_near(name, found, row.consistency[name]);
+        }
+    }
+}
+
+#[test]
+fn reference_statistics_hold_the_quantiles_of_the_ground_truth() {
+    let golden = golden();
+    let motions: Vec<Array2<f32>> = golden.motions.iter().map(MotionRow::frames).collect();
+    let views: Vec<ArrayView2<f32>> = motions.iter().map(|motion| motion.view()).collect();
+    let found = ReferenceStatistics::fit(&views, "hash".to_owned()).expect("finite");
+    assert_eq!((found.n_motions, found.n_chunks), (4, 4));
+    let numbers = |t: &GeometricThresholds| {
+        [
+            t.speed_q50_m_s,
+            t.speed_q90_m_s,
+            t.vertical_speed_q75_m_s,
+            t.radial_speed_q75_m_s,
+            t.curvature_q75_per_m,
+            t.height_q25_m,
+            t.height_q75_m,
+            t.speeding_q75_m_s2,
+        ]
+    };
+    assert_all_near("thresholds", &numbers(&found.thresholds), &numbers(&golden.thresholds));
+    let (range, wanted) = (found.training_range, golden.training_range);
+    assert_near("speed", range.speed_m_s, wanted.speed_m_s);
+    assert_near("turn rate", range.turn_rate_rad_s, wanted.turn_rate_rad_s);
+    let mean = |i: usize| golden.motions.iter().map(|row| row.markers[i]).sum::<f64>() / 4.0;
+    for (i, &found) in found.statistics(FeatureSet::Markers).mean.iter().enumerate() {
+        assert_near("mean of a feature", found, mean(i));
+    }
+}
+
+#[test]
+fn distances_between_sets_of_features_are_scipys() {
+    let golden = golden().features;
+    let [truth, other, flat] =
+        [&golden.truth, &golden.other, &golden.flat].map(|rows| matrix(rows));
+    let statistics = FeatureStatistics::fit(truth.view()).expect("finite");
+    assert_all_near("mean", &statistics.mean, &golden.mean);
+    assert_all_near("deviation", &statistics.deviation, &golden.deviation);
+    for (found, wanted) in statistics.gaussian.covariance.iter().zip(&golden.covariance) {
+        assert_all_near("covariance", found, wanted);
+    }
+    let fit = |features: &Array2<f64>| Gaussian::fit(features.view()).expect("finite");
+    let normalized = fit(&statistics.normalize(other.view()));
+    for (what, a, b, wanted) in [
+        ("normalised", &statistics.gaussian, &normalized, golden.frechet),
+        ("raw", &fit(&truth), &fit(&other), golden.frechet_raw),
+        ("singular", &fit(&truth), &fit(&flat), golden.frechet_flat),
+    ] {
+        assert_near(what, frechet_distance(a, b).expect("enough features"), wanted);
+        assert_near(what, frechet_distance(b, a).expect("enough features"), wanted);
+    }
+    assert_near("Dist", mean_distance(other.view()).expect("pairs"), golden.mean_distance);
+    assert_near("diversity", diversity(other.view(), 13, 5).expect("pairs"), golden.diversity);
+    let all = diversity(other.view(), 300, 6).expect("pairs");
+    assert_near("diversity of all pairs", all, golden.diversity_all);
+    let conditions: Vec<Array2<f64>> = golden.conditions.iter().map(|rows| matrix(rows)).collect();
+    let views: Vec<ArrayView2<f64>> = conditions.iter().map(|rows| rows.view()).collect();
+    let found = multimodality(&views, 10, 11).expect("pairs");
+    assert_near("multimodality", found, golden.multimodality);
+}
+
+#[test]
+fn channels_are_as_far_apart_as_scipy_says() {
+    let golden = golden();
+    let [truth, motion] = [0, 1].map(|i| golden.motions[i].frames());
+    let found = channel_distances(motion.view(), truth.view());
+    let found: Vec<f64> = found.into_iter().map(|x| x.expect("varies")).collect();
+    assert_all_near("distance of channel", &found, &golden.channels);
+}
+
+#[test]
+fn misses_are_summed_up_as_omnicontrol_does() {
+    let golden = golden();
+    let (mut all_mm, mut all_deg) = (Vec::new(), Vec::new());
+    for (row, sample) in golden.motions.iter().zip(&golden.control.samples) {
+        let poses = row.poses();
+        let of = |i: usize| (poses.position_m[sample.at[i]], poses.orientation[sample.at[i]]);
+        let n = sample.at.len();
+        let mm: Vec<f64> = (0..n).map(|i| position_error_mm(of(i).0, sample.position[i])).collect();
+        let deg: Vec<f64> =
+            (0..n).map(|i| rotation_error_deg(of(i).1, sample.quaternion[i])).collect();
+        assert_all_near("miss in mm", &mm, &sample.mm);
+        assert_all_near("miss in degrees", &deg, &sample.deg);
+        all_mm.push(mm);
+        all_deg.push(deg);
+    }
+    let cases = golden.control.position.iter().map(|row| (&all_mm, row));
+    for (misses, wanted) in cases.chain(golden.control.rotation.iter().map(|row| (&all_deg, row))) {
+        let found: ControlErrors = control_errors(misses, wanted.threshold).expect("keyframes");
+        assert_eq!((found.n_samples, found.n_keyframes), (3, 9));
+        assert_near("trajectory", found.trajectory, wanted.trajectory);
+        assert_near("location", found.location, wanted.location);
+        assert_near("location by sample", found.location_by_sample, wanted.location_by_sample);
+        assert_near("mean", found.mean.expect("finite"), wanted.mean);
+        let by_sample = found.mean_by_sample.expect("finite");
+        assert_near("mean by sample", by_sample, wanted.mean_by_sample);
+    }
+    let paths: Vec<Vec<[f64; 3]>> =
+        golden.motions[..3].iter().map(|row| row.poses().position_m).collect();
+    assert_near("spread", spread_mm(&paths).expect("frames"), golden.control.spread_mm);
+}
+
+#[test]
+fn intervals_are_those_of_their_formulas() {
+    let golden = golden().intervals;
+    let check = |what: &str, found: Estimate, wanted: [f64; 3]| {
+        let found = [found.value, found.ci_low, found.ci_high].map(|x| x.expect("a number"));
+        assert_all_near(what, &found, &wanted);
+    };
+    let values = &golden.values;
+    check("mean", mean_estimate(values), golden.mean);
+    let median = |indices: &[usize]| {
+        let mut drawn: Vec<f64> = indices.iter().map(|&i| values[i]).collect();
+        drawn.sort_by(f64::total_cmp);
+        // An odd number of values has one in the middle.
+        drawn.get(drawn.len() / 2).copied()
+    };
+    let found = bootstrap_estimate(values.len(), 101, 77, median);
+    check("bootstrap", found, golden.bootstrap_of_median);
+    check("share", share_estimate(17, 23), golden.share);
+}
+
+#[test]
+fn motion_that_is_not_finite_has_no_metric_and_passes_no_check() {
+    let golden = golden();
+    let mut frames = golden.motions[0].frames();
+    let channels = Channel::Position.range().start..Channel::Phase.range().end;
+    frames.slice_mut(s![40, channels]).fill(f32::NAN);
+    assert!(poses(frames.view()).is_none());
+    assert!(consistency(frames.view(), ChannelLimits::Wide).is_none());
+    assert!(ReferenceStatistics::fit(&[frames.view()], String::new()).is_none());
+    assert!(TrainingRange::fit([frames.view()]).is_none());
+    let range = golden.training_range.checks(frames.view());
+    let all = checks(frames.view(), ChannelLimits::Wide);
+    let passed: Vec<&str> =
+        all.iter().chain(&range).filter(|check| check.passed).map(|check| check.name).collect();
+    // A fall of the phase is one between numbers: `phase` and `finite` say that some are none.
+    assert!(passed.iter().all(|name| *name == "phase_monotonic"), "{passed:?}");
+}
