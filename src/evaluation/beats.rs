@@ -5,7 +5,7 @@
 
 use crate::motion::Poses;
 use crate::motion::kinematics::forward_differences;
-use crate::units::{FPS, frames_to_s};
+use crate::units::frames_to_s;
 
 use super::body::{BODY_RADIUS_M, norm, turn_rates};
 use super::interval::{Draws, mean_and_deviation};
@@ -205,6 +205,7 @@ fn resultant(turns: impl Iterator<Item = f64>) -> Option<f64> {
 mod tests {
     use super::*;
     use crate::motion::quaternion::IDENTITY;
+    use crate::units::FPS;
 
     /// Stands still for a moment every `period` frames, half-way between two of them.
     fn pulsing(n: usize, period: f64) -> Poses {

@@ -71,8 +71,8 @@ impl Gaussian {
 /// Returns the Fréchet distance between two sets of features.
 ///
 /// `|μ₁ - μ₂|² + Tr Σ₁ + Tr Σ₂ - 2 Tr (Σ₁ Σ₂)^½`, the last by the eigenvalues of `Σ₁^½ Σ₂ Σ₁^½`, which
-/// are those of the product. Where a covariance is singular, 1e-6 is added to the diagonals of both within that
-/// root. None where either has fewer than ten features for each dimension or is not sound, or their
+/// are those of the product. Where a covariance is singular, 1e-6 is added to the diagonals of both within
+/// that root. None where either has fewer than ten features for each dimension or is not sound, or their
 /// dimensions differ. Source: Dowson and Landau, "The Fréchet Distance between Multivariate Normal
 /// Distributions", 1982.
 pub fn frechet_distance(a: &Gaussian, b: &Gaussian) -> Option<f64> {

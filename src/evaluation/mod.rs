@@ -2,8 +2,21 @@
 //!
 //! Everything here is pure: motion of 25 channels and phases in, numbers out.
 
+pub mod beats;
+pub mod body;
+pub mod consistency;
+pub mod control;
+pub mod distribution;
+pub mod diversity;
+pub mod frechet;
+pub mod geometric;
+pub mod interval;
+pub mod kinetic;
+pub mod locking;
+pub mod reference_statistics;
 pub mod sanity;
 pub mod score;
+pub mod training_range;
 
 pub use sanity::{Check, CheckSet, checks};
 pub use score::{Score, score};
