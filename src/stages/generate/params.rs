@@ -64,8 +64,8 @@ pub struct Params {
     #[arg(long, value_enum, value_name = "FORMAT", value_delimiter = ',', num_args = 1..,
           default_values_t = Format::DEFAULT)]
     pub format: Vec<Format>,
-    /// With --audio: writes the frames of the first motion as CSV, as soon as they are final; - is the
-    /// standard output.
+    /// With --audio: writes the frames of the first motion as CSV, as soon as they are final and before
+    /// post-processing; - is the standard output.
     #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-", requires = "audio")]
     pub stream: Option<String>,
     /// Name under which tables keep the motions [default: the model's]
