@@ -3,6 +3,7 @@
 mod audio_header;
 mod diffusion;
 mod engine;
+mod evaluation;
 mod extract;
 mod generate;
 mod ingest_bad_input;
