@@ -18,5 +18,5 @@ pub mod sanity;
 pub mod score;
 pub mod training_range;
 
-pub use sanity::{Check, CheckSet, checks};
+pub use sanity::{Check, CheckSet, checks, derivative_error};
 pub use score::{Score, score};

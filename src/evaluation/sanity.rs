@@ -178,6 +178,18 @@ pub fn checks(frames: ArrayView2<f32>, limits: ChannelLimits) -> Vec<Check> {
     reference.into_iter().chain(strict).collect()
 }
 
+/// Returns the mean `|d[t] - 30 (x[t+1] - x[t])|` over frames and axes, of a channel x and the one that says
+/// it is its derivative; 0 where there are no two frames.
+pub fn derivative_error(frames: ArrayView2<f32>, of: Channel, derivative: Channel) -> f64 {
+    let at = |t: usize, i: usize| f64::from(frames[[t, i]]);
+    let (x, d) = (of.range().start, derivative.range().start);
+    let pairs = frames.nrows().saturating_sub(1);
+    let off = |t: usize| -> f64 {
+        (0..3).map(|i| (at(t, d + i) - FPS * (at(t + 1, x + i) - at(t, x + i))).abs()).sum()
+    };
+    (0..pairs).map(off).sum::<f64>() / (3 * pairs.max(1)) as f64
+}
+
 /// What the checks look at.
 struct Measured {
     norm: f64,
@@ -205,15 +217,8 @@ impl Measured {
         };
         let phase = |t: usize| f64::from(frames[[t, Channel::Phase.range().start]]);
         let pairs = n.saturating_sub(1);
-        // NaN where there is nothing to measure, which fails.
+        // Where there is nothing to measure there is no error.
         let mean = |sum: f64, n: usize| if n == 0 { 0.0 } else { sum / n as f64 };
-        let error = |of: Channel, derivative: Channel| {
-            let off = |t: usize| -> f64 {
-                let (a, b, d) = (vector(of, t), vector(of, t + 1), vector(derivative, t));
-                (0..3).map(|i| (d[i] - FPS * (b[i] - a[i])).abs()).sum()
-            };
-            mean((0..pairs).map(off).sum(), 3 * pairs)
-        };
         let length = |v: [f64; 3]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
         let jerk = |t: usize| {
             let (a, b) = (vector(Channel::Acceleration, t), vector(Channel::Acceleration, t + 1));
@@ -240,8 +245,8 @@ impl Measured {
                 (0..n).map(phase).fold(f64::NEG_INFINITY, most),
             ],
             jerk: mean((0..pairs).map(jerk).sum(), pairs),
-            velocity_error: error(Channel::Position, Channel::Velocity),
-            acceleration_error: error(Channel::Velocity, Channel::Acceleration),
+            velocity_error: derivative_error(frames, Channel::Position, Channel::Velocity),
+            acceleration_error: derivative_error(frames, Channel::Velocity, Channel::Acceleration),
             turn_error: mean((0..pairs).map(turn).sum(), 3 * pairs),
             least_dot: (0..pairs)
                 .map(|t| dot(normalize(quaternion(t)), normalize(quaternion(t + 1))))

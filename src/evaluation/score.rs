@@ -2,6 +2,7 @@
 
 use ndarray::ArrayView2;
 
+use super::locking::{unwrapped, wrong_tempi};
 use super::sanity::checks;
 use crate::motion::locking::bar_locking;
 use crate::motion::{Channel, ChannelLimits};
@@ -9,9 +10,8 @@ use crate::motion::{Channel, ChannelLimits};
 /// Error of a decoded velocity at which coherence counts half, m/s: about a quarter of the mean speed of dance.
 const HALF_COHERENT_M_S: f64 = 0.1;
 
-/// Tempi beside the music's own, as multiples of it: none is a simple fraction of it.
-const WRONG_TEMPI: [f64; 12] =
-    [0.55, 0.61, 0.71, 0.77, 0.83, 0.89, 1.13, 1.19, 1.29, 1.37, 1.43, 1.61];
+/// Tempi beside the music's own that locking is held against.
+const N_WRONG_TEMPI: usize = 12;
 
 /// What a motion scores.
 #[derive(Clone, Debug, PartialEq)]
@@ -57,22 +57,9 @@ fn locking(frames: ArrayView2<f32>, phase: &[f64]) -> f64 {
         let phase: Vec<f64> = bars.iter().map(|x| (x * tempo).rem_euclid(1.0)).collect();
         bar_locking(&vertical, &phase)
     };
-    let wrong = WRONG_TEMPI.iter().map(|&tempo| at(tempo)).sum::<f64>() / WRONG_TEMPI.len() as f64;
+    let tempi = wrong_tempi(N_WRONG_TEMPI);
+    let wrong = tempi.iter().map(|&tempo| at(tempo)).sum::<f64>() / tempi.len() as f64;
     at(1.0) - wrong
-}
-
-/// A phase that counts bars on.
-fn unwrapped(phase: &[f64]) -> Vec<f64> {
-    let mut bars = 0.0;
-    let mut last = phase.first().copied().unwrap_or(0.0);
-    let on = phase.iter().map(|&x| {
-        if last - x > 0.5 {
-            bars += 1.0;
-        }
-        last = x;
-        bars + x
-    });
-    on.collect()
 }
 
 #[cfg(test)]

@@ -12,6 +12,8 @@ mod runtime;
 mod sampling;
 mod seam;
 mod track;
+#[cfg(test)]
+mod walk;
 mod windows;
 
 pub use card::{

@@ -153,29 +153,9 @@ impl Joiner {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::generation::walk::walk;
     use crate::generation::windows::Windows;
-    use crate::motion::kinematics::{Poses, frames_of};
-    use crate::motion::quaternion::{from_axis_angle, make_sign_continuous, mul};
-    use crate::units::FPS;
     use ndarray::{Axis, concatenate};
-
-    /// A walk along a curve that turns more than once round, leaning.
-    fn walk(n: usize) -> Array2<f32> {
-        let pose = |t: usize| {
-            let s = t as f64 / FPS;
-            let lean = from_axis_angle([1.0, 0.0, 0.0], 0.2 * (3.0 * s).sin());
-            let turn = from_axis_angle([0.0, 1.0, 0.0], 1.1 * s);
-            ([2.0 * (0.7 * s).sin(), 0.9 + 0.05 * (9.0 * s).cos(), 0.4 * s], mul(turn, lean))
-        };
-        let (position_m, mut orientation): (Vec<_>, Vec<_>) = (0..n + 2).map(pose).unzip();
-        make_sign_continuous(&mut orientation);
-        let mut frames = frames_of(&Poses { position_m, orientation }, n);
-        for (t, mut row) in frames.rows_mut().into_iter().enumerate() {
-            row[16] = (t as f32 / 53.0).fract();
-            row[20] = (t as f32 * 0.01).sin();
-        }
-        frames
-    }
 
     fn windows_of(track: &Array2<f32>, windows: &Windows) -> Vec<Array2<f32>> {
         let cut = |i: usize| {
@@ -199,11 +179,7 @@ mod tests {
 
     #[test]
     fn windows_of_a_motion_are_joined_to_that_motion() {
-        let track = {
-            let mut track = walk(431);
-            Placement::of_first(track.view()).expect("frames").remove(&mut track);
-            track
-        };
+        let track = walk(431);
         for (length, overlap) in [(120, 30), (97, 1), (64, 40)] {
             let windows = Windows::new(431, length, overlap);
             let mut joiner = Joiner::new();

@@ -5,10 +5,8 @@ use super::*;
 use crate::diffusion::{DiffusionConfig, Prediction, Sampler, SamplerConfig, Schedule, Spacing};
 use crate::generation::control::Wanted;
 use crate::generation::engine::Inputs;
-use crate::motion::kinematics::{Poses, frames_of};
-use crate::motion::quaternion::{from_axis_angle, make_sign_continuous, mul};
+use crate::generation::walk::walk;
 use crate::motion::{Channel, ChannelLimits};
-use crate::units::FPS;
 
 const N_FEATURES: usize = 163;
 
@@ -48,24 +46,6 @@ impl Engine for ByHeart {
         motion.outer_iter_mut().for_each(|window| self.normalizer.denormalize(window));
         Ok(motion)
     }
-}
-
-/// A walk along a curve, leaning and turning; it begins at the origin and faces +Z.
-fn walk(n: usize) -> Array2<f32> {
-    let pose = |t: usize| {
-        let s = t as f64 / FPS;
-        let lean = from_axis_angle([1.0, 0.0, 0.0], 0.2 * (3.0 * s).sin());
-        let turn = from_axis_angle([0.0, 1.0, 0.0], 1.1 * s);
-        ([2.0 * (0.7 * s).sin(), 0.9 + 0.05 * (9.0 * s).cos(), 0.4 * s], mul(turn, lean))
-    };
-    let (position_m, mut orientation): (Vec<_>, Vec<_>) = (0..n + 2).map(pose).unzip();
-    make_sign_continuous(&mut orientation);
-    let mut frames = frames_of(&Poses { position_m, orientation }, n);
-    for (t, mut row) in frames.rows_mut().into_iter().enumerate() {
-        row[16] = (t as f32 / 53.0).fract();
-    }
-    Placement::of_first(frames.view()).expect("frames").remove(&mut frames);
-    frames
 }
 
 fn numbered(n: usize) -> Array2<f32> {

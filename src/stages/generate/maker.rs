@@ -5,7 +5,7 @@ use std::time::Instant;
 use ndarray::{Array2, ArrayView2, Axis, concatenate};
 
 use super::params::Settings;
-use crate::evaluation::{Score, score};
+use crate::evaluation::{Score, derivative_error, score};
 use crate::generation::{
     Constrained, Constraints, EngineError, Generator, ModelCard, Primed, Track,
 };
@@ -14,7 +14,7 @@ use crate::motion::{Beats, Channel, MOTION_DIM, bar_phase};
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::store::tables::GenerationRow;
 use crate::store::{TimestampUs, digest};
-use crate::units::{FPS, frames_to_s};
+use crate::units::frames_to_s;
 
 /// What is danced to.
 pub struct Music<'a> {
@@ -95,7 +95,8 @@ impl Maker<'_> {
             let watcher: &mut dyn FnMut(ArrayView2<f32>) -> std::io::Result<()> =
                 if candidate == 0 { &mut *watch } else { &mut unseen };
             let decoded = self.sample(music, seed, constraints.as_ref(), watcher)?;
-            let velocity_error = velocity_error(decoded.view());
+            let velocity_error =
+                derivative_error(decoded.view(), Channel::Position, Channel::Velocity);
             let mut frames = decoded;
             let bars = phase.as_deref().filter(|_| music.begins_bar);
             let postprocess = &self.settings.postprocess;
@@ -252,15 +253,4 @@ impl From<EngineError> for Stop {
     fn from(e: EngineError) -> Self {
         Self::Engine(e)
     }
-}
-
-/// Mean |v − 30 Δp|, m/s.
-fn velocity_error(frames: ArrayView2<f32>) -> f64 {
-    let at = |t: usize, i: usize| f64::from(frames[[t, i]]);
-    let (p, v) = (Channel::Position.range().start, Channel::Velocity.range().start);
-    let n = frames.nrows().saturating_sub(1);
-    let errors = (0..n).flat_map(|t| {
-        (0..3).map(move |i| (at(t, v + i) - FPS * (at(t + 1, p + i) - at(t, p + i))).abs())
-    });
-    errors.sum::<f64>() / (3 * n.max(1)) as f64
 }

@@ -201,15 +201,7 @@ impl PostProcessParams {
             config.smoothing_kernel_size = size;
         }
         if self.raw {
-            config = PostProcessConfig {
-                normalize_quaternions: false,
-                clamp_phase: false,
-                relock_phase: false,
-                clamp_values: false,
-                limits: self.limits,
-                coherence: Coherence::Keep,
-                ..PostProcessConfig::default()
-            };
+            config = PostProcessConfig { limits: self.limits, ..PostProcessConfig::nothing() };
         }
         config.check()?;
         Ok(config)
