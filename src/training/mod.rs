@@ -17,6 +17,7 @@ mod journal;
 mod learning_rate;
 mod loader;
 mod objective;
+mod pipeline;
 mod sampling;
 mod temporal;
 mod window;
