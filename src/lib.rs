@@ -12,6 +12,7 @@ pub mod model;
 pub mod motion;
 pub mod onnx;
 pub mod plot;
+pub mod report;
 pub mod stages;
 pub mod store;
 pub mod training;

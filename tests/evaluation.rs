@@ -23,7 +23,8 @@ use motiongen::evaluation::reference_statistics::{
     FeatureSet, FeatureStatistics, ReferenceStatistics,
 };
 use motiongen::evaluation::sanity::checks;
-use motiongen::evaluation::training_range::TrainingRange;
+use motiongen::evaluation::training_range::range_checks;
+use motiongen::motion::rates::MotionRange;
 use motiongen::motion::{Channel, ChannelLimits, MOTION_DIM, Poses};
 use ndarray::{Array2, ArrayView2, s};
 use serde::Deserialize;
@@ -37,7 +38,7 @@ const NOTHING: f64 = 1e-12;
 struct Golden {
     motions: Vec<MotionRow>,
     thresholds: GeometricThresholds,
-    training_range: TrainingRange,
+    training_range: MotionRange,
     locking: LockingRows,
     channels: Vec<f64>,
     features: FeatureRows,
@@ -442,8 +443,8 @@ fn motion_that_is_not_finite_has_no_metric_and_passes_no_check() {
     assert!(poses(frames.view()).is_none());
     assert!(consistency(frames.view(), ChannelLimits::Wide).is_none());
     assert!(ReferenceStatistics::fit(&[frames.view()], String::new()).is_none());
-    assert!(TrainingRange::fit([frames.view()]).is_none());
-    let range = golden.training_range.checks(frames.view());
+    assert!(MotionRange::fit([frames.view()]).is_none());
+    let range = range_checks(&golden.training_range, frames.view());
     let all = checks(frames.view(), ChannelLimits::Wide);
     let passed: Vec<&str> =
         all.iter().chain(&range).filter(|check| check.passed).map(|check| check.name).collect();

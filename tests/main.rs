@@ -3,6 +3,7 @@
 mod audio_header;
 mod diffusion;
 mod engine;
+mod evaluate;
 mod evaluation;
 mod extract;
 mod generate;

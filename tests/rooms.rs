@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Which rooms a room may use.
-const MAY_USE: [(&str, &[&str]); 16] = [
+const MAY_USE: [(&str, &[&str]); 17] = [
     ("units", &[]),
     ("audio", &["units"]),
     ("autodiff", &["model"]),
@@ -15,6 +15,7 @@ const MAY_USE: [(&str, &[&str]); 16] = [
     ("motion", &["units"]),
     ("onnx", &["audio", "model", "motion"]),
     ("plot", &["motion", "units"]),
+    ("report", &["view"]),
     ("store", &["audio", "motion", "units"]),
     (
         "training",
@@ -34,6 +35,7 @@ const MAY_USE: [(&str, &[&str]); 16] = [
             "motion",
             "onnx",
             "plot",
+            "report",
             "store",
             "training",
             "units",

@@ -15,6 +15,7 @@ use std::process::ExitCode;
 
 use clap::{Arg, ArgAction, ArgMatches, Command, FromArgMatches as _};
 
+use crate::stages::evaluate::Evaluate;
 use crate::stages::export::Export;
 use crate::stages::extract::Extract;
 use crate::stages::finetune::Finetune;
@@ -54,6 +55,7 @@ fn entries() -> Vec<Entry> {
         Entry::of::<Finetune>(),
         Entry::of::<Export>(),
         Entry::of::<Generate>(),
+        Entry::of::<Evaluate>(),
         Entry::of::<Model>(),
         Entry::of::<Plot>(),
         Entry::of::<View>(),

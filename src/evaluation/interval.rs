@@ -3,10 +3,13 @@
 //! Which interval is for what:
 //!
 //! * a mean over independent items (phrases, songs, replications): [`mean_estimate`], normal theory;
+//! * a mean over items of which those of one song are alike: [`clustered_mean_estimate`];
 //! * a share of items: [`share_estimate`], Wilson's score interval, which stays in [0, 1];
 //! * a number of a whole set (Fréchet distance, R² over songs): [`bootstrap_estimate`], the value and
 //!   1.96 standard errors of the bootstrap. Its percentiles are not used: a set drawn with replacement
 //!   repeats items, which moves a Fréchet distance up, and the percentiles might not hold the value.
+
+use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
@@ -65,6 +68,27 @@ pub fn mean_estimate(values: &[f64]) -> Estimate {
         (None, &[single]) => Estimate::plain(Some(single), n),
         (None, _) => Estimate::plain(None, n),
     }
+}
+
+/// Estimates a mean over items of which those of one cluster, such as a song, are no independent ones.
+///
+/// `x̄ ± 1.96 √(G/(G-1) Σ_g (Σ_{i in g} (x_i - x̄))²) / n` with G clusters, which for clusters of one item is
+/// [`mean_estimate`]. `clusters` names the cluster of each value. Absent without items or where one is not
+/// finite; no interval for a single cluster. Source: Liang and Zeger, "Longitudinal Data Analysis Using
+/// Generalized Linear Models", 1986, for a mean.
+pub fn clustered_mean_estimate(values: &[f64], clusters: &[usize]) -> Estimate {
+    let n = values.len();
+    let mean = values.iter().sum::<f64>() / n as f64;
+    if n == 0 || !mean.is_finite() {
+        return Estimate::plain(None, n);
+    }
+    let mut sums: BTreeMap<usize, f64> = BTreeMap::new();
+    for (x, cluster) in values.iter().zip(clusters) {
+        *sums.entry(*cluster).or_default() += x - mean;
+    }
+    let n_clusters = sums.len() as f64;
+    let spread = n_clusters / (n_clusters - 1.0) * sums.values().map(|x| x * x).sum::<f64>();
+    Estimate::around(mean, Z_95 * spread.sqrt() / n as f64, n)
 }
 
 /// Estimates the share of `n` items that `n_true` of them are, with Wilson's score interval.
@@ -163,6 +187,24 @@ mod tests {
         for (found, wanted) in found.into_iter().zip(wanted) {
             assert!(found.is_some_and(|x| (x - wanted).abs() < 1e-12), "{estimate:?}, {wanted}");
         }
+    }
+
+    #[test]
+    fn items_of_one_cluster_count_as_alike() {
+        let values = [1.0, 2.0, 4.0, 9.0, 5.5];
+        let alone = clustered_mean_estimate(&values, &[0, 1, 2, 3, 4]);
+        let plain = mean_estimate(&values);
+        for (a, b) in [(alone.ci_low, plain.ci_low), (alone.ci_high, plain.ci_high)] {
+            assert!((a.unwrap() - b.unwrap()).abs() < 1e-12, "{alone:?} {plain:?}");
+        }
+        // Mean 3, two clusters off by -3 and 3: √(2 · 18) / 4 = 1.5.
+        let pairs = clustered_mean_estimate(&[1.0, 2.0, 4.0, 5.0], &[7, 7, 3, 3]);
+        assert_eq!((pairs.value, pairs.n), (Some(3.0), 4));
+        assert!((pairs.ci_high.unwrap() - (3.0 + 1.96 * 1.5)).abs() < 1e-12, "{pairs:?}");
+        let one = clustered_mean_estimate(&[1.0, 3.0], &[5, 5]);
+        assert_eq!((one.value, one.ci_low, one.ci_high), (Some(2.0), None, None));
+        assert_eq!(clustered_mean_estimate(&[], &[]).value, None);
+        assert_eq!(clustered_mean_estimate(&[f64::NAN, 1.0], &[0, 1]).value, None);
     }
 
     #[test]

@@ -3,7 +3,7 @@
 //! R² of a short signal is not small by chance, so it is held against R² of the same signal with the bar's
 //! phase running at tempi that the music does not have.
 
-use crate::motion::locking::{N_HARMONICS, bar_locking};
+use crate::motion::locking::BarSums;
 
 use super::interval::mean_and_deviation;
 
@@ -17,9 +17,6 @@ const MIN_LOG_DISTANCE: f64 = 0.04;
 const N_CANDIDATES: usize = 4000;
 /// A fall of the phase by more than this begins a new bar.
 const WRAP: f64 = 0.5;
-/// A fit says nothing of as many values as it has numbers: a constant, and a cosine and a sine for each
-/// harmonic.
-const N_FITTED: usize = 1 + 2 * N_HARMONICS;
 /// Scores over wrong tempi that spread less than this do not spread.
 const MIN_DEVIATION: f64 = 1e-12;
 
@@ -50,45 +47,63 @@ pub struct BarLocking {
 /// Returns how strongly signals are locked to the bar, against the tempi `ratios` times the music's.
 ///
 /// Each item of `fits` is one regression: a single passage for a fit of its own, or all passages of a song
-/// for one fit of them. `R²` is [`bar_locking`] of the passages of a fit one behind the other, with phases
+/// for one fit of them. `R²` is [`bar_locking`](crate::motion::locking::bar_locking) of the passages of a fit one behind the other, with phases
 /// `bars · ratio`, averaged over fits. For p below 0.01 there must be a hundred ratios.
 ///
 /// None where no fit has more values than the nine that are fitted, there are fewer than two ratios, or
 /// something is not finite.
 pub fn locking_against(fits: &[Vec<Passage<'_>>], ratios: &[f64]) -> Option<BarLocking> {
-    let fits: Vec<(Vec<f64>, Vec<f64>)> =
-        fits.iter().map(|fit| joined(fit)).filter(|(signal, _)| signal.len() > N_FITTED).collect();
-    let is_finite = |x: &[f64]| x.iter().all(|x| x.is_finite());
-    if fits.is_empty() || !fits.iter().all(|(signal, bars)| is_finite(signal) && is_finite(bars)) {
-        return None;
-    }
-    let r2_at = |ratio: f64| {
-        let of = |(signal, bars): &(Vec<f64>, Vec<f64>)| {
-            let phase: Vec<f64> = bars.iter().map(|x| x * ratio).collect();
-            bar_locking(signal, &phase)
-        };
-        fits.iter().map(of).sum::<f64>() / fits.len() as f64
-    };
-    let r2 = r2_at(1.0);
-    let wrong: Vec<f64> = ratios.iter().map(|&ratio| r2_at(ratio)).collect();
-    let (wrong_mean, deviation) = mean_and_deviation(&wrong)?;
-    let n_as_good = wrong.iter().filter(|&&x| x >= r2).count();
-    r2.is_finite().then(|| BarLocking {
-        r2,
-        wrong_mean,
-        effect: (deviation > MIN_DEVIATION).then(|| (r2 - wrong_mean) / deviation),
-        p: (1 + n_as_good) as f64 / (1 + wrong.len()) as f64,
-        n_wrong: wrong.len(),
-        n_fits: fits.len(),
-    })
+    let fit_of: Vec<usize> =
+        fits.iter().enumerate().flat_map(|(i, fit)| fit.iter().map(move |_| i)).collect();
+    let passages: Vec<Passage<'_>> = fits.iter().flatten().copied().collect();
+    let at: Vec<Vec<f64>> = std::iter::once(&1.0)
+        .chain(ratios)
+        .map(|&ratio| r2_at(&passages, &[&fit_of], ratio).swap_remove(0))
+        .collect();
+    BarLocking::against(at.first()?, &at[1..])
 }
 
-/// Signal and bars of passages one behind the other, of the frames that have both.
-fn joined(passages: &[Passage<'_>]) -> (Vec<f64>, Vec<f64>) {
-    passages
-        .iter()
-        .flat_map(|passage| passage.signal.iter().copied().zip(passage.bars.iter().copied()))
-        .unzip()
+/// Returns R² of each fit with the bar's tempo multiplied by `ratio`, for several ways to put passages into
+/// fits: `groupings[g][i]` is the fit of passage i.
+///
+/// Fits that have no more values than are fitted are left out.
+pub fn r2_at(passages: &[Passage<'_>], groupings: &[&[usize]], ratio: f64) -> Vec<Vec<f64>> {
+    let n_fits = |grouping: &&[usize]| grouping.iter().max().map_or(0, |last| last + 1);
+    let mut fits: Vec<Vec<BarSums>> =
+        groupings.iter().map(|grouping| vec![BarSums::default(); n_fits(grouping)]).collect();
+    for (i, Passage { signal, bars }) in passages.iter().enumerate() {
+        let phases = bars.iter().map(|bars| bars * ratio);
+        let sums = BarSums::of(signal.iter().copied().zip(phases));
+        for (fits, grouping) in fits.iter_mut().zip(groupings) {
+            fits[grouping[i]].add(&sums);
+        }
+    }
+    let fitted = |fits: Vec<BarSums>| {
+        fits.into_iter().filter(BarSums::can_be_fitted).map(|fit| fit.r2()).collect()
+    };
+    fits.into_iter().map(fitted).collect()
+}
+
+impl BarLocking {
+    /// Holds R² of fits against those of the same fits at wrong tempi.
+    ///
+    /// None without fits, for fewer than two wrong tempi, or where something is not finite.
+    pub fn against(r2: &[f64], wrong: &[Vec<f64>]) -> Option<Self> {
+        let mean = |of: &[f64]| of.iter().sum::<f64>() / of.len() as f64;
+        let n_fits = r2.len();
+        let r2 = mean(r2);
+        let wrong: Vec<f64> = wrong.iter().map(|of| mean(of)).collect();
+        let (wrong_mean, deviation) = mean_and_deviation(&wrong)?;
+        let n_as_good = wrong.iter().filter(|&&x| x >= r2).count();
+        r2.is_finite().then(|| Self {
+            r2,
+            wrong_mean,
+            effect: (deviation > MIN_DEVIATION).then(|| (r2 - wrong_mean) / deviation),
+            p: (1 + n_as_good) as f64 / (1 + wrong.len()) as f64,
+            n_wrong: wrong.len(),
+            n_fits,
+        })
+    }
 }
 
 /// Returns `n` wrong tempi as multiples of the music's: evenly from 0.55 to 1.8 on a scale of logarithms,

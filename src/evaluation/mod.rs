@@ -2,6 +2,7 @@
 //!
 //! Everything here is pure: motion of 25 channels and phases in, numbers out.
 
+pub mod baseline;
 pub mod beats;
 pub mod body;
 pub mod consistency;
@@ -13,10 +14,13 @@ pub mod geometric;
 pub mod interval;
 pub mod kinetic;
 pub mod locking;
+pub mod measured;
+pub mod metrics;
 pub mod reference_statistics;
 pub mod sanity;
 pub mod score;
 pub mod training_range;
 
+pub use measured::Measured;
 pub use sanity::{Check, CheckSet, checks, derivative_error};
 pub use score::{Score, score};

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::motion::Poses;
+use crate::motion::rates::MotionRange;
 
 use super::body::{BODY_RADIUS_M, part, poses};
 use super::frechet::{DEVIATION_EPS, Gaussian};
@@ -15,7 +16,6 @@ use super::geometric::{GEOMETRIC_NAMES, GeometricThresholds, geometric_features}
 use super::kinetic::{
     AXIS_NAMES, CHUNK_FRAMES, Formula, MARKER_NAMES, axis_features, chunks, marker_features,
 };
-use super::training_range::TrainingRange;
 
 /// Version of the artefact: another meaning of any of its numbers is another version.
 pub const REFERENCE_VERSION: u32 = 1;
@@ -160,7 +160,7 @@ pub struct ReferenceStatistics {
     pub chunk_frames: usize,
     pub body_radius_m: f64,
     pub thresholds: GeometricThresholds,
-    pub training_range: TrainingRange,
+    pub training_range: MotionRange,
     pub axes: FeatureStatistics,
     pub axes_compat: FeatureStatistics,
     pub markers: FeatureStatistics,
@@ -187,7 +187,7 @@ impl ReferenceStatistics {
             chunk_frames: CHUNK_FRAMES,
             body_radius_m: BODY_RADIUS_M,
             thresholds,
-            training_range: TrainingRange::fit(motions.iter().copied())?,
+            training_range: MotionRange::fit(motions.iter().copied())?,
             axes: of(FeatureSet::Axes)?,
             axes_compat: of(FeatureSet::AxesCompat)?,
             markers: of(FeatureSet::Markers)?,

@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::audio::{FEATURE_DIM, FeatureScale, feature_names};
 use crate::diffusion::DiffusionConfig;
 use crate::model::{DecoderConfig, UNetConfig};
+use crate::motion::rates::MotionRange;
 use crate::motion::{CHANNEL_NAMES, Normalizer};
 use crate::onnx::Storage;
 use crate::units::FPS;
@@ -51,6 +52,9 @@ pub struct ModelCard {
     pub normalizer: Normalizer,
     /// Centre and scale of each feature; `unet.onnx` applies them itself.
     pub feature_scale: FeatureScale,
+    /// How fast the motion is that it was trained on; generated motion is held to it.
+    #[serde(default)]
+    pub motion_range: Option<MotionRange>,
     pub licence: String,
     pub files: Vec<FileEntry>,
 }

@@ -8,6 +8,7 @@ mod control;
 mod eager;
 mod engine;
 mod pool;
+mod retrieval;
 mod runtime;
 mod sampling;
 mod seam;
@@ -24,6 +25,7 @@ pub use control::{Constraints, ControlError, Miss, REACH_FRAMES, Wanted, continu
 pub use eager::EagerEngine;
 pub use engine::{Engine, EngineError, Inputs};
 pub use pool::Pool;
+pub use retrieval::Retrieval;
 pub use runtime::{OnnxEngine, SessionPlan};
 pub use sampling::{Sampling, sample};
 pub use track::{Constrained, Generator, OVERLAP_FRAMES, Primed, RUN_WINDOWS, Track};

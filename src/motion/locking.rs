@@ -10,6 +10,112 @@ pub const N_HARMONICS: usize = 4;
 /// Numbers that are fitted: a constant, and a cosine and a sine per harmonic.
 const N_FITTED: usize = 1 + 2 * N_HARMONICS;
 
+/// Sums over the values of a signal from which its fit to the bar follows; those of two stretches add up
+/// to those of both.
+///
+/// Products of two harmonics are halves of harmonics of their sum and difference, so that the Gram matrix
+/// follows from the sums of `cos 2πhφ` and `sin 2πhφ`, h = 0 … 8.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct BarSums {
+    n: usize,
+    /// Of the signal and its square.
+    signal: f64,
+    square: f64,
+    cosine: [f64; 2 * N_HARMONICS + 1],
+    sine: [f64; 2 * N_HARMONICS + 1],
+    /// Of the signal times both, h = 0 … 4.
+    by_cosine: [f64; N_HARMONICS + 1],
+    by_sine: [f64; N_HARMONICS + 1],
+}
+
+impl BarSums {
+    /// Sums over the values of a signal, each with its bar phase φ; whole bars do not count.
+    pub fn of(values: impl IntoIterator<Item = (f64, f64)>) -> Self {
+        let mut sums = Self::default();
+        for (x, phase) in values {
+            let (sine, cosine) = (TAU * phase.fract()).sin_cos();
+            let (mut c, mut s) = (1.0, 0.0);
+            sums.n += 1;
+            sums.signal += x;
+            sums.square += x * x;
+            for h in 0..=2 * N_HARMONICS {
+                sums.cosine[h] += c;
+                sums.sine[h] += s;
+                if h <= N_HARMONICS {
+                    sums.by_cosine[h] += x * c;
+                    sums.by_sine[h] += x * s;
+                }
+                (c, s) = (c * cosine - s * sine, s * cosine + c * sine);
+            }
+        }
+        sums
+    }
+
+    /// Adds the sums of another stretch.
+    pub fn add(&mut self, other: &Self) {
+        self.n += other.n;
+        self.signal += other.signal;
+        self.square += other.square;
+        let pairs = |a: &mut [f64], b: &[f64]| a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
+        pairs(&mut self.cosine, &other.cosine);
+        pairs(&mut self.sine, &other.sine);
+        pairs(&mut self.by_cosine, &other.by_cosine);
+        pairs(&mut self.by_sine, &other.by_sine);
+    }
+
+    /// Whether there are more values than the 9 numbers that are fitted.
+    pub fn can_be_fitted(&self) -> bool {
+        self.n > N_FITTED
+    }
+
+    /// Returns the share of the variance that follows the bar, as [`bar_locking`] does; NaN where a value is
+    /// not finite.
+    pub fn r2(&self) -> f64 {
+        if !self.can_be_fitted() {
+            return 0.0;
+        }
+        let n = self.n as f64;
+        let mean = self.signal / n;
+        let total = self.square - n * mean * mean;
+        if !(total + self.cosine[1]).is_finite() {
+            return f64::NAN;
+        }
+        // A variance at the rounding of the squares is none.
+        if total <= self.square * f64::EPSILON * (16.0 + n) {
+            return 0.0;
+        }
+        // Waves in the order 1, sin φ, cos φ, sin 2φ, cos 2φ, …
+        let wave = |i: usize| (i.div_ceil(2), i.is_multiple_of(2));
+        let (mut gram, mut projection) = ([[0.0; N_FITTED]; N_FITTED], [0.0; N_FITTED]);
+        for i in 0..N_FITTED {
+            let (h, is_cosine) = wave(i);
+            projection[i] = if is_cosine {
+                self.by_cosine[h] - mean * self.cosine[h]
+            } else {
+                self.by_sine[h] - mean * self.sine[h]
+            };
+            for (j, product) in gram[i].iter_mut().enumerate().take(i + 1) {
+                let (k, other_is_cosine) = wave(j);
+                let (sum, difference) = (h + k, h.abs_diff(k));
+                *product = match (is_cosine, other_is_cosine) {
+                    (true, true) => (self.cosine[difference] + self.cosine[sum]) / 2.0,
+                    (false, false) => (self.cosine[difference] - self.cosine[sum]) / 2.0,
+                    // sin hφ cos kφ = (sin (h + k)φ + sin (h - k)φ) / 2, and the sine is odd.
+                    (false, true) => {
+                        let sign = if h >= k { 1.0 } else { -1.0 };
+                        (self.sine[sum] + sign * self.sine[difference]) / 2.0
+                    }
+                    (true, false) => {
+                        let sign = if k >= h { 1.0 } else { -1.0 };
+                        (self.sine[sum] + sign * self.sine[difference]) / 2.0
+                    }
+                };
+            }
+        }
+        (explained(gram, projection) / total).clamp(0.0, 1.0)
+    }
+}
+
 /// Returns the share of a signal's variance that follows the bar, R² in [0, 1].
 ///
 /// `R² = 1 - Σ(x - x̂)² / Σ(x - x̄)²` with `x̂` the least-squares fit of a constant and
@@ -17,36 +123,10 @@ const N_FITTED: usize = 1 + 2 * N_HARMONICS;
 /// is constant or has no more values than the 9 that are fitted. By chance alone R² is about 8 over
 /// the number of independent values, so compare it with R² at other tempi.
 pub fn bar_locking(signal: &[f64], phase: &[f64]) -> f64 {
+    // Squares keep more digits about the mean.
     let n = signal.len().min(phase.len());
-    if n <= N_FITTED {
-        return 0.0;
-    }
-    let (signal, phase) = (&signal[..n], &phase[..n]);
-    let mean = signal.iter().sum::<f64>() / n as f64;
-    let (mut gram, mut projection) = ([[0.0; N_FITTED]; N_FITTED], [0.0; N_FITTED]);
-    let mut total = 0.0;
-    for (&x, &phi) in signal.iter().zip(phase) {
-        let wave = waves(phi);
-        for i in 0..N_FITTED {
-            projection[i] += wave[i] * (x - mean);
-            for j in 0..=i {
-                gram[i][j] += wave[i] * wave[j];
-            }
-        }
-        total += (x - mean) * (x - mean);
-    }
-    // A variance at the rounding of the mean is none.
-    if total <= n as f64 * (mean.abs() * f64::EPSILON * 16.0).powi(2) {
-        return 0.0;
-    }
-    (explained(gram, projection) / total).clamp(0.0, 1.0)
-}
-
-fn waves(phase: f64) -> [f64; N_FITTED] {
-    std::array::from_fn(|i| {
-        let angle = TAU * i.div_ceil(2) as f64 * phase;
-        if i % 2 == 0 { angle.cos() } else { angle.sin() }
-    })
+    let mean = signal[..n].iter().sum::<f64>() / n.max(1) as f64;
+    BarSums::of(signal.iter().map(|x| x - mean).zip(phase.iter().copied())).r2()
 }
 
 /// Returns `bᵀ G⁻¹ b`, the sum of squares that the fit explains, by Cholesky factors `G = L Lᵀ`:
@@ -99,6 +179,44 @@ mod tests {
             .map(|(t, p)| (TAU * p).sin() + (TAU * 7.0 * t as f64 / 60.0).cos())
             .collect();
         assert!((bar_locking(&both, &phase) - 0.5).abs() < 1e-12);
+    }
+
+    /// The definition: least squares by the normal equations of the nine waves themselves.
+    fn by_definition(signal: &[f64], phase: &[f64]) -> f64 {
+        let wave = |phi: f64| -> [f64; N_FITTED] {
+            std::array::from_fn(|i| {
+                let angle = TAU * i.div_ceil(2) as f64 * phi;
+                if i % 2 == 0 { angle.cos() } else { angle.sin() }
+            })
+        };
+        let mean = signal.iter().sum::<f64>() / signal.len() as f64;
+        let (mut gram, mut b) = ([[0.0; N_FITTED]; N_FITTED], [0.0; N_FITTED]);
+        for (x, &phi) in signal.iter().zip(phase) {
+            let wave = wave(phi);
+            for i in 0..N_FITTED {
+                b[i] += wave[i] * (x - mean);
+                (0..=i).for_each(|j| gram[i][j] += wave[i] * wave[j]);
+            }
+        }
+        explained(gram, b) / signal.iter().map(|x| (x - mean).powi(2)).sum::<f64>()
+    }
+
+    #[test]
+    fn sums_of_stretches_are_those_of_the_whole_and_fit_as_by_definition() {
+        let signal: Vec<f64> = (0..137).map(|t| f64::from(t * t % 23) / 7.0 + 1.3).collect();
+        let phase: Vec<f64> =
+            (0..137).map(|t| f64::from(t) / 31.7 + 0.004 * f64::from(t % 5)).collect();
+        let expected = by_definition(&signal, &phase);
+        assert!((0.003..0.99).contains(&expected), "{expected}");
+        let sums =
+            |range: std::ops::Range<usize>| BarSums::of(range.map(|t| (signal[t], phase[t])));
+        let mut both = sums(0..50);
+        both.add(&sums(50..137));
+        for found in [bar_locking(&signal, &phase), sums(0..137).r2(), both.r2()] {
+            assert!((found - expected).abs() < 1e-11, "{found} {expected}");
+        }
+        assert!(BarSums::of([(0.0, f64::NAN); 20]).r2().is_nan());
+        assert!(BarSums::of((0..20).map(|t| (f64::NAN, f64::from(t) / 7.0))).r2().is_nan());
     }
 
     #[test]

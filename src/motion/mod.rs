@@ -29,6 +29,7 @@ pub mod placement;
 pub mod postprocess;
 pub mod quantile;
 pub mod quaternion;
+pub mod rates;
 pub mod spline;
 pub mod style;
 pub mod trajectory;

@@ -5,8 +5,8 @@
 //! derived before, velocities would belong to positions that smoothing then moves.
 //!
 //! Nothing that is not finite is mended: no step puts a finite number where NaN or an infinity was,
-//! so that the checks find it. Neither are derived values held within limits: one beyond them tells
-//! of a jump in the positions, and held it would no longer be their difference.
+//! so that the checks find it. Neither are derived values held within limits: held, they would no longer
+//! be differences. It is poses that are held, where a range says how fast they may change.
 
 mod config;
 mod orientation;
@@ -65,16 +65,33 @@ pub fn process(config: &PostProcessConfig, frames: &mut Array2<f32>, phase: Opti
     if config.apply_smoothing {
         smooth_columns(frames, &VECTORS, |x| moving_average(x, config.smoothing_kernel_size));
     }
+    limit(config, frames);
     if let Some(SavitzkyGolay { window, order }) = config.savitzky_golay {
         let polynomials = Polynomials::new(window, order, frames.nrows());
         smooth_columns(frames, &[Channel::Position], |x| polynomials.smooth(x));
         let mut q = quaternions(frames);
         orientation::smooth_by_polynomials(&mut q, &polynomials);
         write_quaternions(config, frames, q);
+        limit(config, frames);
     }
     if config.coherence == Coherence::Derive {
         derive(frames);
     }
+}
+
+/// Holds poses to the speeds that they may have.
+fn limit(config: &PostProcessConfig, frames: &mut Array2<f32>) {
+    let Some(range) = config.range else { return };
+    let mut position_m = vectors(frames, Channel::Position);
+    range.limit_positions(&mut position_m);
+    for (mut row, p) in frames.rows_mut().into_iter().zip(position_m) {
+        for (i, x) in Channel::Position.range().zip(p) {
+            row[i] = x as f32;
+        }
+    }
+    let mut q = quaternions(frames);
+    range.limit_orientations(&mut q);
+    write_quaternions(config, frames, q);
 }
 
 /// Sets the phase to the bar phase of the music, `[T]`, in bars; a phase that is not finite stays.

@@ -11,7 +11,7 @@ const ITEM_COLUMN: &str = "phrase_id";
 
 rows! {
     "One row per phrase that ingest accepted or library constructed."
-    PhraseRow in "phrases" version 1 sorted by [phrase_id]
+    PhraseRow in "phrases" version 2 sorted by [phrase_id]
     {
         phrase_id: String, "", "Name of the phrase: its folder in a phrase layout, its relative path in a music library; of a constructed one `SONG.tTAKE.NUMBER`.";
         source: String, "URL", "The source it came from; of a constructed phrase, the song.";
@@ -33,6 +33,7 @@ rows! {
         sample_rate_hz: Option<i32>, "Hz", "Sample rate named by the audio header.";
         n_channels: Option<i32>, "channels", "Channels named by the audio header.";
         duration_s: f64, "s", "Length of the audio; without audio, frames / 30.";
+        start_s: Option<f64>, "s", "Of a constructed phrase, where in its song it begins.";
         n_frames: Option<i64>, "frames", "Motion frames at 30 fps.";
         n_feature_frames: Option<i64>, "frames", "Frames in the feature file, or of the features.";
         split: String, "", "`train` (90 %), `validation` (5 %) or `test` (5 %), by a stable hash of `phrase_id`; constructed phrases go with their song.";
@@ -192,6 +193,43 @@ rows! {
     }
 }
 
+rows! {
+    "One row per sanity check of a motion that evaluate looked at."
+    SanityCheckRow in "sanity_checks" version 1 sorted by [run, phrase_id, sample]
+    {
+        run: String, "", "The run of generate that was evaluated; evaluating it again replaces its rows.";
+        model: String, "", "Name of the model.";
+        phrase_id: String, "", "The phrase, as in `phrases`.";
+        sample: i32, "samples", "Number of the motion among those of the phrase.";
+        check_set: String, "", "`reference` (the five checks of the reference design) or `strict` (what captured motion keeps).";
+        check_name: String, "", "Name of the check: see docs/evaluate.md.";
+        value: Option<f64>, "", "What was measured; none where it is not finite.";
+        threshold: f64, "", "What the value is held against.";
+        passed: bool, "", "Whether the motion passes.";
+        message: String, "", "Both in a few words, with their unit.";
+    }
+}
+
+rows! {
+    "One row per number of a run that evaluate measured, and of what it is compared with."
+    MetricRow in "metrics" version 1 sorted by [run, metric, variant, split, subject]
+    {
+        run: String, "", "The run of generate that was evaluated; evaluating it again replaces its rows.";
+        model: String, "", "Name of the model.";
+        subject: String, "", "Whose number it is: `generated`, or a baseline: `shuffled` (the same motions with the music of other songs), `retrieval` (the library's phrase with the nearest features), `mean_motion`, `held_out_truth`, `ground_truth`.";
+        split: String, "", "Which music: `all`, or `held_out` (songs that the model did not learn from).";
+        metric: String, "", "Name of the number: see docs/evaluate.md.";
+        variant: String, "", "Which of several ways to measure it; empty where there is one.";
+        unit: String, "", "Unit of the value; empty where it has none.";
+        value: Option<f64>, "", "The number; none where there is too little to tell.";
+        ci_low: Option<f64>, "", "Lower end of its 95 % interval.";
+        ci_high: Option<f64>, "", "Upper end of its 95 % interval.";
+        n: i64, "", "What was counted: motions, chunks, fits or frames, as the protocol says.";
+        protocol: String, "", "How it was measured.";
+        time: TimestampUs, "", "When it was measured.";
+    }
+}
+
 /// Name of the table of generated motion.
 pub const GENERATED: &str = "generated";
 
@@ -297,6 +335,8 @@ pub fn all() -> Vec<TableSchema> {
         OnnxCheckRow::schema(),
         GenerationRow::schema(),
         generated(),
+        SanityCheckRow::schema(),
+        MetricRow::schema(),
     ]
 }
 

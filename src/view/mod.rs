@@ -9,7 +9,7 @@ mod page;
 
 use ndarray::Array2;
 
-pub use page::page;
+pub use page::{escaped, page};
 
 /// What a page shows.
 #[derive(Clone, Debug, PartialEq)]

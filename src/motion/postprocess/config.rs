@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::motion::channels::Channel;
+use crate::motion::rates::MotionRange;
 use crate::motion::trajectory::ChannelLimits;
 
 /// Widest window of any smoothing: ten seconds.
@@ -110,6 +111,8 @@ pub struct PostProcessConfig {
     /// How positions and orientations are smoothed by polynomials, after the moving average; needs
     /// [`Coherence::Derive`].
     pub savitzky_golay: Option<SavitzkyGolay>,
+    /// How fast the body may move and turn; before and after smoothing, which carries over its peaks.
+    pub range: Option<MotionRange>,
 }
 
 impl Default for PostProcessConfig {
@@ -134,17 +137,19 @@ impl Default for PostProcessConfig {
             apply_smoothing: false,
             smoothing_kernel_size: 3,
             savitzky_golay: None,
+            range: None,
         }
     }
 }
 
 impl PostProcessConfig {
-    /// Returns the configuration without any smoothing, for motion that was smoothed before.
+    /// Returns the configuration without any step that moves poses, for motion that was smoothed before.
     pub fn without_smoothing(&self) -> Self {
         Self {
             smooth_quaternions: false,
             apply_smoothing: false,
             savitzky_golay: None,
+            range: None,
             ..self.clone()
         }
     }

@@ -18,10 +18,9 @@ use crate::model::{MotionDecoder, Parameter, ParameterList, UNet1D};
 use crate::motion::MOTION_DIM;
 use crate::onnx::{Device, Model, Runtime, Storage, values_of};
 use crate::stages::Progress;
-use crate::stages::train::session::{Looker, read_phrases};
 use crate::stages::trained::Trained;
 use crate::store::tables::OnnxCheckRow;
-use crate::store::{Location, TimestampUs, write_file};
+use crate::store::{TimestampUs, write_file};
 use crate::training::Dataset;
 
 /// Name of the check of rounded weights.
@@ -29,7 +28,7 @@ pub const ROUNDING: &str = "rounding";
 /// Steps of the sampling that is held against another.
 const N_STEPS: usize = 20;
 const GUIDANCE: f64 = 2.5;
-/// Training phrases that are read for their music, beside those of the other splits.
+/// Phrases whose music the checks hear.
 const N_PHRASES: usize = 16;
 
 /// f32 of another order of summation: 2e-5 at most was seen over a forward of the largest preset.
@@ -41,7 +40,7 @@ const ROUNDING_TOLERANCE: f64 = 0.05;
 
 /// What is checked.
 pub struct Checking<'a> {
-    pub store: &'a Location,
+    pub dataset: &'a Dataset,
     pub params: &'a Params,
     pub trained: &'a Trained,
     pub files: &'a Files,
@@ -111,7 +110,7 @@ impl Checking<'_> {
                 MotionDecoder::new(&network.decoder).1,
             )?,
         )?;
-        let music = self.music(progress)?;
+        let music = self.music()?;
         let schedule = Schedule::new(&network.diffusion)?;
         let window = network.window_frames;
         let cases = [(1, window), (3, window), (2, window / 2 + 17), (1, 2 * window + 1)]
@@ -190,18 +189,8 @@ impl Checking<'_> {
     }
 
     /// Returns music of the store, frame after frame, \[frames, 163\]; held-out songs first.
-    fn music(&self, progress: &dyn Progress) -> anyhow::Result<ndarray::Array2<f32>> {
-        let watch = Looker(progress);
-        let machine = &self.params.machine;
-        let phrases = read_phrases(
-            self.store,
-            <super::Export as crate::stages::Stage>::NAME,
-            machine,
-            Some(N_PHRASES),
-            progress,
-            &watch,
-        )?;
-        let dataset: &Dataset = &phrases.dataset;
+    fn music(&self) -> anyhow::Result<ndarray::Array2<f32>> {
+        let dataset = self.dataset;
         let mut order: Vec<_> = dataset.phrases().iter().collect();
         order.sort_by_key(|phrase| std::cmp::Reverse(phrase.split));
         let mut music = ndarray::Array2::zeros((0, FEATURE_DIM));

@@ -13,6 +13,7 @@ use crate::generation::{
     own_features,
 };
 use crate::model::ParameterId;
+use crate::motion::rates::MotionRange;
 use crate::onnx::{Encoded, Form, Model, ModelFile, OnnxError, check, decoder, unet};
 use crate::stages::model_files::sha256;
 use crate::stages::trained::Trained;
@@ -31,7 +32,11 @@ impl Files {
     ///
     /// # Errors
     /// A network that cannot be written, or one that breaks a rule.
-    pub fn make(trained: &Trained, params: &Params) -> anyhow::Result<Self> {
+    pub fn make(
+        trained: &Trained,
+        params: &Params,
+        range: Option<MotionRange>,
+    ) -> anyhow::Result<Self> {
         let config = &trained.state.config.network;
         let scales = &trained.state.scales;
         let storage = params.precision;
@@ -74,6 +79,7 @@ impl Files {
             features: own_features(),
             normalizer: scales.motion.clone(),
             feature_scale: scales.features.clone(),
+            motion_range: range,
             licence: params.licence.clone(),
             files: Vec::new(),
         };

@@ -13,13 +13,18 @@ use self::checks::{Checking, Held};
 use self::files::Files;
 use self::report::{Planned, Report};
 use super::model_files::{folder_of, sha256};
-use super::train::session::{MachineParams, check_run_name};
+use super::train::session::{Looker, MachineParams, check_run_name, read_phrases};
 use super::trained::{Stand, Trained};
 use super::{ClientParams, Contract, Progress, Stage, Summary};
 use crate::generation::file_names;
+use crate::motion::rates::MotionRange;
 use crate::onnx::{Runtime, Storage};
 use crate::store::tables::OnnxCheckRow;
 use crate::store::{Commit, Item, Ledger, Location, Row as _, StoreError, TimestampUs, digest};
+use crate::training::{Dataset, Split};
+
+/// Most training phrases that are read: enough to know how fast they move, and a bound on memory.
+const MAX_TRAIN_PHRASES: usize = 4000;
 
 /// The stage.
 pub struct Export;
@@ -77,7 +82,11 @@ impl Stage for Export {
         check_model_name(&params.model)?;
         let store = Location::open(&params.store, &params.client.options())?;
         let trained = Trained::read(&store, &params.run, params.weights)?;
-        let files = Files::make(&trained, &params)?;
+        let machine = &params.machine;
+        let watch = Looker(progress);
+        let most = Some(MAX_TRAIN_PHRASES);
+        let phrases = read_phrases(&store, Self::NAME, machine, most, progress, &watch)?;
+        let files = Files::make(&trained, &params, motion_range(&phrases.dataset)?)?;
         if params.dry_run {
             return Ok(Box::new(Planned::new(&params, &files, &store)));
         }
@@ -94,8 +103,12 @@ impl Stage for Export {
         }
         // Before anything is computed: without the library there is nothing to check with.
         let runtime = Runtime::load(params.ort_lib.as_deref())?;
-        let checking =
-            Checking { store: &store, params: &params, trained: &trained, files: &files };
+        let checking = Checking {
+            dataset: &phrases.dataset,
+            params: &params,
+            trained: &trained,
+            files: &files,
+        };
         let held = checking.run(&runtime, progress)?;
         record(&store, &params, &files, &held)?;
         if let Some(failed) = held.rows.iter().find(|row| !row.passed) {
@@ -113,6 +126,14 @@ impl Stage for Export {
         publish(&store, &params.model, &files)?;
         Ok(Box::new(Report::written(&params, &store, &files, held)))
     }
+}
+
+/// Returns how fast the motion is that was trained on; none where it never moves.
+fn motion_range(dataset: &Dataset) -> Result<Option<MotionRange>, StoreError> {
+    let train = dataset.phrases().iter().filter(|phrase| phrase.split == Split::Train);
+    let motions: Vec<_> =
+        train.map(|phrase| dataset.motion(phrase, 0, phrase.n_frames)).collect::<Result<_, _>>()?;
+    Ok(MotionRange::fit(motions.iter().map(|frames| frames.view())).filter(MotionRange::is_sound))
 }
 
 fn check_model_name(model: &str) -> anyhow::Result<()> {

@@ -29,6 +29,7 @@ pub use params::{Params, SamplerName, Tracks};
 
 pub(in crate::stages) use files::listen;
 pub(in crate::stages) use maker::generation_id;
+pub(in crate::stages) use tracks::{beats_in_bars, beats_of, url_of};
 
 /// Motions and failures that the summary spells out.
 const N_SHOWN: usize = 10;

@@ -11,6 +11,7 @@ use super::outputs::Format;
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
 use crate::generation::{ModelCard, OVERLAP_FRAMES};
 use crate::motion::postprocess::{Coherence, Hemisphere, PostProcessConfig, SavitzkyGolay};
+use crate::motion::rates::MotionRange;
 use crate::motion::style::STYLE_DIM;
 use crate::motion::{Channel, ChannelLimits};
 use crate::stages::ClientParams;
@@ -19,7 +20,7 @@ use crate::stages::motion_source::read_motion;
 use crate::store::{Shard, digest};
 
 /// Raised when generate writes something else for the same model, music and settings.
-const OUTPUT_VERSION: u32 = 1;
+const OUTPUT_VERSION: u32 = 2;
 
 /// The samplers by the names of the flag.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
@@ -146,6 +147,9 @@ pub struct PostProcessParams {
     /// How far each channel may go.
     #[arg(long, value_enum, default_value_t = ChannelLimits::Wide, help_heading = "Post-processing")]
     pub limits: ChannelLimits,
+    /// Let motion be faster than nearly all that the model was trained on (99.9 % of its frames).
+    #[arg(long, help_heading = "Post-processing")]
+    pub any_speed: bool,
     /// Signs of quaternions: continuous in time, or w ≥ 0 in every frame as in the reference.
     #[arg(long, value_enum, default_value_t = Hemisphere::Sequential, help_heading = "Post-processing")]
     pub hemisphere: Hemisphere,
@@ -173,11 +177,11 @@ pub struct PostProcessParams {
 }
 
 impl PostProcessParams {
-    /// Returns the configuration.
+    /// Returns the configuration, for a model whose motion is as fast as `range`.
     ///
     /// # Errors
     /// A window that is even or an order that is too high, in a sentence.
-    pub fn config(&self) -> anyhow::Result<PostProcessConfig> {
+    pub fn config(&self, range: Option<MotionRange>) -> anyhow::Result<PostProcessConfig> {
         let mut config = PostProcessConfig {
             limits: self.limits,
             hemisphere: self.hemisphere,
@@ -192,6 +196,7 @@ impl PostProcessParams {
                 [window, order] => Some(SavitzkyGolay { window, order }),
                 _ => bail!("--savitzky-golay takes two numbers: WINDOW,ORDER, such as 7,3"),
             },
+            range: range.filter(|range| range.is_sound() && !self.any_speed),
             ..PostProcessConfig::default()
         };
         if let Some(window) = self.smooth_quaternions {
@@ -266,7 +271,7 @@ impl Settings {
             best_of: params.best_of.get(),
             style: style(&params.style, card)?,
             overlap_frames: params.overlap,
-            postprocess: params.postprocess.config()?,
+            postprocess: params.postprocess.config(card.motion_range)?,
             constraints,
             constraint_strength: strength,
             soft: params.soft,

@@ -209,7 +209,8 @@ fn make_batch(
     Ok(outcomes.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner))
 }
 
-fn url_of(row: &PhraseRow) -> &str {
+/// Returns the file that a phrase dances to.
+pub(in crate::stages) fn url_of(row: &PhraseRow) -> &str {
     row.audio_url.as_deref().or(row.features_url.as_deref()).unwrap_or(&row.source)
 }
 
@@ -224,7 +225,7 @@ fn without_features(row: &PhraseRow, store: &Location) -> Failure {
 }
 
 /// Returns the beats of some phrases, in order.
-fn beats_of(
+pub(in crate::stages) fn beats_of(
     store: &Location,
     wanted: &BTreeSet<String>,
 ) -> Result<HashMap<String, Vec<f64>>, StoreError> {
@@ -241,7 +242,7 @@ fn beats_of(
 }
 
 /// Counts beats in bars; `None` for too few beats to tell a tempo.
-fn beats_in_bars(times_s: &[f64], row: &PhraseRow) -> Option<Beats> {
+pub(in crate::stages) fn beats_in_bars(times_s: &[f64], row: &PhraseRow) -> Option<Beats> {
     let beats_per_bar = row.beats_per_bar.and_then(|n| u32::try_from(n).ok());
     Beats::new(times_s.to_vec(), None, beats_per_bar).ok()
 }

@@ -292,6 +292,7 @@ impl Job<'_> {
             sample_rate_hz: phrase.audio.as_ref().map(|a| a.sample_rate_hz as i32),
             n_channels: phrase.audio.as_ref().map(|a| i32::from(a.n_channels)),
             duration_s,
+            start_s: None,
             n_frames: phrase.motion.as_ref().map(|m| m.n_frames() as i64),
             n_feature_frames: phrase.n_feature_frames.map(|n| n as i64),
             split: split_of(&planned.id).to_owned(),

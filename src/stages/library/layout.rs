@@ -50,7 +50,7 @@ impl Output {
     /// # Errors
     /// What the file system says.
     pub fn write(&self, song: &Song, music: &Music, phrase: &Constructed) -> io::Result<()> {
-        let Constructed { id, motion, features, beats, later_beats } = phrase;
+        let Constructed { id, motion, features, beats, later_beats, .. } = phrase;
         let values: Vec<f32> = motion.iter().copied().collect();
         let trajectory = npy::write(&[motion.nrows(), motion.ncols()], &values);
         write_file(&self.folder.join(format!("motion/{id}/trajectory.npy")), |out| {

@@ -36,6 +36,8 @@ pub struct Music {
 /// A phrase as it goes into the tables.
 pub struct Constructed {
     pub id: String,
+    /// Where in the song it begins.
+    pub first_frame: usize,
     /// [n, 25].
     pub motion: Array2<f32>,
     /// [n, 163].
@@ -209,6 +211,7 @@ pub fn dance<E: From<Failure>>(
             let (beats, later_beats) = beats_of(&grid, first, length);
             visit(Constructed {
                 id: phrase_id(song, rules, take, index),
+                first_frame: first,
                 motion: choreography::phrase(danced.frames.view(), first, length),
                 features: music.features.slice(s![first..first + length, ..]).to_owned(),
                 beats,

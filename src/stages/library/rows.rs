@@ -30,6 +30,7 @@ pub fn phrase_row(song: &Song, music: &Music, phrase: &Constructed) -> PhraseRow
         sample_rate_hz: None,
         n_channels: None,
         duration_s: frames_to_s(n_frames),
+        start_s: Some(frames_to_s(phrase.first_frame)),
         n_frames: Some(n_frames as i64),
         n_feature_frames: Some(n_frames as i64),
         split: song.split.to_owned(),

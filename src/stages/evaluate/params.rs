@@ -1,0 +1,99 @@
+//! What the user asks of evaluate.
+
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+
+use anyhow::ensure;
+
+use crate::motion::ChannelLimits;
+use crate::stages::ClientParams;
+use crate::store::digest;
+
+/// Raised when evaluate writes something else for the same motions and settings.
+const OUTPUT_VERSION: u32 = 1;
+
+/// What the user asks for.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Params {
+    /// Folder or bucket of the tables.
+    #[arg(long, value_name = "URL")]
+    pub store: String,
+    /// The run of generate whose motions are evaluated.
+    #[arg(long, value_name = "NAME")]
+    pub run: String,
+    /// Sanity checks only: no ground truth is read and no metrics are written.
+    #[arg(long)]
+    pub quick: bool,
+    /// Most motions that are looked at, the same ones every time [default: all]
+    #[arg(long, value_name = "N")]
+    pub num_samples: Option<NonZeroUsize>,
+    /// Frames of each motion that are looked at, from its first [default: all]
+    #[arg(long, value_name = "N")]
+    pub num_frames: Option<NonZeroUsize>,
+    /// How far each channel may go.
+    #[arg(long, value_enum, default_value_t = ChannelLimits::Wide)]
+    pub limits: ChannelLimits,
+    /// Threads that measure motions [default: all cores]
+    #[arg(long, value_name = "N", default_value_t =
+          std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN))]
+    pub threads: NonZeroUsize,
+    /// The page, FILE.html; written whole or not at all.
+    #[arg(long, value_name = "FILE", help_heading = "Report")]
+    pub report: Option<PathBuf>,
+    /// Another run that was evaluated, to compare with.
+    #[arg(long, value_name = "RUN", help_heading = "Report")]
+    pub against: Option<String>,
+    /// Motions that fail the most, which the report shows.
+    #[arg(long, value_name = "N", default_value_t = 3, help_heading = "Report")]
+    pub worst: usize,
+    /// Exit code 1 when fewer than this share of the motions pass the reference's checks, 0 to 1.
+    #[arg(long, value_name = "X", help_heading = "Exit code")]
+    pub min_pass_rate: Option<f64>,
+    /// Exit code 1 when fewer than this share of the motions pass the strict checks, 0 to 1.
+    #[arg(long, value_name = "X", help_heading = "Exit code")]
+    pub min_strict_pass_rate: Option<f64>,
+    #[command(flatten)]
+    pub client: ClientParams,
+    /// Evaluate again what is evaluated.
+    #[arg(long)]
+    pub force: bool,
+}
+
+impl Params {
+    /// Refuses values that mean nothing.
+    ///
+    /// # Errors
+    /// One sentence with the flag.
+    pub fn check(&self) -> anyhow::Result<()> {
+        let shares = [
+            ("--min-pass-rate", self.min_pass_rate),
+            ("--min-strict-pass-rate", self.min_strict_pass_rate),
+        ];
+        for (flag, share) in shares {
+            if let Some(share) = share {
+                ensure!(
+                    (0.0..=1.0).contains(&share),
+                    "{flag} {share} is no share; give a number from 0 to 1"
+                );
+            }
+        }
+        if let Some(report) = &self.report {
+            let is_page = report.extension().is_some_and(|e| e.eq_ignore_ascii_case("html"));
+            ensure!(
+                is_page,
+                "--report {} is not named like a page; name it .html",
+                report.display()
+            );
+        }
+        Ok(())
+    }
+
+    /// Returns the digest of everything but the motions that determines the numbers.
+    pub fn digest(&self) -> String {
+        let text = format!(
+            "{OUTPUT_VERSION}\n{:?}\n{:?}\n{:?}",
+            self.num_samples, self.num_frames, self.limits
+        );
+        digest(text.as_bytes())
+    }
+}
