@@ -1,6 +1,6 @@
 # The demo: real music and real motion capture (tests/data) become tables, the music's features are
 # extracted, phrases to train on are constructed from both, small networks are trained on them and
-# fine-tuned, they become ONNX files, motion is made for all songs, and queries answer.
+# fine-tuned, they become ONNX files, motion is made for all songs and evaluated, and queries answer.
 #
 #   make demo                              builds first
 #   make -f pipelines/demo.mk BIN=…        with executables that are there already
@@ -29,7 +29,9 @@ demo:
 	@echo "plot     $(PLOT)"
 	@echo "model    $(STORE)/models/$(MODEL)"
 	@echo "motion   $(PAGE) (open it in a browser)"
-	@echo "ask on   $(MOTIONGEN) query --store $(STORE) \"select …\""
+	@echo "report   $(REPORT) (open it in a browser)"
+	@echo "numbers  $(MOTIONGEN) query --store $(STORE) \"select model, subject, metric, variant, value, ci_low, \
+	ci_high from metrics where split = 'held_out' and metric like 'locking%'\""
 
 # ingest: both sources into one store.
 $(foreach s,$(SOURCES),$(call watch,$(s),$(DATA)/$(s),$(STORE)))
@@ -47,7 +49,7 @@ LIBRARY := $(STAMPS)/library.done
 $(LIBRARY): $(EXTRACTED) $(CONFIG) $(MOTIONGEN)
 	$(call stage,$(MOTIONGEN) library --config $(CONFIG) --store $(STORE))
 
-# train, finetune: a network that is small enough to learn in a minute.
+# train, finetune: a network that is small enough to learn in minutes.
 TRAINED := $(STAMPS)/train-$(RUN).done
 $(TRAINED): $(LIBRARY) $(CONFIG) $(MOTIONGEN)
 	$(call stage,$(MOTIONGEN) train --config $(CONFIG) --store $(STORE) --run $(RUN))
@@ -71,6 +73,11 @@ PAGE := $(OUT)/motion/$(basename $(notdir $(SONG))).html
 $(PAGE): $(EXPORTED) $(CONFIG) $(MOTIONGEN)
 	$(MOTIONGEN) generate --config $(CONFIG) --model $(STORE)/models/$(MODEL) --audio $(SONG) \
 	  --output $(OUT)/motion --format npy,glb,png,html --force
+
+# evaluate: checks, metrics and baselines of what was danced.
+REPORT := $(OUT)/report.html
+$(REPORT): $(GENERATED) $(CONFIG) $(MOTIONGEN)
+	$(MOTIONGEN) evaluate --config $(CONFIG) --store $(STORE) --run $(MODEL) --report $@
 
 # query: what the tables tell.
 define SPLITS
@@ -113,7 +120,12 @@ endef
 define GENERATIONS
 select g.phrase_id, round(g.n_frames / 30.0, 1) as seconds, g.n_windows as windows, round(g.score, 3) as score,
 g.checks_passed, g.n_checks, round(g.locking, 3) as bar_locking, round(g.real_time_factor, 3) as real_time_factor
-from generations g where g.selected order by g.phrase_id limit 8
+from generations g where g.selected and g.sample = 0 order by g.phrase_id limit 8
+endef
+define METRICS
+select subject, metric, variant, round(value, 4) as value, round(ci_low, 4) as ci_low,
+round(ci_high, 4) as ci_high, n from metrics where split = 'held_out' and
+(metric = 'pass_rate' or (metric like 'locking%' and variant = 'per_song')) order by metric, variant, subject
 endef
 # Lines become spaces on the way to the shell.
 define newline
@@ -124,7 +136,7 @@ comma := ,
 ask = @{ echo; echo '$(1)'; $(MOTIONGEN) query --config $(CONFIG) --store $(STORE) \
 	'$(subst $(newline), ,$($(2)))'; } | tee --append $@.new
 
-$(ANSWERS): $(INGESTED) $(EXTRACTED) $(LIBRARY) $(FINETUNED) $(EXPORTED) $(PLOT) $(GENERATED) $(PAGE)
+$(ANSWERS): $(INGESTED) $(EXTRACTED) $(LIBRARY) $(FINETUNED) $(EXPORTED) $(PLOT) $(GENERATED) $(PAGE) $(REPORT)
 	@rm -f $@.new
 	@{ echo; echo 'What is there?'; $(MOTIONGEN) query --store $(STORE) --tables; } | tee $@.new
 	$(call ask,How much is in each split?,SPLITS)
@@ -135,4 +147,5 @@ $(ANSWERS): $(INGESTED) $(EXTRACTED) $(LIBRARY) $(FINETUNED) $(EXPORTED) $(PLOT)
 	$(call ask,What did training bring?,TRAINING)
 	$(call ask,Does onnxruntime answer what was trained?,CHECKS)
 	$(call ask,What was danced$(comma) and how well?,GENERATIONS)
+	$(call ask,Does it follow music that it did not learn from?,METRICS)
 	@mv $@.new $@

@@ -15,6 +15,7 @@ mod motion_source;
 pub mod plot;
 #[cfg(feature = "query")]
 pub mod query;
+mod retrieval;
 pub mod train;
 mod trained;
 pub mod view;

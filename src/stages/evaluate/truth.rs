@@ -8,12 +8,10 @@ use crate::evaluation::baseline::mean_motion;
 use crate::evaluation::reference_statistics::ReferenceStatistics;
 use crate::generation::Retrieval;
 use crate::stages::Progress;
-use crate::store::{Location, Patience, StoreError};
-use crate::training::{Dataset, DatasetError, Reading, Split};
+use crate::stages::retrieval::{index_of, read_dataset};
+use crate::store::{Location, StoreError};
+use crate::training::{DatasetError, Split};
 
-/// Most training phrases that are read, the same ones every time: enough for every number, and a bound on
-/// memory.
-const MAX_TRAIN_PHRASES: usize = 4000;
 /// Frames of the windows for which the library is asked for its nearest phrase.
 pub const RETRIEVAL_FRAMES: usize = 120;
 /// Where the statistics of the ground truth are kept in a store.
@@ -47,14 +45,8 @@ pub fn read(
     threads: NonZeroUsize,
     progress: &dyn Progress,
 ) -> anyhow::Result<Option<Truth>> {
-    let reading = Reading {
-        in_memory: false,
-        n_threads: threads,
-        patience: Patience::default(),
-        max_train_phrases: Some(MAX_TRAIN_PHRASES),
-    };
-    let dataset = match Dataset::read(store, &reading, &|_, _| {}, &|_, _| {}) {
-        Ok((dataset, _)) => dataset,
+    let dataset = match read_dataset(store, threads) {
+        Ok(dataset) => dataset,
         Err(DatasetError::Empty { .. }) => {
             progress.note(
                 "the store has no phrases with motion and features, so that there is no ground truth to \
@@ -65,16 +57,11 @@ pub fn read(
         Err(e) => return Err(e.into()),
     };
     let mut phrases = Vec::with_capacity(dataset.phrases().len());
-    let (mut features, mut of_phrase) = (Vec::new(), Vec::new());
     for phrase in dataset.phrases() {
         let motion = dataset.motion(phrase, 0, phrase.n_frames)?;
-        if phrase.split == Split::Train && phrase.n_frames >= RETRIEVAL_FRAMES {
-            features.push(dataset.features(phrase, 0, RETRIEVAL_FRAMES)?);
-            of_phrase.push(phrases.len());
-        }
         phrases.push(TruthPhrase { id: phrase.id.to_string(), split: phrase.split, motion });
     }
-    let index = Retrieval::new(RETRIEVAL_FRAMES, features.iter().map(|frames| frames.view()));
+    let retrieval = index_of(&dataset, RETRIEVAL_FRAMES)?;
     let train = || phrases.iter().filter(|phrase| phrase.split == Split::Train);
     let mean = mean_motion(train().map(|phrase| phrase.motion.view()), RETRIEVAL_FRAMES);
     let statistics = statistics(store, data_hash, &phrases)?;
@@ -85,7 +72,6 @@ pub fn read(
         );
         return Ok(None);
     };
-    let retrieval = index.map(|index| (index, of_phrase));
     Ok(Some(Truth { phrases, statistics, retrieval, mean_motion }))
 }
 

@@ -12,6 +12,7 @@ use crate::generation::{
 use crate::motion::postprocess::process;
 use crate::motion::{Beats, Channel, MOTION_DIM, bar_phase};
 use crate::stages::failure::{Failure, FailureKind, guarded};
+use crate::stages::retrieval::{Primer, Priming};
 use crate::store::tables::GenerationRow;
 use crate::store::{TimestampUs, digest};
 use crate::units::frames_to_s;
@@ -45,6 +46,8 @@ pub struct Maker<'a> {
     pub weights: &'a str,
     pub run: &'a str,
     pub settings: &'a Settings,
+    /// The library that sampling begins from.
+    pub primer: Option<&'a Primer>,
 }
 
 /// Returns the name of a motion in tables.
@@ -86,6 +89,7 @@ impl Maker<'_> {
             let times_s: Vec<f64> = (0..n_frames).map(frames_to_s).collect();
             bar_phase(&times_s, beats)
         });
+        let priming = self.priming(music)?;
         let mut best: Option<(f64, usize, Array2<f32>)> = None;
         let mut rows = Vec::with_capacity(self.settings.best_of);
         for candidate in 0..self.settings.best_of {
@@ -94,7 +98,8 @@ impl Maker<'_> {
             let mut unseen = |_: ArrayView2<f32>| Ok(());
             let watcher: &mut dyn FnMut(ArrayView2<f32>) -> std::io::Result<()> =
                 if candidate == 0 { &mut *watch } else { &mut unseen };
-            let decoded = self.sample(music, seed, constraints.as_ref(), watcher)?;
+            let decoded =
+                self.sample(music, seed, constraints.as_ref(), priming.as_ref(), watcher)?;
             let velocity_error =
                 derivative_error(decoded.view(), Channel::Position, Channel::Velocity);
             let mut frames = decoded;
@@ -122,6 +127,7 @@ impl Maker<'_> {
                 sample,
                 candidate,
                 seed,
+                primed_by: priming.as_ref().map(|priming| priming.names.join(",")),
                 score: &score,
                 velocity_error,
                 control: [
@@ -151,12 +157,24 @@ impl Maker<'_> {
         }
     }
 
+    /// Returns the library's motion for a track, where sampling begins from it.
+    fn priming(&self, music: &Music) -> Result<Option<Priming>, Failure> {
+        let Some(primer) = self.primer else { return Ok(None) };
+        let windows = self.generator.windows(music.features.nrows());
+        primer.motion_for(music.features, &windows).map(Some).ok_or_else(|| {
+            let message = "a feature is not finite, so that no phrase of the library is nearest; extract \
+                           it again";
+            Failure::new(FailureKind::NonFinite, music.source, message)
+        })
+    }
+
     /// Samples and decodes a whole track, bent to its constraints.
     fn sample(
         &self,
         music: &Music,
         seed: u64,
         constraints: Option<&Constraints>,
+        priming: Option<&Priming>,
         watch: &mut dyn FnMut(ArrayView2<f32>) -> std::io::Result<()>,
     ) -> Result<Array2<f32>, Failure> {
         let strength = self.settings.constraint_strength;
@@ -170,7 +188,10 @@ impl Maker<'_> {
                 strength,
                 is_exact,
             }),
-            primed: None::<Primed>,
+            primed: priming.zip(self.settings.prime.as_ref()).map(|(priming, prime)| Primed {
+                motion: priming.motion.view(),
+                n_left: prime.n_left,
+            }),
         };
         let mut parts: Vec<Array2<f32>> = Vec::new();
         self.generator
@@ -214,7 +235,7 @@ impl Maker<'_> {
             n_steps: settings.sampler.n_steps as i32,
             guidance: settings.guidance,
             eta: settings.eta(),
-            primed_by: None,
+            primed_by: found.primed_by.clone(),
             n_frames: n_frames as i64,
             n_windows: n_windows as i32,
             score: found.score.total,
@@ -236,6 +257,7 @@ struct Found<'a> {
     sample: usize,
     candidate: usize,
     seed: u64,
+    primed_by: Option<String>,
     score: &'a Score,
     velocity_error: f64,
     /// Largest misses: mm, degrees.

@@ -17,6 +17,7 @@ use anyhow::bail;
 
 use super::failure::Failure;
 use super::model_files::{OpenModel, sha256};
+use super::retrieval::Primer;
 use super::{Contract, Progress, Stage, Summary};
 use crate::diffusion::Schedule;
 use crate::generation::{Engine, Generator, ModelCard, Sampling, file_names};
@@ -53,7 +54,20 @@ impl Stage for Generate {
             None => None,
         };
         let model = open_model(&params, store.as_ref())?;
-        let settings = Settings::new(&params, &model.card)?;
+        let mut settings = Settings::new(&params, &model.card)?;
+        let primer = match (params.prime, &store) {
+            (None, _) => None,
+            (Some(_), None) => bail!(
+                "--prime begins from the motion of a library, and there is none without --store; name the \
+                 store of one, or leave --prime out"
+            ),
+            (Some(strength), Some(store)) => {
+                let threads = params.engine.threads;
+                let primer = Primer::read(store, model.card.window_frames, threads)?;
+                settings.begin_from(strength, &primer.fingerprint, &model.card)?;
+                Some(primer)
+            }
+        };
         let run = params.run.clone().unwrap_or_else(|| model.card.name.clone());
         super::train::session::check_run_name(&run)?;
         // A single track is fastest with all threads in one worker; many keep a worker each busy.
@@ -83,6 +97,7 @@ impl Stage for Generate {
             weights: &weights,
             run: &run,
             settings: &settings,
+            primer: primer.as_ref(),
         };
         let n_samples = params.samples.get();
         let (place, done) = match (&params.output, &store) {

@@ -112,6 +112,10 @@ pub struct Params {
     #[arg(long, value_name = "S0,…,S7", value_delimiter = ',', num_args = 1.., allow_hyphen_values = true,
           help_heading = "Sampling")]
     pub style: Vec<f32>,
+    /// Begin from the motion of the library's phrases whose music is nearest, made noisy, instead of from noise
+    /// alone: the share of it that is kept, 0 to 1; needs --store with a library.
+    #[arg(long, value_name = "X", help_heading = "Sampling")]
+    pub prime: Option<f64>,
     /// Frames that neighbouring windows of a long track share.
     #[arg(long, value_name = "N", default_value_t = OVERLAP_FRAMES, help_heading = "Sampling")]
     pub overlap: usize,
@@ -213,6 +217,15 @@ impl PostProcessParams {
     }
 }
 
+/// How sampling begins from the library's motion.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Prime {
+    /// Steps of the diffusion that are left to sample, out of all that were trained.
+    pub n_left: usize,
+    /// Digest of the library.
+    pub library: String,
+}
+
 /// What determines a motion beside the model and the music.
 #[derive(Clone, Debug)]
 pub struct Settings {
@@ -222,6 +235,7 @@ pub struct Settings {
     pub best_of: usize,
     pub style: Option<[f32; STYLE_DIM]>,
     pub overlap_frames: usize,
+    pub prime: Option<Prime>,
     pub postprocess: PostProcessConfig,
     pub constraints: Option<Asked>,
     pub constraint_strength: f64,
@@ -271,11 +285,39 @@ impl Settings {
             best_of: params.best_of.get(),
             style: style(&params.style, card)?,
             overlap_frames: params.overlap,
+            prime: None,
             postprocess: params.postprocess.config(card.motion_range)?,
             constraints,
             constraint_strength: strength,
             soft: params.soft,
         })
+    }
+
+    /// Lets sampling begin from a library's motion, of which the share `strength` is kept.
+    ///
+    /// # Errors
+    /// A strength that is no share, or one that leaves fewer steps than the sampler takes.
+    pub fn begin_from(
+        &mut self,
+        strength: f64,
+        library: &str,
+        card: &ModelCard,
+    ) -> anyhow::Result<()> {
+        ensure!(
+            (0.0..=1.0).contains(&strength),
+            "--prime {strength} is no share; give a number from 0 to 1"
+        );
+        let n_all = Schedule::new(&card.diffusion)?.len();
+        let n_left = ((1.0 - strength) * n_all as f64).round() as usize;
+        let n_steps = self.sampler.n_steps;
+        ensure!(
+            n_left >= n_steps,
+            "--prime {strength} leaves {n_left} of {n_all} steps, fewer than the {n_steps} of the sampler; \
+             give up to {:.3}, or fewer --steps",
+            1.0 - n_steps as f64 / n_all as f64
+        );
+        self.prime = Some(Prime { n_left, library: library.to_owned() });
+        Ok(())
     }
 
     /// Returns η, for a sampler that has one.
@@ -299,6 +341,8 @@ impl Settings {
             best_of: usize,
             style: Option<[f32; STYLE_DIM]>,
             overlap_frames: usize,
+            #[serde(skip_serializing_if = "Option::is_none")]
+            prime: Option<&'a Prime>,
             postprocess: &'a PostProcessConfig,
             constraints: Option<String>,
             constraint_strength: f64,
@@ -313,6 +357,7 @@ impl Settings {
             best_of: self.best_of,
             style: self.style,
             overlap_frames: self.overlap_frames,
+            prime: self.prime.as_ref(),
             postprocess: &self.postprocess,
             constraints: self.constraints.as_ref().map(|asked| format!("{asked:?}")),
             constraint_strength: self.constraint_strength,
