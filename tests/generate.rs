@@ -366,8 +366,17 @@ fn sampling_can_begin_from_the_librarys_nearest_phrases() {
     let model = store.join("models/m").display().to_string();
     let song = dir.write("song.wav", crate::support::files::wav(2.0)).display().to_string();
     let out = dir.at("out").display().to_string();
-    let alone =
-        run(["generate", "--model", &model, "--audio", &song, "--output", &out, "--prime=0.5"]);
+    let alone = run([
+        "generate",
+        "--model",
+        &model,
+        "--audio",
+        &song,
+        "--output",
+        &out,
+        "--prime=0.5",
+        "--overlap=7",
+    ]);
     assert_eq!(
         (alone.code, alone.stderr.as_str()),
         (

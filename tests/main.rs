@@ -23,6 +23,7 @@ mod query_tables;
 mod rooms;
 mod schemas;
 mod servers;
+mod shell;
 mod store_suite;
 mod support;
 mod train;

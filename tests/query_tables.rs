@@ -193,12 +193,15 @@ fn tables_counts_rows_bytes_and_parts_of_what_is_live() {
             String::from("table                    rows          bytes   parts  version\n");
         let of_extract = ["features", "extractions", "beats"].map(|name| (name, 0));
         let [phrases, motion, failures] = tables;
-        let of_models = ["training_log", "onnx_checks", "generations", "generated"];
+        let of_models =
+            ["training_log", "onnx_checks", "generations", "generated", "sanity_checks", "metrics"];
         let rest = [failures].into_iter().chain(of_models.map(|name| (name, 0)));
         for (name, n_rows) in [phrases, motion].into_iter().chain(of_extract).chain(rest) {
             let live = live_files(&store, name);
             let n_bytes: u64 = live.iter().sum();
-            text += &format!("{name:<16} {n_rows:>12} {n_bytes:>14} {:>7}        1\n", live.len());
+            let version = if name == "phrases" { 2 } else { 1 };
+            let n_parts = live.len();
+            text += &format!("{name:<16} {n_rows:>12} {n_bytes:>14} {n_parts:>7} {version:>8}\n");
         }
         text
     };
@@ -313,7 +316,7 @@ fn an_empty_store_has_every_table_without_rows() {
     assert_eq!((output.code, output.stdout.as_str()), (0, "[]\n"), "{}", output.stderr);
     let expected = "\
 table                    rows          bytes   parts  version
-phrases                     0              0       0        1
+phrases                     0              0       0        2
 motion                      0              0       0        1
 features                    0              0       0        1
 extractions                 0              0       0        1
@@ -323,6 +326,8 @@ training_log                0              0       0        1
 onnx_checks                 0              0       0        1
 generations                 0              0       0        1
 generated                   0              0       0        1
+sanity_checks               0              0       0        1
+metrics                     0              0       0        1
 ";
     let output = ask(&store, &["--tables"]);
     assert_eq!((output.code, output.stdout.as_str()), (0, expected), "{}", output.stderr);
@@ -374,7 +379,7 @@ fn an_unknown_table_comes_with_the_nearest_and_all_others() {
         let start = format!("table \"{table}\" not found; nearest: {nearest}");
         assert!(sentence.starts_with(&start), "{sentence}");
         let all = "; a store has phrases, motion, features, extractions, beats, failures, \
-                   training_log, onnx_checks, generations, generated";
+                   training_log, onnx_checks, generations, generated, sanity_checks, metrics";
         assert!(sentence.ends_with(all), "{sentence}");
     }
 }
@@ -481,7 +486,8 @@ fn a_store_in_memory_is_asked_inside_the_process() {
     let infos = table_infos(&store, &options).expect("a store");
     let counts: Vec<_> = infos.iter().map(|i| (i.name, i.n_rows, i.n_parts)).collect();
     let empty = ["phrases", "motion", "features", "extractions", "beats"].map(|name| (name, 0, 0));
-    let of_models = ["training_log", "onnx_checks", "generations", "generated"];
+    let of_models =
+        ["training_log", "onnx_checks", "generations", "generated", "sanity_checks", "metrics"];
     let of_models = of_models.map(|name| (name, 0, 0));
     assert_eq!(counts, [&empty[..], &[("failures", 3, 2)], &of_models].concat());
 }

@@ -15,7 +15,7 @@ const MAY_USE: [(&str, &[&str]); 17] = [
     ("motion", &["units"]),
     ("onnx", &["audio", "model", "motion"]),
     ("plot", &["motion", "units"]),
-    ("report", &["view"]),
+    ("report", &[]),
     ("store", &["audio", "motion", "units"]),
     (
         "training",

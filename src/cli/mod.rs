@@ -8,6 +8,7 @@ mod exit;
 mod interrupt;
 mod log;
 mod progress;
+mod shell;
 
 use std::ffi::OsString;
 use std::io::Write as _;
@@ -86,6 +87,9 @@ pub fn front_door() -> ExitCode {
     for entry in &entries {
         command = command.subcommand((entry.command)());
     }
+    let stages: Vec<&'static str> = entries.iter().map(|entry| entry.name).collect();
+    command = command.after_help(shell::HINT).subcommands(shell::commands(&stages));
+    let program = command.clone();
     let arguments: Vec<OsString> = std::env::args_os().collect();
     if arguments.len() < 2 {
         return exit::report(list_stages(&entries));
@@ -94,6 +98,9 @@ pub fn front_door() -> ExitCode {
         Ok(matches) => matches,
         Err(code) => return code,
     };
+    if let Some(told) = matches.subcommand().and_then(|chosen| shell::run(chosen, program)) {
+        return exit::report(told);
+    }
     let chosen = matches.subcommand().and_then(|(name, matches)| {
         entries.iter().find(|entry| entry.name == name).map(|entry| (entry, matches))
     });
@@ -186,7 +193,7 @@ fn list_stages(entries: &[Entry]) -> anyhow::Result<Box<dyn Summary>> {
             for (name, about) in &self.0 {
                 writeln!(out, "  {name:<10} {about}")?;
             }
-            writeln!(out, "\nmotiongen STAGE --help tells the rest.")
+            writeln!(out, "\nmotiongen STAGE --help tells the rest. {}.", shell::HINT)
         }
         fn n_failed(&self) -> u64 {
             0

@@ -1,95 +1,210 @@
-//! Small pictures beside the numbers.
+//! Dots with intervals: the numbers of all subjects on one scale.
 
-use std::fmt::Write as _;
+use super::Metric;
+use super::html::{Escaped, put};
+use super::names::{self, GROUND_TRUTH, HELD_OUT_TRUTH, OWN};
+use super::numbers::{interval, number};
+use super::rows::Row;
 
-use super::grid::GridRow;
-use super::numbers::{number, words};
-use super::{Metric, OWN};
-use crate::view::escaped;
+/// Sizes in CSS pixels.
+const WIDTH_PX: f64 = 190.0;
+const LANE_PX: f64 = 6.0;
+const FOOT_PX: f64 = 13.0;
+/// Room on either side, so that dots at the ends are whole.
+const SIDE_PX: f64 = 5.0;
+const DOT_PX: f64 = 2.4;
+const OWN_DOT_PX: f64 = 3.4;
 
-const WIDTH_PX: f64 = 180.0;
-const ROW_PX: f64 = 9.0;
-const EDGE_PX: f64 = 6.0;
+/// Values of which the largest is so many times the smallest are on a scale of logarithms; beyond that the
+/// smallest is a zero that was rounded.
+const LOG_RATIOS: std::ops::Range<f64> = 30.0..1e9;
+/// Fewer values than this are no comparison.
+const MIN_VALUES: usize = 2;
 
-/// Returns a row's numbers as dots on one scale, each with its interval; empty for fewer than two numbers.
-pub fn intervals(row: &GridRow) -> String {
-    let cells: Vec<&Metric> =
-        row.cells.iter().flatten().copied().filter(|m| m.value.is_some()).collect();
-    if cells.len() < 2 {
-        return String::new();
-    }
-    let ends = |m: &Metric| [m.value, m.ci_low, m.ci_high];
-    let known = || cells.iter().flat_map(|m| ends(m)).flatten().filter(|x| x.is_finite());
-    let (low, high) =
-        (known().fold(f64::INFINITY, f64::min), known().fold(f64::NEG_INFINITY, f64::max));
-    let span = if high > low { high - low } else { 1.0 };
-    let x = |value: f64| EDGE_PX + (WIDTH_PX - 2.0 * EDGE_PX) * (value - low) / span;
-    let height = ROW_PX * cells.len() as f64 + 2.0;
-    let mut out = format!(
-        "<svg class=\"dots\" viewBox=\"0 0 {WIDTH_PX} {height}\" width=\"{WIDTH_PX}\" height=\"{height}\" \
-         role=\"img\"><title>{} from {} to {}</title>",
-        escaped(&words(row.metric)),
-        number(low),
-        number(high)
-    );
-    for (i, m) in cells.iter().enumerate() {
-        let y = 1.0 + ROW_PX * (i as f64 + 0.5);
-        let class = if m.subject == OWN { "own" } else { "other" };
-        if let (Some(a), Some(b)) = (m.ci_low, m.ci_high) {
-            let (a, b) = (x(a), x(b));
-            let _ = write!(
-                out,
-                "<line class=\"{class}\" x1=\"{a:.1}\" x2=\"{b:.1}\" y1=\"{y}\" y2=\"{y}\"/>"
-            );
-        }
-        let at = x(m.value.unwrap_or(low));
-        let _ = write!(
-            out,
-            "<circle class=\"{class}\" cx=\"{at:.1}\" cy=\"{y}\" r=\"3\"><title>{}: {}</title></circle>",
-            escaped(&words(&m.subject)),
-            number(m.value.unwrap_or(f64::NAN))
-        );
-    }
-    out.push_str("</svg>");
-    out
+/// From the least to the greatest number of a row, across the chart.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Scale {
+    low: f64,
+    high: f64,
+    is_log: bool,
 }
 
-/// Returns the distances of channels as bars, those of generated motion over those of held-out real motion.
-pub fn channels(own: &[&Metric], real: &[&Metric]) -> String {
-    const LABEL_PX: f64 = 150.0;
-    const BAR_PX: f64 = 320.0;
-    const VALUE_PX: f64 = 60.0;
-    const LINE_PX: f64 = 16.0;
-    let sizes = own.iter().chain(real).filter_map(|m| m.value);
-    let most = sizes.fold(0.0, f64::max).max(f64::MIN_POSITIVE);
-    let width = LABEL_PX + BAR_PX + VALUE_PX;
-    let height = LINE_PX * own.len() as f64 + 4.0;
-    let mut out = format!(
-        "<svg class=\"bars\" viewBox=\"0 0 {width} {height}\" role=\"img\"><title>Distance of each channel \
-         from the ground truth</title>"
-    );
-    for (i, m) in own.iter().enumerate() {
-        let top = 2.0 + LINE_PX * i as f64;
-        let base = top + 0.7 * LINE_PX;
-        let name = escaped(&words(&m.variant));
-        let edge = LABEL_PX - 6.0;
-        let _ = write!(out, "<text x=\"{edge}\" y=\"{base:.1}\" text-anchor=\"end\">{name}</text>");
-        let held_out = real.iter().find(|r| r.variant == m.variant).and_then(|r| r.value);
-        for (value, class, offset) in [(m.value, "own", 2.0), (held_out, "real", 8.0)] {
-            let Some(value) = value else { continue };
-            let y = top + offset;
-            let long = BAR_PX * value / most;
-            let _ = write!(
-                out,
-                "<rect class=\"{class}\" x=\"{LABEL_PX}\" y=\"{y:.1}\" width=\"{long:.1}\" height=\"5\">\
-                 <title>{name}: {}</title></rect>",
-                number(value)
-            );
+impl Scale {
+    /// Takes in values and ends of intervals; on a scale of logarithms the values alone count, since ends
+    /// may not be above 0.
+    ///
+    /// None where all are the same.
+    fn of(metrics: &[&Metric]) -> Option<Self> {
+        let values = || metrics.iter().filter_map(|metric| metric.finite());
+        let (low, high) = extent(values());
+        if low > 0.0 && LOG_RATIOS.contains(&(high / low)) {
+            return Some(Self { low, high, is_log: true });
         }
-        let x = LABEL_PX + 4.0 + BAR_PX * m.value.unwrap_or(0.0) / most;
-        let text = m.value.map_or_else(|| "constant".to_owned(), number);
-        let _ = write!(out, "<text x=\"{x:.1}\" y=\"{base:.1}\">{text}</text>");
+        let ends = metrics.iter().filter_map(|m| m.interval()).flat_map(|(low, high)| [low, high]);
+        let (low, high) = extent(values().chain(ends));
+        (high > low).then_some(Self { low, high, is_log: false })
     }
-    out.push_str("</svg>");
-    out
+
+    /// Returns the x of a number; of one beyond the ends that of the end.
+    fn x(&self, value: f64) -> f64 {
+        let place = |x: f64| if self.is_log { x.max(f64::MIN_POSITIVE).ln() } else { x };
+        let (low, high) = (place(self.low), place(self.high));
+        // Halves, since the difference of two numbers may be beyond the greatest.
+        let share = (place(value) / 2.0 - low / 2.0) / (high / 2.0 - low / 2.0);
+        SIDE_PX + share.clamp(0.0, 1.0) * (WIDTH_PX - 2.0 * SIDE_PX)
+    }
+}
+
+fn extent(values: impl Iterator<Item = f64>) -> (f64, f64) {
+    values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), x| (low.min(x), high.max(x)))
+}
+
+/// Returns the class in which a subject has its colour.
+pub(super) fn color_class(subject: &str) -> String {
+    match names::SUBJECTS.get(names::order(subject)) {
+        Some((name, _)) => format!("of-{}", name.replace('_', "-")),
+        None => "of-others".to_owned(),
+    }
+}
+
+/// Returns a number with its interval and what was counted, as a sentence has it.
+pub(super) fn told(metric: &Metric) -> String {
+    let subject = names::words(&metric.subject);
+    match (metric.finite(), metric.interval()) {
+        (Some(value), Some((low, high))) => {
+            format!("{subject}: {} {}", number(value), interval(low, high))
+        }
+        (Some(value), None) => format!("{subject}: {}", number(value)),
+        (None, _) => format!("{subject}: too few (n = {})", metric.n),
+    }
+}
+
+/// Writes the chart of a row as SVG; nothing where fewer than two subjects have a number, or all the same.
+pub(super) fn dots(out: &mut String, row: &Row) {
+    let metrics: Vec<&Metric> =
+        row.cells.iter().flatten().copied().filter(|m| m.finite().is_some()).collect();
+    if metrics.len() < MIN_VALUES {
+        return;
+    }
+    let Some(scale) = Scale::of(&metrics) else { return };
+    let lanes_px = metrics.len() as f64 * LANE_PX;
+    let height = lanes_px + FOOT_PX;
+    let name = [row.metric, row.variant].map(names::words).join(" ");
+    put!(
+        out,
+        "<svg class=\"dots\" width=\"{WIDTH_PX}\" height=\"{height}\" viewBox=\"0 0 {WIDTH_PX} {height}\" \
+         role=\"img\"><title>{}: {}</title>",
+        Escaped(name.trim_end()),
+        Escaped(&metrics.iter().map(|metric| told(metric)).collect::<Vec<_>>().join("; "))
+    );
+    put!(out, "<path class=\"axis\" d=\"M{SIDE_PX} {lanes_px}H{:.1}\"/>", WIDTH_PX - SIDE_PX);
+    if !scale.is_log && scale.low < 0.0 && scale.high > 0.0 {
+        put!(out, "<path class=\"zero\" d=\"M{:.1} 0V{lanes_px}\"/>", scale.x(0.0));
+    }
+    if let Some(truth) = truth(row) {
+        put!(out, "<path class=\"truth\" d=\"M{:.1} 0V{lanes_px}\"/>", scale.x(truth));
+    }
+    for (lane, metric) in metrics.iter().enumerate() {
+        mark(out, metric, scale, lane as f64 * LANE_PX);
+    }
+    let baseline = height - 2.0;
+    put!(out, "<text x=\"{SIDE_PX}\" y=\"{baseline}\">{}</text>", number(scale.low));
+    if scale.is_log {
+        put!(out, "<text x=\"{}\" y=\"{baseline}\" class=\"middle\">log</text>", WIDTH_PX / 2.0);
+    }
+    put!(
+        out,
+        "<text x=\"{}\" y=\"{baseline}\" class=\"end\">{}</text></svg>",
+        WIDTH_PX - SIDE_PX,
+        number(scale.high)
+    );
+}
+
+/// Returns the number of real motion, preferably of music that was not learnt from.
+fn truth(row: &Row) -> Option<f64> {
+    [HELD_OUT_TRUTH, GROUND_TRUTH].into_iter().find_map(|subject| row.of(subject)?.finite())
+}
+
+fn mark(out: &mut String, metric: &Metric, scale: Scale, top: f64) {
+    let Some(value) = metric.finite() else { return };
+    let middle = top + LANE_PX / 2.0;
+    put!(
+        out,
+        "<g class=\"{}\"><title>{}</title><rect y=\"{top}\" width=\"{WIDTH_PX}\" height=\"{LANE_PX}\" \
+         class=\"lane\"/>",
+        color_class(&metric.subject),
+        Escaped(&told(metric))
+    );
+    if let Some((low, high)) = metric.interval() {
+        put!(out, "<path d=\"M{:.1} {middle}H{:.1}\"/>", scale.x(low), scale.x(high));
+    }
+    let radius = if metric.subject == OWN { OWN_DOT_PX } else { DOT_PX };
+    put!(out, "<circle cx=\"{:.1}\" cy=\"{middle}\" r=\"{radius}\"/></g>", scale.x(value));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::example::{metric, with_interval};
+    use super::*;
+
+    fn chart(metrics: &[Metric]) -> String {
+        let cells = metrics.iter().map(Some).collect();
+        let row = Row { metric: "fid_k", variant: "axes", split: "all", unit: "", cells };
+        let mut out = String::new();
+        dots(&mut out, &row);
+        out
+    }
+
+    #[test]
+    fn all_subjects_are_on_one_scale() {
+        let own = with_interval(metric("generated", "all", "fid_k", "axes", Some(3.0)), 2.0, 4.0);
+        let truth = metric("held_out_truth", "all", "fid_k", "axes", Some(1.0));
+        let told = chart(&[own, truth]);
+        // 180 px for 1 to 4.
+        assert!(
+            told.contains("<path d=\"M65.0 3H185.0\"/><circle cx=\"125.0\" cy=\"3\" r=\"3.4\"/>")
+        );
+        assert!(told.contains("<circle cx=\"5.0\" cy=\"9\" r=\"2.4\"/>"));
+        assert!(
+            told.contains("<g class=\"of-held-out-truth\"><title>held out truth: 1.00</title>")
+        );
+        assert!(told.contains(
+            "<title>fid k axes: generated: 3.00 [2.0, 4.0]; held out truth: 1.00</title>"
+        ));
+        assert!(told.contains("<path class=\"truth\" d=\"M5.0 0V12\"/>"));
+        assert!(told.contains(">1.00</text>") && told.contains(">4.00</text>"));
+        assert!(!told.contains("log") && !told.contains("class=\"zero\""));
+    }
+
+    #[test]
+    fn values_far_apart_are_on_a_scale_of_logarithms() {
+        let values = [1.0, 10.0, 100.0];
+        let metrics = values.map(|x| metric("guest", "all", "fid_k", "axes", Some(x)));
+        let told = chart(&metrics);
+        for (x, y) in [("5.0", 3), ("95.0", 9), ("185.0", 15)] {
+            assert!(told.contains(&format!("<circle cx=\"{x}\" cy=\"{y}\"")), "{told}");
+        }
+        assert!(told.contains(">log</text>"));
+        // An end below 0 has no logarithm.
+        let wide = metrics.map(|m| with_interval(m, -1.0, 20.0));
+        assert!(chart(&wide).contains("<path d=\"M5.0 9H122.1\"/>"), "{}", chart(&wide));
+    }
+
+    #[test]
+    fn one_number_is_no_comparison_nor_are_equal_ones() {
+        let of = |x: Option<f64>| metric("generated", "all", "fid_k", "axes", x);
+        assert_eq!(chart(&[of(Some(1.0)), of(None), of(Some(f64::NAN))]), "");
+        assert_eq!(chart(&[of(Some(0.0)), of(Some(0.0))]), "");
+        let told = chart(&[of(Some(7.0)), with_interval(of(Some(7.0)), 6.0, 8.0)]);
+        assert_eq!(told.matches("<circle cx=\"95.0\"").count(), 2, "{told}");
+        assert!(chart(&[of(Some(-1.0)), of(Some(1.0))]).contains("class=\"zero\" d=\"M95.0 "));
+        // A rounded zero is no reason for fourteen decades.
+        assert!(!chart(&[of(Some(1e-14)), of(Some(1.0))]).contains("log"));
+    }
+
+    #[test]
+    fn what_is_too_little_is_told_so() {
+        let metric = Metric { n: 12, ..metric("mean_motion", "all", "fid_k", "axes", None) };
+        assert_eq!(told(&metric), "mean motion: too few (n = 12)");
+    }
 }

@@ -1,135 +1,225 @@
-//! What the metrics mean: the one place that knows.
+//! What the metrics mean, and under which heading they stand: the one place that knows.
 
-/// Which way a number is better.
+use super::Better;
+use Better::{Higher, Lower, Neither};
+use Section::{Asked, Music, Other, Real, Sound, Varied};
+
+/// A question that numbers answer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Better {
-    Higher,
-    Lower,
-    /// Best as near as can be to what real motion has.
-    AsReal,
+pub(super) enum Section {
+    Music,
+    Real,
+    Varied,
+    Sound,
+    Asked,
+    Other,
 }
 
-/// Headings of the report, in order.
-pub const SECTIONS: [&str; 6] = [
-    "Does it follow the music?",
-    "Is it like real motion?",
-    "Is it varied?",
-    "Is it sound?",
-    "Does it do what was asked?",
-    "Other numbers",
-];
+impl Section {
+    /// Every section, in the order in which they are shown.
+    pub const ALL: [Self; 6] = [Music, Real, Varied, Sound, Asked, Other];
+
+    pub const fn heading(self) -> &'static str {
+        match self {
+            Music => "Does it follow the music?",
+            Real => "Is it like real motion?",
+            Varied => "Is it varied?",
+            Sound => "Is it sound?",
+            Asked => "Does it do what was asked?",
+            Other => "Other",
+        }
+    }
+
+    /// Returns the name of the section in links.
+    pub const fn id(self) -> &'static str {
+        match self {
+            Music => "music",
+            Real => "real",
+            Varied => "varied",
+            Sound => "sound",
+            Asked => "asked",
+            Other => "other",
+        }
+    }
+}
 
 /// What a metric means.
-#[derive(Clone, Copy, Debug)]
-pub struct Meaning {
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Meaning {
     pub metric: &'static str,
-    /// Place of its heading in [`SECTIONS`].
-    pub section: usize,
+    pub section: Section,
     pub better: Better,
+    /// What is measured.
     pub text: &'static str,
+    /// What chance gives, or what is perfect.
+    pub ideal: &'static str,
 }
 
-const fn of(metric: &'static str, section: usize, better: Better, text: &'static str) -> Meaning {
-    Meaning { metric, section, better, text }
-}
-
-use Better::{AsReal, Higher, Lower};
-
-/// Every metric, in the order in which they are shown.
+/// Every metric that is known, in the order in which they are shown.
+#[rustfmt::skip]
 const MEANINGS: [Meaning; 29] = [
-    of(
-        "locking_r2",
-        0,
-        Higher,
-        "Share of the vertical velocity that repeats with the bar, 0 to 1.",
-    ),
-    of(
-        "locking_wrong_r2",
-        0,
-        AsReal,
-        "The same at tempi that the music does not have: what chance gives.",
-    ),
-    of(
-        "locking_effect",
-        0,
-        Higher,
-        "How far the share is above that, in standard deviations over wrong tempi.",
-    ),
-    of("locking_p", 0, Lower, "How often a wrong tempo does as well; below 0.01 is no chance."),
-    of(
-        "beat_alignment",
-        0,
-        AsReal,
-        "Beat score of the field, 0 to 1; says nothing without what chance gives.",
-    ),
-    of("beat_alignment_chance", 0, AsReal, "The same score of the motion shifted in time."),
-    of(
-        "beat_alignment_lift",
-        0,
-        Higher,
-        "How much of what chance leaves open is reached; 0 is chance.",
-    ),
-    of("beat_alignment_z", 0, Higher, "Score above chance in standard deviations over shifts."),
-    of(
-        "phase_error",
-        0,
-        Lower,
-        "Distance of the motion's bar phase from the music's; 1/4 is chance.",
-    ),
-    of("phase_coherence", 0, Higher, "1 where both phases run at one tempo."),
-    of("rayleigh", 0, Higher, "1 where the slowest moments keep one place between the beats."),
-    of("fid_k", 1, Lower, "Fréchet distance of speeds and accelerations from the ground truth's."),
-    of(
-        "fid_g",
-        1,
-        Lower,
-        "Fréchet distance of sixteen geometric features from the ground truth's.",
-    ),
-    of(
-        "channel_distance",
-        1,
-        Lower,
-        "Wasserstein distance of a channel's values, in deviations of the ground truth.",
-    ),
-    of("mean_speed", 1, AsReal, "Mean speed of the body."),
-    of(
-        "log_dimensionless_jerk",
-        1,
-        AsReal,
-        "Smoothness, whatever the size and speed; higher is smoother.",
-    ),
-    of("jerk_mean", 1, AsReal, "Mean rate of change of acceleration."),
-    of("jerk_p95", 1, AsReal, "95th percentile of the same."),
-    of("diversity", 2, AsReal, "Mean distance of the features of two motions."),
-    of("mean_distance", 2, AsReal, "Mean distance of all pairs of features (Dist)."),
-    of("multimodality", 2, AsReal, "Mean distance of two motions for the same music."),
-    of("pass_rate", 3, Higher, "Share of motions that pass every check of a set."),
-    of("velocity_error", 3, Lower, "How far velocity is from the change of position."),
-    of("acceleration_error", 3, Lower, "How far acceleration is from the change of velocity."),
-    of("turn_error", 3, Lower, "How far angular velocity is from the change of orientation."),
-    of("norm_error", 3, Lower, "How far quaternions are from length 1."),
-    of("share_over_limits", 3, Lower, "Share of frames beyond the limits of their channels."),
-    of("control_position", 4, Lower, "Distance from constraints on the position."),
-    of("control_orientation", 4, Lower, "Angle from constraints on the orientation."),
+    of("locking_r2", Music, Higher,
+        "Share of the vertical velocity that repeats with the bar (R²).",
+        "1 is perfect; chance is not 0 but locking_wrong_r2."),
+    of("locking_wrong_r2", Music, Neither,
+        "The same at tempi that the music does not have.",
+        "What chance gives for locking_r2."),
+    of("locking_effect", Music, Higher,
+        "locking_r2 less its mean at wrong tempi, in standard deviations over these.",
+        "0 by chance."),
+    of("locking_p", Music, Lower,
+        "Share of the wrong tempi that do as well as the music’s own.",
+        "About 0.5 by chance; below 0.01 is no chance."),
+    of("beat_alignment", Music, Neither,
+        "How near beats of motion and of music are, from 0 to 1, for a width in seconds.",
+        "Says little alone: chance is beat_alignment_chance."),
+    of("beat_alignment_chance", Music, Neither,
+        "The same score of the motion shifted in time.",
+        "What chance gives for beat_alignment."),
+    of("beat_alignment_lift", Music, Higher,
+        "Share of what chance leaves open that is reached: (score − chance) / (1 − chance).",
+        "0 by chance, 1 is perfect."),
+    of("beat_alignment_z", Music, Higher,
+        "Score above chance, in standard deviations over shifts.",
+        "0 by chance."),
+    of("phase_error", Music, Lower,
+        "Distance of the bar phase that the motion says from the music’s, in bars.",
+        "1/4 by chance, 0 is perfect."),
+    of("phase_coherence", Music, Higher,
+        "Whether both phases run at one tempo, whatever lies between them.",
+        "Near 0 by chance, 1 is perfect."),
+    of("rayleigh", Music, Higher,
+        "Whether beats of motion keep one place between the beats of music, whichever.",
+        "√(π / 4n) by chance with n beats, 1 is perfect."),
+    of("fid_k", Real, Lower,
+        "Fréchet distance of speeds and accelerations from the ground truth’s.",
+        "As low as the held-out truth’s is perfect."),
+    of("fid_g", Real, Lower,
+        "Fréchet distance of sixteen geometric features from the ground truth’s.",
+        "As low as the held-out truth’s is perfect."),
+    of("mean_speed", Real, Neither, "Mean speed of the body.", "Best near the truth’s."),
+    of("jerk_mean", Real, Neither,
+        "Mean rate of change of the acceleration.",
+        "Best near the truth’s; lower is stiller, higher is rougher."),
+    of("jerk_p95", Real, Neither, "95th percentile of the same.", "Best near the truth’s."),
+    of("log_dimensionless_jerk", Real, Neither,
+        "Smoothness, whatever size and speed; higher is smoother.",
+        "Best near the truth’s."),
+    of("channel_distance", Real, Lower,
+        "Wasserstein distance of a channel’s values from the ground truth’s, in its standard deviations.",
+        "As low as the held-out truth’s is perfect."),
+    of("diversity", Varied, Neither,
+        "Mean distance of the features of two motions.",
+        "Best near the truth’s."),
+    of("mean_distance", Varied, Neither,
+        "Mean distance of the features of all pairs of motions (Dist).",
+        "Best near the truth’s."),
+    of("multimodality", Varied, Neither,
+        "Mean distance of the features of two motions for the same music.",
+        "0 where music decides all; best near the truth’s where it has several."),
+    of("pass_rate", Sound, Higher,
+        "Share of the motions that pass every check of a set.",
+        "1 is perfect; real motion need not be."),
+    of("velocity_error", Sound, Lower,
+        "How far velocity is from the change of position.",
+        "0 is perfect."),
+    of("acceleration_error", Sound, Lower,
+        "How far acceleration is from the change of velocity.",
+        "0 is perfect."),
+    of("turn_error", Sound, Lower,
+        "How far angular velocity is from the change of orientation.",
+        "0 is perfect."),
+    of("norm_error", Sound, Lower, "How far quaternions are from length 1.", "0 is perfect."),
+    of("share_over_limits", Sound, Lower,
+        "Share of the frames with a channel beyond its limits.",
+        "0 is perfect."),
+    of("control_position", Asked, Lower,
+        "Distance from where the body was asked to be.",
+        "0 is perfect."),
+    of("control_orientation", Asked, Lower,
+        "Angle from how the body was asked to be turned.",
+        "0 is perfect."),
 ];
 
-/// Returns what a metric means; of an unknown one, nothing but its name.
-pub fn meaning_of(metric: &str) -> Meaning {
-    let known = MEANINGS.iter().find(|meaning| meaning.metric == metric).copied();
-    known.unwrap_or(of("", SECTIONS.len() - 1, AsReal, ""))
+const fn of(
+    metric: &'static str,
+    section: Section,
+    better: Better,
+    text: &'static str,
+    ideal: &'static str,
+) -> Meaning {
+    Meaning { metric, section, better, text, ideal }
 }
 
-/// Returns the place of a metric among all.
-pub fn order_of(metric: &str) -> usize {
+/// The metric of which there is a number for every channel.
+pub(super) const CHANNELS: &str = "channel_distance";
+
+/// Metrics about what was asked of a motion, which nothing else has, have names that begin so.
+const ASKED: &str = "control_";
+
+/// Returns what a metric means; of an unknown one, only its section.
+pub(super) fn meaning_of(metric: &str) -> Meaning {
+    let known = MEANINGS.iter().find(|meaning| meaning.metric == metric).copied();
+    let section = if is_asked(metric) { Asked } else { Other };
+    known.unwrap_or(of("", section, Neither, "", ""))
+}
+
+/// Returns the place of a metric among the known ones, and behind them for others.
+pub(super) fn order(metric: &str) -> usize {
     MEANINGS.iter().position(|meaning| meaning.metric == metric).unwrap_or(MEANINGS.len())
 }
 
-/// Returns whether the report can say what a metric means.
-pub fn knows(metric: &str) -> bool {
-    order_of(metric) < MEANINGS.len()
+/// Returns whether a metric is about what was asked, and so needs no baseline.
+pub(super) fn is_asked(metric: &str) -> bool {
+    metric.starts_with(ASKED)
 }
 
-/// Returns whether a variant repeats a published formula that has a defect.
-pub fn is_compat(variant: &str) -> bool {
+/// Returns whether a variant reproduces a published formula that has a defect.
+pub(super) fn is_compat(variant: &str) -> bool {
     variant.ends_with("_compat")
+}
+
+/// Returns which way a metric is better; neither for one that is not known.
+pub fn better(metric: &str) -> Better {
+    meaning_of(metric).better
+}
+
+/// Returns whether a report can say what a metric means.
+pub fn knows(metric: &str) -> bool {
+    order(metric) < MEANINGS.len()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_metric_stands_under_a_heading() {
+        let cases = [
+            ("locking_p", Music, Lower),
+            ("rayleigh", Music, Higher),
+            ("fid_k", Real, Lower),
+            ("diversity", Varied, Neither),
+            ("pass_rate", Sound, Higher),
+            ("control_position", Asked, Lower),
+            ("control_of_something_new", Asked, Neither),
+            ("something_new", Other, Neither),
+        ];
+        for (metric, section, way) in cases {
+            assert_eq!((meaning_of(metric).section, better(metric)), (section, way), "{metric}");
+        }
+        assert_eq!(["fid_g", "something_new"].map(knows), [true, false]);
+        assert_eq!(["axes_compat", "axes"].map(is_compat), [true, false]);
+    }
+
+    #[test]
+    fn metrics_of_a_section_stand_together_and_all_say_something() {
+        let mut order: Vec<&str> = MEANINGS.iter().map(|m| m.section.id()).collect();
+        order.dedup();
+        assert_eq!(order, ["music", "real", "varied", "sound", "asked"]);
+        for meaning in MEANINGS {
+            assert!(meaning.text.ends_with('.') && meaning.ideal.ends_with('.'), "{meaning:?}");
+            assert_eq!(MEANINGS.iter().filter(|m| m.metric == meaning.metric).count(), 1);
+        }
+    }
 }

@@ -1,34 +1,46 @@
-//! The report of an evaluation: what was measured, beside what it is compared with, as a page and as text.
+//! The report of an evaluation: what was measured, beside what it is compared with.
 //!
-//! Everything here is pure: numbers in, text out.
+//! A [`Report`] becomes one page of HTML that is complete in itself ([`page()`]), or text for a terminal
+//! ([`terminal()`]). Everything here is pure: numbers in, text out; the same report gives the same text.
+//! What the metrics mean, and under which heading they stand, is said in one place, `meaning`.
 
+mod against;
+mod channels;
 mod chart;
 mod comparison;
-mod grid;
+#[cfg(test)]
+mod example;
+mod html;
 mod meaning;
+mod names;
 mod numbers;
 mod page;
+mod rows;
+mod sanity;
+mod summary;
+mod tables;
 mod terminal;
-#[cfg(test)]
-mod tests;
 
-pub use meaning::knows;
+pub use meaning::{better, knows};
 pub use page::page;
 pub use terminal::terminal;
 
-/// Subjects in the order in which they are shown: what was generated, its controls, real motion. Others come
-/// after them.
-const SUBJECTS: [&str; 6] =
-    ["generated", "shuffled", "retrieval", "mean_motion", "held_out_truth", "ground_truth"];
-/// The subject that the report is about.
-const OWN: &str = SUBJECTS[0];
+/// Which way a number is better.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Better {
+    Higher,
+    Lower,
+    /// Neither: where the nearest to real motion is best, and where a number is there to read others by.
+    #[default]
+    Neither,
+}
 
-/// A number, as the table of metrics has it.
-#[derive(Clone, Debug, PartialEq)]
+/// One measured number, as the table `metrics` has it.
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Metric {
-    /// Whose number it is.
+    /// Whose number it is: `generated`, or what it is compared with, such as `held_out_truth`.
     pub subject: String,
-    /// Which music: `all` or `held_out`.
+    /// Which music: `all`, or `held_out`, which the model did not learn from.
     pub split: String,
     pub metric: String,
     /// Which of several ways to measure it; empty where there is one.
@@ -39,12 +51,30 @@ pub struct Metric {
     /// Ends of its 95 % interval.
     pub ci_low: Option<f64>,
     pub ci_high: Option<f64>,
+    /// What was counted.
     pub n: i64,
+    /// How it was measured.
     pub protocol: String,
+    /// What [`better`] says of the metric, or what is known of one that it does not know.
+    pub better: Better,
 }
 
-/// How many motions passed a sanity check.
-#[derive(Clone, Debug, PartialEq)]
+impl Metric {
+    /// Returns the value, if it is a number.
+    fn finite(&self) -> Option<f64> {
+        self.value.filter(|x| x.is_finite())
+    }
+
+    /// Returns the interval of a value that is a number, if both ends are numbers in order.
+    fn interval(&self) -> Option<(f64, f64)> {
+        self.finite()?;
+        let (low, high) = (self.ci_low?, self.ci_high?);
+        (low.is_finite() && high.is_finite() && low <= high).then_some((low, high))
+    }
+}
+
+/// How many motions passed one sanity check.
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct CheckLine {
     /// `reference` or `strict`; the two are never mixed.
     pub set: String,
@@ -52,24 +82,25 @@ pub struct CheckLine {
     pub threshold: f64,
     pub n: usize,
     pub n_passed: usize,
-    /// The answer that is worst, and its message.
+    /// The answer that is worst, in the unit of the threshold, and its message.
     pub worst_value: f64,
     pub worst_message: String,
 }
 
-/// A motion that is worth a look.
-#[derive(Clone, Debug, PartialEq)]
+/// A motion worth looking at.
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Worst {
     pub name: String,
+    /// Names and values, in the order in which they are listed.
     pub facts: Vec<(String, String)>,
     /// Messages of the checks that it failed.
     pub failed: Vec<String>,
-    /// A picture of it: a whole SVG, which is trusted.
+    /// A picture of it: a whole SVG file, as the plot of motion writes.
     pub svg: String,
 }
 
 /// Another run to compare with.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Against {
     pub run: String,
     pub metrics: Vec<Metric>,
@@ -77,29 +108,14 @@ pub struct Against {
     pub settings: Vec<(String, String, String)>,
 }
 
-/// What is told.
+/// What a report tells.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Report {
     pub title: String,
+    /// Names and values, in the order in which they are listed.
     pub facts: Vec<(String, String)>,
     pub checks: Vec<CheckLine>,
     pub metrics: Vec<Metric>,
     pub worst: Vec<Worst>,
     pub against: Option<Against>,
-}
-
-impl Report {
-    /// Returns a number of the report.
-    fn find(&self, subject: &str, split: &str, metric: &str, variant: &str) -> Option<&Metric> {
-        self.metrics.iter().find(|m| {
-            m.subject == subject && m.split == split && m.metric == metric && m.variant == variant
-        })
-    }
-
-    /// Returns which music the short account is of: that which the model did not learn from, where there is.
-    fn main_split(&self) -> &str {
-        let of_own = || self.metrics.iter().filter(|m| m.subject == OWN);
-        let held_out = of_own().find(|m| m.split == "held_out");
-        held_out.or_else(|| of_own().next()).map_or("all", |m| m.split.as_str())
-    }
 }

@@ -1,106 +1,296 @@
-//! The report as text, for a terminal.
+//! The report as text for a terminal.
 
 use std::fmt::Write as _;
 
-use super::comparison::{Verdict, pairs};
-use super::grid::subjects;
-use super::numbers::{number, value, words};
-use super::{CheckLine, Report};
+use super::comparison::{Pair, counts, pairs};
+use super::names::{ALL, music, words};
+use super::numbers::{difference, short, value};
+use super::rows::{Row, rows, subjects, telling_split};
+use super::sanity::{Passed, SETS, sets};
+use super::{Against, CheckLine, Report};
 
-/// Numbers that a terminal shows; the page has all of them.
-const KEY: [(&str, &str); 11] = [
-    ("pass_rate", "reference"),
-    ("pass_rate", "strict"),
-    ("locking_r2", "per_song"),
-    ("locking_wrong_r2", "per_song"),
-    ("locking_p", "per_song"),
-    ("beat_alignment_lift", "music_to_motion 0.1 s"),
-    ("fid_k", "axes"),
-    ("fid_g", ""),
-    ("diversity", "axes"),
-    ("mean_speed", ""),
-    ("jerk_mean", ""),
+/// No line has more characters.
+const MAX_COLUMNS: usize = 120;
+/// Space between two columns of a table.
+const GAP: &str = "  ";
+/// Names of rows have at least so much room, before the last subjects are left out.
+const MIN_NAME_COLUMNS: usize = 24;
+/// Most numbers of a comparison that are listed.
+const MAX_PAIRS: usize = 12;
+
+/// Numbers that a terminal shows, by metric and the variant that is preferred; the page has all.
+const KEY: [[&str; 2]; 10] = [
+    ["pass_rate", "reference"],
+    ["pass_rate", "strict"],
+    ["locking_r2", "per_song"],
+    ["locking_p", "per_song"],
+    ["beat_alignment_lift", "music_to_motion 0.1 s"],
+    ["fid_k", "axes"],
+    ["fid_g", ""],
+    ["diversity", "axes"],
+    ["velocity_error", ""],
+    ["jerk_mean", ""],
 ];
 
-/// Returns the report as text.
+/// Returns the report as plain text of at most 120 columns.
 pub fn terminal(report: &Report) -> String {
     let mut out = String::new();
-    for set in ["reference", "strict"] {
-        checks(&mut out, set, report);
-    }
+    sanity(&mut out, report);
     numbers(&mut out, report);
-    compared(&mut out, report);
-    out
+    if let Some(against) = &report.against {
+        compared(&mut out, report, against);
+    }
+    let lines = out.lines().map(|line| fitted(line.trim_end(), MAX_COLUMNS) + "\n");
+    lines.collect()
 }
 
-fn checks(out: &mut String, set: &str, report: &Report) {
-    let lines: Vec<&CheckLine> = report.checks.iter().filter(|line| line.set == set).collect();
-    if lines.is_empty() {
-        return;
-    }
-    let n_all = lines.iter().filter(|line| line.n_passed == line.n).count();
-    let _ = writeln!(out, "{set} checks: all motions pass {n_all} of {}", lines.len());
-    for line in lines.iter().filter(|line| line.n_passed < line.n) {
-        let CheckLine { check, n, n_passed, worst_message, .. } = line;
-        let _ = writeln!(out, "  {check}: {n_passed} of {n} pass; the worst: {worst_message}");
+fn sanity(out: &mut String, report: &Report) {
+    let [reference, strict] = SETS.map(|set| Passed::of(report, set).words());
+    put_line(out, format_args!("sanity: reference {reference}, strict {strict}"));
+    for set in sets(&report.checks) {
+        for line in report.checks.iter().filter(|line| line.set == set && line.n_passed < line.n) {
+            let CheckLine { check, n, n_passed, threshold, worst_value, worst_message, .. } = line;
+            let worst = match worst_message.as_str() {
+                "" => format!("{}, threshold {}", short(*worst_value), short(*threshold)),
+                message => message.to_owned(),
+            };
+            put_line(
+                out,
+                format_args!("  {set} {check}: {n_passed} of {n} passed; the worst: {worst}"),
+            );
+        }
     }
 }
 
-/// A table of the key numbers, a column for each subject.
+/// Writes the key numbers as a table for each split, a column for each subject.
 fn numbers(out: &mut String, report: &Report) {
-    if report.metrics.is_empty() {
-        return;
-    }
-    let split = report.main_split();
-    let columns = subjects(&report.metrics);
-    let mut rows: Vec<Vec<String>> = Vec::new();
-    rows.push(std::iter::once(words(split)).chain(columns.iter().map(|s| words(s))).collect());
-    for (metric, variant) in KEY {
-        let cells: Vec<_> =
-            columns.iter().map(|s| report.find(s, split, metric, variant)).collect();
-        let Some(first) = cells.iter().flatten().next() else { continue };
-        let mut name = words(metric);
-        for more in [variant, first.unit.as_str()].into_iter().filter(|more| !more.is_empty()) {
-            name = format!("{name}, {}", words(more));
+    let subjects = subjects(&report.metrics);
+    let rows = rows(&report.metrics, &subjects);
+    let key: Vec<&Row> = KEY.iter().filter_map(|name| key_row(report, &rows, *name)).collect();
+    let mut lines: Vec<Vec<String>> = Vec::new();
+    for (i, row) in key.iter().enumerate() {
+        if key[..i].iter().any(|before| before.split == row.split) {
+            continue;
         }
-        let cell = |m: &Option<&super::Metric>| m.map_or(String::new(), |m| value(m.value));
-        rows.push(std::iter::once(name).chain(cells.iter().map(cell)).collect());
+        lines.push(vec![String::new(); subjects.len() + 1]);
+        let names = subjects.iter().map(|subject| words(subject));
+        lines.push(std::iter::once(music(row.split)).chain(names).collect());
+        lines.extend(key.iter().filter(|other| other.split == row.split).map(|row| cells(row)));
     }
-    let width = |i: usize| rows.iter().map(|row| row[i].chars().count()).max().unwrap_or(0);
-    let widths: Vec<usize> = (0..=columns.len()).map(width).collect();
-    out.push('\n');
-    for row in &rows {
-        let mut line = format!("{:<1$}", row[0], widths[0]);
-        for (cell, width) in row[1..].iter().zip(&widths[1..]) {
-            let _ = write!(line, "  {cell:>width$}");
+    table(out, &lines);
+}
+
+fn cells(row: &Row) -> Vec<String> {
+    let mut name = format!("{} {}", row.metric, row.variant).trim_end().to_owned();
+    if !row.unit.is_empty() {
+        name = format!("{name}, {}", row.unit);
+    }
+    let values = row.cells.iter().map(|cell| value(cell.and_then(|metric| metric.value)));
+    std::iter::once(name).chain(values).collect()
+}
+
+/// Returns the row of a key number: of music that was not learnt from, where there is any, but pass rates
+/// of all motions, as the checks are; of the first variant there is where the preferred one is missing.
+fn key_row<'a>(
+    report: &Report,
+    rows: &'a [Row<'a>],
+    [metric, variant]: [&str; 2],
+) -> Option<&'a Row<'a>> {
+    let of = |variant: &str| {
+        let split = match metric {
+            "pass_rate" => ALL,
+            _ => telling_split(&report.metrics, [metric, variant]),
+        };
+        let is_it = |row: &&&Row| row.metric == metric && row.variant == variant;
+        let mut found = rows.iter().filter(|row| is_it(&row));
+        found.clone().find(|row| row.split == split).or_else(|| found.next())
+    };
+    let other = || rows.iter().find(|row| row.metric == metric && !row.is_compat());
+    of(variant).or_else(|| match metric {
+        // Sets of checks are not variants of one number.
+        "pass_rate" => None,
+        _ => of(other()?.variant),
+    })
+}
+
+/// Writes lines of cells, of which the first is a name.
+fn table(out: &mut String, lines: &[Vec<String>]) {
+    let n_cells = lines.iter().map(Vec::len).max().unwrap_or(0);
+    let width = |i: usize| lines.iter().map(|line| line[i].chars().count()).max().unwrap_or(0);
+    let mut widths: Vec<usize> = (0..n_cells).map(width).collect();
+    let Some(names) = widths.first().copied() else { return };
+    let of_values = |widths: &[usize]| widths[1..].iter().map(|n| n + GAP.len()).sum::<usize>();
+    while widths.len() > 2 && names.min(MIN_NAME_COLUMNS) + of_values(&widths) > MAX_COLUMNS {
+        widths.pop();
+    }
+    widths[0] = names.min(MAX_COLUMNS.saturating_sub(of_values(&widths)));
+    for line in lines {
+        let mut text = format!("{:<1$}", fitted(&line[0], widths[0]), widths[0]);
+        for (cell, width) in line.iter().zip(&widths).skip(1) {
+            let _ = write!(text, "{GAP}{cell:>width$}");
         }
-        let _ = writeln!(out, "{}", line.trim_end());
+        put_line(out, format_args!("{}", text.trim_end()));
+    }
+    let n_left_out = n_cells - widths.len();
+    if n_left_out > 0 {
+        put_line(out, format_args!("({n_left_out} more subjects are on the page)"));
     }
 }
 
-fn compared(out: &mut String, report: &Report) {
-    let Some(against) = &report.against else { return };
-    let _ = writeln!(out, "\nagainst run {}:", against.run);
-    for (name, there, here) in &against.settings {
-        let _ = writeln!(out, "  {name}: {there} there, {here} here");
-    }
+fn compared(out: &mut String, report: &Report, against: &Against) {
     let pairs = pairs(report, against);
-    let changed: Vec<_> = pairs
-        .iter()
-        .filter(|pair| matches!(pair.verdict, Verdict::Better | Verdict::Worse | Verdict::Differs))
-        .filter(|pair| pair.here.split == report.main_split())
-        .collect();
-    if changed.is_empty() {
-        out.push_str("  nothing differs beyond the intervals\n");
+    out.push('\n');
+    if pairs.is_empty() {
+        put_line(out, format_args!("compared with {}: no number in common", against.run));
+    } else {
+        put_line(out, format_args!("compared with {}, {}", against.run, counts(&pairs)));
     }
-    for pair in changed {
-        let name = [&pair.here.metric, &pair.here.variant].map(|text| words(text)).join(" ");
-        let [there, here] = [pair.there, pair.here].map(|m| value(m.value));
-        let (change, verdict) = (number(pair.difference), pair.verdict.text());
-        let _ = writeln!(
+    for (setting, there, here) in &against.settings {
+        put_line(out, format_args!("  {setting}: {there} there, {here} here"));
+    }
+    let notable: Vec<&Pair> = pairs.iter().filter(|pair| pair.is_notable()).collect();
+    for pair in notable.iter().take(MAX_PAIRS) {
+        let here = pair.here;
+        put_line(
             out,
-            "  {}: {there} there, {here} here ({change}), {verdict}",
-            name.trim_end()
+            format_args!(
+                "  {:<7}  {}, {}: {} there, {} here ({})",
+                pair.verdict.words(),
+                format!("{} {}", here.metric, here.variant).trim_end(),
+                music(&here.split),
+                value(pair.there.value),
+                value(here.value),
+                pair.difference.map_or_else(String::new, difference)
+            ),
         );
+    }
+    if notable.len() > MAX_PAIRS {
+        put_line(out, format_args!("  and {} more", notable.len() - MAX_PAIRS));
+    }
+}
+
+fn put_line(out: &mut String, text: std::fmt::Arguments<'_>) {
+    out.push_str(&inert(&text.to_string()));
+    out.push('\n');
+}
+
+/// Returns a text from outside with replacement characters for what would command a terminal.
+fn inert(text: &str) -> String {
+    let of = |c: char| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c };
+    text.chars().map(of).collect()
+}
+
+/// Returns a text of at most `n` characters, with `…` for what is cut off.
+fn fitted(text: &str, n: usize) -> String {
+    if text.chars().count() <= n {
+        return text.to_owned();
+    }
+    text.chars().take(n.saturating_sub(1)).chain(std::iter::once('…')).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Metric;
+    use super::super::example::{check, example, metric};
+    use super::*;
+
+    #[test]
+    fn a_report_is_a_few_lines() {
+        let wanted = "\
+sanity: reference 118 of 120 (98.3 %), strict at most 96 of 120 (80 %)
+  reference phase: 118 of 120 passed; the worst: 512, threshold 404
+  strict jerk: 96 of 120 passed; the worst: Mean jerk: 512
+  strict velocity: 119 of 120 passed; the worst: 512, threshold 404
+
+all music            generated  shuffled  mean motion  held out truth  ground truth
+pass_rate reference      0.983         –            –               –             –
+
+unseen music         generated  shuffled  mean motion  held out truth  ground truth
+locking_r2 per_song     0.0990   0.00900            –               –             –
+locking_p per_song     0.00500     0.710            –               –             –
+fid_k axes                2.50         –         31.2           0.800             –
+fid_g                     1.50         –            –               –             –
+diversity axes            3.00         –            –               –             –
+jerk_mean, m/s³           61.2         –            –               –             –
+
+compared with before, 2 numbers: 1 better, 1 without an interval
+  steps: 20 there, 50 here
+  better   fid_k axes, unseen music: 3.50 there, 2.50 here (-1.00)
+";
+        assert_eq!(terminal(&example()), wanted);
+    }
+
+    #[test]
+    fn an_empty_report_says_that_nothing_was_measured() {
+        let wanted = "sanity: reference not measured, strict not measured\n";
+        assert_eq!(terminal(&Report::default()), wanted);
+    }
+
+    #[test]
+    fn lines_are_no_longer_than_a_terminal() {
+        let long = "a word and ".repeat(30);
+        let mut report = Report {
+            checks: vec![CheckLine {
+                worst_message: long.clone(),
+                ..check("strict", "jerk", 2, 1)
+            }],
+            metrics: (0..20)
+                .map(|i| metric(&format!("visitor number {i}"), "all", "fid_k", "axes", Some(1.0)))
+                .collect(),
+            ..Report::default()
+        };
+        report.metrics.push(metric("generated", "all", "diversity", &long, Some(1.0)));
+        report.against = Some(Against {
+            run: long.clone(),
+            settings: vec![(long.clone(), long.clone(), long)],
+            ..Against::default()
+        });
+        let text = terminal(&report);
+        let lengths: Vec<usize> = text.lines().map(|line| line.chars().count()).collect();
+        assert_eq!(lengths.iter().max(), Some(&120), "{text}");
+        let head = format!("\nall music{:30}generated  visitor number 0", "");
+        assert!(text.contains(&head), "{text}");
+        assert!(text.contains("(16 more subjects are on the page)\n"), "{text}");
+        assert!(text.contains("\ndiversity a word and a word and a wo…       1.00"), "{text}");
+    }
+
+    #[test]
+    fn text_from_outside_commands_no_terminal() {
+        let hostile = "\u{1b}[2J\nnext";
+        let report = Report {
+            checks: vec![CheckLine {
+                worst_message: hostile.to_owned(),
+                ..check("strict", "jerk", 2, 1)
+            }],
+            metrics: vec![Metric {
+                unit: hostile.to_owned(),
+                ..metric(hostile, "all", "fid_k", hostile, Some(1.0))
+            }],
+            against: Some(Against { run: hostile.to_owned(), ..Against::default() }),
+            ..Report::default()
+        };
+        let text = terminal(&report);
+        assert!(!text.contains('\u{1b}') && !text.contains("\nnext"), "{text}");
+        assert_eq!(text.matches("\u{fffd}[2J\u{fffd}next").count(), 5, "{text}");
+    }
+
+    #[test]
+    fn another_variant_takes_the_place_of_one_that_is_missing() {
+        let report = Report {
+            metrics: vec![
+                metric("generated", "all", "fid_k", "axes_compat", Some(9.0)),
+                metric("generated", "all", "fid_k", "markers", Some(1.5)),
+                metric("generated", "held_out", "fid_k", "markers", None),
+                metric("generated", "all", "pass_rate", "house", Some(0.5)),
+            ],
+            ..Report::default()
+        };
+        let wanted = "\
+sanity: reference not measured, strict not measured
+
+unseen music   generated
+fid_k markers          –
+";
+        assert_eq!(terminal(&report), wanted);
     }
 }

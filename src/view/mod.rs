@@ -9,7 +9,7 @@ mod page;
 
 use ndarray::Array2;
 
-pub use page::{escaped, page};
+pub use page::page;
 
 /// What a page shows.
 #[derive(Clone, Debug, PartialEq)]

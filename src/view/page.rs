@@ -121,13 +121,6 @@ fn inert(json: &str) -> String {
 }
 
 /// Writes text between tags or in a quoted attribute; control characters become replacement characters.
-/// Returns text that is text in HTML too, whatever it says.
-pub fn escaped(text: &str) -> String {
-    let mut out = String::with_capacity(text.len());
-    write_escaped(&mut out, text);
-    out
-}
-
 fn write_escaped(out: &mut String, text: &str) {
     for c in text.chars() {
         match c {

@@ -119,7 +119,8 @@ fn the_front_door_alone_lists_the_stages() {
         env!("CARGO_PKG_VERSION")
     );
     assert!(output.stdout.starts_with(&start), "{}", output.stdout);
-    assert!(output.stdout.ends_with("\n\nmotiongen STAGE --help tells the rest.\n"));
+    assert!(output.stdout.ends_with("\n\nmotiongen STAGE --help tells the rest. For the shell: motiongen completions SHELL, motiongen man \
+             [STAGE].\n"));
 }
 
 #[test]

@@ -1,17 +1,15 @@
 //! The report of an evaluation, from its rows.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use crate::motion::Trajectory;
 use crate::plot::{self, Format, MOTION_WIDTH_PX, MotionPanel, MotionPlot};
-use crate::report::{Against, CheckLine, Metric, Report, Worst};
+use crate::report::{self, Against, CheckLine, Metric, Report, Worst};
 use crate::stages::motion_source::generated_frames;
 use crate::store::Location;
 use crate::store::tables::{GenerationRow, MetricRow, SanityCheckRow};
 use crate::training::TemporalConfig;
 use crate::units::frames_to_s;
-
-use super::subjects::{ALL, HELD_OUT, Subject};
 
 /// What a report tells of.
 pub struct Evaluated<'a> {
@@ -165,11 +163,11 @@ impl Badness {
     }
 }
 
-/// Returns the rows as a report shows them: the ground truth beside the numbers of every split.
+/// Returns the rows as a report takes them.
 fn shown(rows: &[MetricRow]) -> Vec<Metric> {
-    let of = |row: &MetricRow, split: &str| Metric {
+    let of = |row: &MetricRow| Metric {
         subject: row.subject.clone(),
-        split: split.to_owned(),
+        split: row.split.clone(),
         metric: row.metric.clone(),
         variant: row.variant.clone(),
         unit: row.unit.clone(),
@@ -178,19 +176,7 @@ fn shown(rows: &[MetricRow]) -> Vec<Metric> {
         ci_high: row.ci_high,
         n: row.n,
         protocol: row.protocol.clone(),
+        better: report::better(&row.metric),
     };
-    let splits: BTreeSet<&str> = rows
-        .iter()
-        .filter(|row| row.subject == Subject::Generated.name())
-        .map(|row| row.split.as_str())
-        .collect();
-    let is_truth = |row: &MetricRow| {
-        row.subject == Subject::GroundTruth.name() || row.subject == Subject::HeldOutTruth.name()
-    };
-    let mut metrics = Vec::new();
-    for split in [ALL, HELD_OUT].into_iter().filter(|split| splits.contains(split)) {
-        let of_split = rows.iter().filter(|row| row.split == split || is_truth(row));
-        metrics.extend(of_split.map(|row| of(row, split)));
-    }
-    metrics
+    rows.iter().map(of).collect()
 }
