@@ -16,7 +16,7 @@ const TRAINED: [&str; 4] =
     ["--steps=20", "--decoder-steps=15", "--warmup-steps=5", "--prediction=x0"];
 
 /// A store of 16 phrases of 19 to 67 frames, with a model of windows of 24.
-fn modelled(dir: &Dir) -> PathBuf {
+pub fn modelled(dir: &Dir) -> PathBuf {
     let store = make_store(dir);
     let output = train(&store, "run", &TRAINED);
     assert_eq!(output.code, 0, "{output:?}");

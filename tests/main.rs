@@ -13,6 +13,7 @@ mod ingest_local;
 mod ingest_remote;
 mod library;
 mod motion_capture;
+mod notebooks;
 mod npy_files;
 mod object_store_conformance;
 mod onnx;
