@@ -174,7 +174,10 @@ class Chart {
     for (const time of ticks(from, to, Math.max(2, Math.floor((width - LEFT - RIGHT) / 70)))) {
       pen.moveTo(x(time), TOP);
       pen.lineTo(x(time), height - FOOT);
-      pen.fillText(`${short(time)} s`, x(time), height - 4);
+      // A label at the right edge ends there instead of being cut.
+      const label = `${short(time)} s`;
+      const half = pen.measureText(label).width / 2;
+      pen.fillText(label, Math.min(x(time), width - half), height - 4);
     }
     pen.stroke();
   }
