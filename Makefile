@@ -108,6 +108,10 @@ bench-generation: build/bench-venv/ready setup ## measure generation, whole song
 	$(CARGO) build --locked --release --no-default-features --bin motiongen
 	build/bench-venv/bin/python benches/generation.py --bin $(TARGET)/release/motiongen $(BENCH_ARGS)
 
+.PHONY: bench-evaluation
+bench-evaluation: build/bench-venv/ready build ## measure evaluation of 10,000 motions, with the demo's model [BENCH_ARGS]
+	build/bench-venv/bin/python benches/evaluation.py --bin $(BIN)/motiongen $(BENCH_ARGS)
+
 .PHONY: bench-room
 bench-room: ## build the room autodiff alone, from nothing
 	$(PYTHON) benches/room.py

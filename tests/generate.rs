@@ -386,3 +386,33 @@ fn sampling_can_begin_from_the_librarys_nearest_phrases() {
         )
     );
 }
+
+#[test]
+fn features_of_another_version_fail_with_their_sentence_and_the_job_goes_on() {
+    let dir = Dir::new();
+    let store = modelled(&dir);
+    for entry in std::fs::read_dir(store.join("commits/extract")).expect("commits") {
+        let path = entry.expect("an entry").path();
+        let text = std::fs::read_to_string(&path).expect("a commit");
+        let mut commit: serde_json::Value = serde_json::from_str(&text).expect("JSON");
+        for part in commit["parts"].as_array_mut().expect("parts") {
+            if part["table"] == "features" {
+                part["schema_version"] = 7.into();
+            }
+        }
+        std::fs::write(&path, commit.to_string()).expect("written");
+    }
+    let output = finish(&mut command(&store, &[]));
+    assert_eq!(output.code, 1, "{output:?}");
+    let found = failures(&store);
+    assert_eq!(found.len(), 16);
+    for (id, row) in found {
+        let phrase = &id["m/".len()..id.len() - "/0".len()];
+        let start = format!(
+            "phrase {phrase}: has no features that this program reads: table features: file://"
+        );
+        let end = "has schema version 7, this program reads version 1; install a newer motiongen";
+        assert!(row.message.starts_with(&start) && row.message.ends_with(end), "{}", row.message);
+        assert_eq!(row.kind, "version");
+    }
+}

@@ -54,6 +54,8 @@ pub enum FailureKind {
     Truncated,
     Unreadable,
     Unwritable,
+    /// What is in the store was written by another version of the program.
+    Version,
 }
 
 impl FailureKind {
@@ -98,6 +100,7 @@ impl FailureKind {
             FailureKind::Truncated => "truncated",
             FailureKind::Unreadable => "unreadable",
             FailureKind::Unwritable => "unwritable",
+            FailureKind::Version => "version",
         }
     }
 }
@@ -147,7 +150,7 @@ pub fn guarded<T>(path: &str, work: impl FnOnce() -> Result<T, Failure>) -> Resu
 
 impl FailureKind {
     /// Every kind, for looking one up by the name that a reader gives.
-    const ALL: [FailureKind; 38] = [
+    const ALL: [FailureKind; 39] = [
         FailureKind::AudioCodec,
         FailureKind::AudioData,
         FailureKind::AudioHeader,
@@ -186,6 +189,7 @@ impl FailureKind {
         FailureKind::Truncated,
         FailureKind::Unreadable,
         FailureKind::Unwritable,
+        FailureKind::Version,
     ];
 
     /// Returns the kind that a reader names.

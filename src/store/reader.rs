@@ -52,6 +52,27 @@ impl Snapshot {
         Self::new(store, schema, parts, None)
     }
 
+    /// Takes a snapshot of the parts of a table that this program reads, and tells why it leaves out the first
+    /// of the others.
+    ///
+    /// # Errors
+    /// [`StoreError`] when the commits cannot be read.
+    pub fn take_known(
+        store: &Location,
+        schema: TableSchema,
+    ) -> Result<(Self, Option<StoreError>), StoreError> {
+        let mut parts = live_parts(store)?.remove(schema.name).unwrap_or_default();
+        let mut unknown = None;
+        parts.retain(|live| match check_version(store, &schema, live) {
+            Ok(()) => true,
+            Err(e) => {
+                unknown.get_or_insert(e);
+                false
+            }
+        });
+        Ok((Self::new(store, schema, parts, None)?, unknown))
+    }
+
     /// Returns the snapshot of some parts, or of one item's rows in them.
     pub(super) fn new(
         store: &Location,

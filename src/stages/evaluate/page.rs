@@ -180,3 +180,50 @@ fn shown(rows: &[MetricRow]) -> Vec<Metric> {
     };
     rows.iter().map(of).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn row(check: &str, value: Option<f64>, passed: bool) -> SanityCheckRow {
+        SanityCheckRow {
+            run: "r".to_owned(),
+            model: "m".to_owned(),
+            phrase_id: "p".to_owned(),
+            sample: 0,
+            check_set: "strict".to_owned(),
+            check_name: check.to_owned(),
+            value,
+            threshold: 1.0,
+            passed,
+            message: format!("{check} {value:?}"),
+        }
+    }
+
+    #[test]
+    fn the_worst_answer_is_the_farthest_failure_or_the_nearest_pass() {
+        let rows = [
+            row("a", Some(0.3), true),
+            row("b", Some(0.2), true),
+            row("a", Some(0.9), true),
+            row("b", Some(1.5), false),
+            row("a", Some(0.1), true),
+            row("b", Some(4.0), false),
+            row("b", Some(0.99), true),
+            row("c", Some(9.0), false),
+            row("c", None, false),
+        ];
+        let told: Vec<(String, usize, usize, String)> = lines(&rows)
+            .into_iter()
+            .map(|line| (line.check, line.n_passed, line.n, line.worst_message))
+            .collect();
+        let of = |check: &str, n_passed, n, message: &str| {
+            (check.to_owned(), n_passed, n, message.to_owned())
+        };
+        assert_eq!(
+            told,
+            [of("a", 3, 3, "a Some(0.9)"), of("b", 2, 4, "b Some(4.0)"), of("c", 0, 2, "c None"),]
+        );
+        assert!(lines(&rows)[2].worst_value.is_nan());
+    }
+}

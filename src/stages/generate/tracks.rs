@@ -166,10 +166,12 @@ fn make_batch(
 ) -> anyhow::Result<BTreeMap<String, Outcome>> {
     let wanted: BTreeSet<String> = tasks.iter().map(|task| task.row.phrase_id.clone()).collect();
     let mut music: HashMap<String, Array2<f32>> = HashMap::new();
-    Snapshot::take(target.store, tables::features())?.visit_items(&wanted, |id, frames| {
+    let (known, unknown) = Snapshot::take_known(target.store, tables::features())?;
+    known.visit_items(&wanted, |id, frames| {
         music.insert(id.to_owned(), frames);
         Ok::<_, StoreError>(())
     })?;
+    let unknown = unknown.map(|e| e.to_string());
     let beats = beats_of(target.store, &wanted)?;
     // The longest first, so that no worker is left with it at the end.
     let mut order: Vec<(&Task, usize)> = tasks
@@ -199,7 +201,7 @@ fn make_batch(
                     };
                     maker.make(&music, sample, &mut |_| Ok(()))
                 }
-                None => Err(without_features(&task.row, target.store)),
+                None => Err(without_features(&task.row, target.store, unknown.as_deref())),
             };
             progress.advance(frames_to_s(task.n_frames).round() as u64);
             lock(&outcomes).insert(generation_id(maker.run, id, sample), outcome);
@@ -214,8 +216,13 @@ pub(in crate::stages) fn url_of(row: &PhraseRow) -> &str {
     row.audio_url.as_deref().or(row.features_url.as_deref()).unwrap_or(&row.source)
 }
 
-fn without_features(row: &PhraseRow, store: &Location) -> Failure {
+/// Returns why a phrase has no features; `unknown` says why some were not read.
+fn without_features(row: &PhraseRow, store: &Location, unknown: Option<&str>) -> Failure {
     let id = &row.phrase_id;
+    if let Some(why) = unknown.filter(|_| row.has_audio || row.has_features) {
+        let message = format!("phrase {id}: has no features that this program reads: {why}");
+        return Failure::new(FailureKind::Version, url_of(row), message);
+    }
     let message = if row.has_audio || row.has_features {
         format!("phrase {id}: has no features; run motiongen extract --store {store} first")
     } else {
