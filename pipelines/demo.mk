@@ -122,10 +122,11 @@ select g.phrase_id, round(g.n_frames / 30.0, 1) as seconds, g.n_windows as windo
 g.checks_passed, g.n_checks, round(g.locking, 3) as bar_locking, round(g.real_time_factor, 3) as real_time_factor
 from generations g where g.selected and g.sample = 0 order by g.phrase_id limit 8
 endef
+# Quotes on the way to the shell, which has the query in quotes of its own.
 define METRICS
 select subject, metric, variant, round(value, 4) as value, round(ci_low, 4) as ci_low,
-round(ci_high, 4) as ci_high, n from metrics where split = 'held_out' and
-(metric = 'pass_rate' or (metric like 'locking%' and variant = 'per_song')) order by metric, variant, subject
+round(ci_high, 4) as ci_high, n from metrics where split = '\''held_out'\'' and
+(metric = '\''pass_rate'\'' or (metric like '\''locking%'\'' and variant = '\''per_song'\'')) order by metric, variant, subject
 endef
 # Lines become spaces on the way to the shell.
 define newline

@@ -1,6 +1,6 @@
 //! Whose motion is measured: what was generated, and what it is compared with.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::num::NonZeroUsize;
 
 use ndarray::{Array2, ArrayView2, s};
@@ -146,14 +146,14 @@ impl Subjects<'_> {
             .collect()
     }
 
-    /// Returns the best constant with the music of motions, one for each window.
+    /// Returns the best constant with the music of each phrase, one for each window.
     pub fn mean_motion(&self, generated: &[Item]) -> Vec<Item> {
         let Some(truth) = self.truth else { return Vec::new() };
-        let whole = |item: &Item| windows(item.seen.measured.n_frames).map(|_| ()).count();
-        let windows = generated
-            .iter()
-            .flat_map(|item| (0..whole(item)).map(move |i| (item, i * RETRIEVAL_FRAMES)));
-        windows
+        let mut phrases = BTreeSet::new();
+        let firsts = generated.iter().filter(|item| phrases.insert(item.phrase));
+        let of_windows = firsts
+            .flat_map(|item| windows(item.seen.measured.n_frames).map(move |first| (item, first)));
+        of_windows
             .take(MAX_RETRIEVED)
             .map(|(item, first)| Item {
                 phrase_id: item.phrase_id.clone(),
