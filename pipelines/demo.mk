@@ -72,7 +72,7 @@ $(GENERATED): $(EXPORTED) $(CONFIG) $(MOTIONGEN)
 PAGE := $(OUT)/motion/$(basename $(notdir $(SONG))).html
 $(PAGE): $(EXPORTED) $(CONFIG) $(MOTIONGEN)
 	$(MOTIONGEN) generate --config $(CONFIG) --model $(STORE)/models/$(MODEL) --audio $(SONG) \
-	  --output $(OUT)/motion --format npy,glb,png,html --force
+	  --output $(OUT)/motion --samples 1 --format npy,glb,png,html --force
 
 # evaluate: checks, metrics and baselines of what was danced.
 REPORT := $(OUT)/report.html
