@@ -292,6 +292,14 @@ fn evaluating_again_does_nothing_and_with_force_finds_the_same() {
     // Without the ground truth nobody knows how fast it is: 13 checks.
     assert_eq!(rows::<SanityCheckRow>(&store).len(), 16 * 13);
     assert!(!metrics(&store, "locked").is_empty());
+    // A whole one is good for a quick one, not the other way round.
+    let motions_seen = |output: Output| output.stdout.lines().nth(1).map(str::to_owned);
+    let whole = motions_seen(evaluate(&store, "locked", &[])).expect("a line");
+    assert!(whole.starts_with("  16 motions (89.1 s) evaluated;"), "{whole}");
+    assert_eq!(rows::<SanityCheckRow>(&store).len(), 16 * 15);
+    let quick = motions_seen(evaluate(&store, "locked", &["--quick"])).expect("a line");
+    assert_eq!(quick, "  16 motions (89.1 s), evaluated before");
+    assert_eq!(rows::<SanityCheckRow>(&store).len(), 16 * 15);
 
     put_locked(&store, "other");
     let missing = evaluate(&store, "locked", &["--against=other"]);

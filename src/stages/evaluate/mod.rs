@@ -59,7 +59,8 @@ impl Stage for Evaluate {
         let known = Known {
             store: &store,
             run: &params.run,
-            params_hash: &params.digest(),
+            params_hash: &params.digest(params.quick),
+            whole_hash: &params.digest(false),
             input_hash: &input_hash(&generations, &data_hash),
         };
         let n_wanted = if params.quick { 1 } else { rows::STAGES.len() };

@@ -88,10 +88,11 @@ impl Params {
         Ok(())
     }
 
-    /// Returns the digest of everything but the motions that determines the numbers.
-    pub fn digest(&self) -> String {
+    /// Returns the digest of everything but the motions that determines the rows; quick checks leave out
+    /// those that need the ground truth.
+    pub fn digest(&self, quick: bool) -> String {
         let text = format!(
-            "{OUTPUT_VERSION}\n{:?}\n{:?}\n{:?}",
+            "{OUTPUT_VERSION}\n{:?}\n{:?}\n{:?}\n{quick}",
             self.num_samples, self.num_frames, self.limits
         );
         digest(text.as_bytes())

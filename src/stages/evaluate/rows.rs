@@ -73,6 +73,8 @@ pub struct Known<'a> {
     pub store: &'a Location,
     pub run: &'a str,
     pub params_hash: &'a str,
+    /// The same of a whole evaluation, which is good for a quick one too.
+    pub whole_hash: &'a str,
     /// Digest of the motions and of the ground truth.
     pub input_hash: &'a str,
 }
@@ -85,7 +87,7 @@ impl Known<'_> {
     pub fn is_up_to_date(&self, stage: &str) -> Result<bool, StoreError> {
         let ledger = Ledger::read(self.store, stage)?;
         Ok(ledger.get(self.run).is_some_and(|known| {
-            known.params_hash == self.params_hash
+            [self.params_hash, self.whole_hash].contains(&known.params_hash.as_str())
                 && known.item.succeeded()
                 && known.item.input_hash == self.input_hash
         }))
