@@ -1,5 +1,7 @@
 //! `motiongen generate`, as a user runs it: tables and files, killed, sharded, and with bad input.
 
+mod priming;
+
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -17,8 +19,12 @@ const TRAINED: [&str; 4] =
 
 /// A store of 16 phrases of 19 to 67 frames, with a model of windows of 24.
 pub fn modelled(dir: &Dir) -> PathBuf {
+    modelled_with(dir, &TRAINED)
+}
+
+fn modelled_with(dir: &Dir, trained: &[&str]) -> PathBuf {
     let store = make_store(dir);
-    let output = train(&store, "run", &TRAINED);
+    let output = train(&store, "run", trained);
     assert_eq!(output.code, 0, "{output:?}");
     let export = ["export", "--run=run", "--model=m", "--quiet", "--store"];
     let output = run(export.iter().map(AsRef::as_ref).chain([store.as_os_str()]));
@@ -313,78 +319,6 @@ fn memory_does_not_grow_with_the_track() {
     // Ten minutes are 18,000 frames: 12 MB of features and 2 MB of motion.
     let output = finish(&mut confined(&command, 600 << 20));
     assert_eq!(output.code, 0, "{output:?}");
-}
-
-#[test]
-fn sampling_can_begin_from_the_librarys_nearest_phrases() {
-    let dir = Dir::new();
-    let store = modelled(&dir);
-    generate(&store, &["--run=plain"]);
-    generate(&store, &["--run=primed", "--prime=0.5", "--threads=1"]);
-    let by_run = |name: &str| -> Vec<GenerationRow> {
-        generations(&store).into_iter().filter(|row| row.run == name).collect()
-    };
-    assert!(by_run("plain").iter().all(|row| row.primed_by.is_none()));
-    let train: std::collections::BTreeSet<String> = crate::support::phrases(&store)
-        .into_values()
-        .filter(|row| row.split == "train" && row.n_frames >= Some(24))
-        .map(|row| row.phrase_id)
-        .collect();
-    for row in by_run("primed") {
-        let names: Vec<&str> = row.primed_by.as_deref().expect("named").split(',').collect();
-        assert_eq!(names.len(), row.n_windows as usize, "{row:?}");
-        assert!(names.iter().all(|name| train.contains(*name)), "{names:?} of {train:?}");
-        // A phrase of the library is nearest to itself.
-        if train.contains(&row.phrase_id) {
-            assert_eq!(names[0], row.phrase_id);
-        }
-    }
-    let of = |name: &str| {
-        let sql = format!("select * from generated where run = '{name}' order by phrase_id, frame");
-        let output =
-            run(["query", "--store", &store.display().to_string(), &sql, "--format", "csv"]);
-        output.stdout.replace(name, "")
-    };
-    assert_ne!(of("primed"), of("plain"));
-    generate(&store, &["--run=again", "--prime=0.5", "--threads=2"]);
-    assert_eq!(of("again"), of("primed"), "whatever the number of threads");
-
-    let refused = |more: &[&str]| {
-        let output = finish(&mut command(&store, more));
-        assert_eq!(output.code, 2, "{output:?}");
-        output.stderr
-    };
-    assert_eq!(
-        refused(&["--prime=1.5"]),
-        "error: --prime 1.5 is no share; give a number from 0 to 1\n"
-    );
-    assert_eq!(
-        refused(&["--prime=0.999"]),
-        "error: --prime 0.999 leaves 1 of 1000 steps, fewer than the 4 of the sampler; give up to 0.996, or \
-         fewer --steps\n"
-    );
-    let model = store.join("models/m").display().to_string();
-    let song = dir.write("song.wav", crate::support::files::wav(2.0)).display().to_string();
-    let out = dir.at("out").display().to_string();
-    let alone = run([
-        "generate",
-        "--model",
-        &model,
-        "--audio",
-        &song,
-        "--output",
-        &out,
-        "--prime=0.5",
-        "--overlap=7",
-    ]);
-    assert_eq!(
-        (alone.code, alone.stderr.as_str()),
-        (
-            2,
-            "error: --prime begins from the motion of a library, and there is none without --store; name \
-             the store of one, or leave --prime out\n"
-        )
-    );
 }
 
 #[test]

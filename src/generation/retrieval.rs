@@ -1,6 +1,6 @@
 //! The library's phrase whose music is nearest.
 
-use ndarray::{Array1, Array2, ArrayView1, ArrayView2, Axis, s};
+use ndarray::{Array1, Array2, ArrayBase, ArrayView1, ArrayView2, Axis, Data, Ix2, s};
 
 use crate::audio::FEATURE_DIM;
 
@@ -26,10 +26,11 @@ pub struct Retrieval {
 impl Retrieval {
     /// Makes an index of phrases by the features of their first `window_frames` frames, `[T, 163]` each.
     ///
-    /// None without phrases, for one that is shorter, and where a feature is not finite.
-    pub fn new<'a>(
+    /// They are taken one at a time, and of each only its key is kept, 163 numbers for every block. None without
+    /// phrases, for one that is shorter, and where a feature is not finite.
+    pub fn new<S: Data<Elem = f32>>(
         window_frames: usize,
-        phrases: impl IntoIterator<Item = ArrayView2<'a, f32>>,
+        phrases: impl IntoIterator<Item = ArrayBase<S, Ix2>>,
     ) -> Option<Self> {
         let width = window_frames.div_ceil(BLOCK_FRAMES) * FEATURE_DIM;
         let mut rows: Vec<f32> = Vec::new();
@@ -144,12 +145,19 @@ mod tests {
 
     #[test]
     fn units_and_constant_features_do_not_count_and_less_than_a_window_is_enough() {
+        let phrases = || [phrase(3, 0.0), phrase(5, 0.0), phrase(5, 0.8)];
+        let plain = Retrieval::new(WINDOW, phrases()).expect("phrases");
         let scaled = |p: Array2<f32>| p * 1000.0 + 7.0;
-        let phrases = [phrase(3, 0.0), phrase(5, 0.0), phrase(5, 0.8)].map(scaled);
-        let index = Retrieval::new(WINDOW, phrases.iter().map(|p| p.view())).expect("phrases");
+        let index = Retrieval::new(WINDOW, phrases().map(scaled)).expect("phrases");
         let mut own = scaled(phrase(5, 0.7));
         own.column_mut(100).fill(-1e6);
-        assert_eq!(index.nearest(own.view()).map(|found| found.0), Some(2));
+        let (nearest, distance) = index.nearest(own.view()).expect("finite");
+        let (same, as_far) = plain.nearest(phrase(5, 0.7).view()).expect("finite");
+        // Single precision of 1000.
+        assert!(
+            nearest == 2 && same == 2 && (distance - as_far).abs() < 1e-5,
+            "{distance}, {as_far}"
+        );
         assert_eq!(index.nearest(own.slice(s![..6, ..])).map(|found| found.0), Some(2));
     }
 
@@ -157,7 +165,7 @@ mod tests {
     fn what_is_short_or_not_finite_is_no_phrase() {
         let short = Array2::<f32>::zeros((WINDOW - 1, FEATURE_DIM));
         assert!(Retrieval::new(WINDOW, [short.view()]).is_none());
-        assert!(Retrieval::new(WINDOW, []).is_none());
+        assert!(Retrieval::new(WINDOW, std::iter::empty::<Array2<f32>>()).is_none());
         let mut holed = phrase(3, 0.0);
         holed[[4, 8]] = f32::NAN;
         assert!(Retrieval::new(WINDOW, [holed.view()]).is_none());

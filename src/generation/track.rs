@@ -51,14 +51,12 @@ pub struct Track<'a> {
     pub primed: Option<Primed<'a>>,
 }
 
-/// Constraints, and how strictly they are kept.
+/// Constraints, and how strictly sampling keeps them.
 #[derive(Clone, Copy, Debug)]
 pub struct Constrained<'a> {
     pub constraints: &'a Constraints,
     /// Share of the way that an estimate is bent at every step: 1 is in-painting.
     pub strength: f64,
-    /// Whether the finished motion is bent the rest of the way.
-    pub is_exact: bool,
 }
 
 /// Motion that sampling begins from instead of noise alone.
@@ -160,7 +158,7 @@ impl Generator<'_> {
             let (earlier, later) = motions.split_at_mut(i);
             agree(&mut earlier[i - 1], &mut later[0], run.shift(i));
         }
-        if let Some(Constrained { constraints, strength, .. }) = track.constraints {
+        if let Some(Constrained { constraints, strength }) = track.constraints {
             let places = run.places(&motions);
             for ((i, motion), place) in run.range.clone().zip(&mut motions).zip(places) {
                 let frames = run.windows.frames(i);

@@ -8,7 +8,7 @@ use ndarray::{Array2, ArrayView2, s};
 use crate::generation::{Retrieval, Windows};
 use crate::motion::{MOTION_DIM, Placement};
 use crate::store::{Location, Patience, StoreError};
-use crate::training::{Dataset, Reading, Split};
+use crate::training::{Dataset, Phrase, Reading, Split};
 
 /// Most training phrases that are read, the same ones every time: a bound on memory.
 pub const MAX_TRAIN_PHRASES: usize = 4000;
@@ -39,15 +39,17 @@ pub fn index_of(
     dataset: &Dataset,
     window_frames: usize,
 ) -> Result<Option<(Retrieval, Vec<usize>)>, StoreError> {
-    let (mut features, mut places) = (Vec::new(), Vec::new());
-    for (place, phrase) in dataset.phrases().iter().enumerate() {
-        if phrase.split == Split::Train && phrase.n_frames >= window_frames {
-            features.push(dataset.features(phrase, 0, window_frames)?);
-            places.push(place);
-        }
-    }
-    let index = Retrieval::new(window_frames, features.iter().map(|frames| frames.view()));
-    Ok(index.map(|index| (index, places)))
+    let (mut places, mut failed) = (Vec::new(), None);
+    let is_indexed =
+        |phrase: &Phrase| phrase.split == Split::Train && phrase.n_frames >= window_frames;
+    let phrases = dataset.phrases().iter().enumerate().filter(|(_, phrase)| is_indexed(phrase));
+    // One phrase in memory at a time: its frames are four times its key.
+    let features = phrases.map_while(|(place, phrase)| {
+        places.push(place);
+        dataset.features(phrase, 0, window_frames).map_err(|e| failed = Some(e)).ok()
+    });
+    let index = Retrieval::new(window_frames, features);
+    failed.map_or(Ok(index.map(|index| (index, places))), Err)
 }
 
 /// Phrases that sampling can begin from.

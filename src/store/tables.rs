@@ -177,7 +177,7 @@ rows! {
         n_steps: i32, "steps", "Steps of the sampler.";
         guidance: f64, "", "Guidance: 1 follows the music, more exaggerates it.";
         eta: Option<f64>, "", "Of DDIM, the share of the noise that is renewed.";
-        primed_by: Option<String>, "", "The library phrases that sampling began from, one for each window.";
+        primed_by: Option<String>, "", "The library phrases that sampling began from, one for each window, with commas between.";
         n_frames: i64, "frames", "Frames of the motion.";
         n_windows: i32, "windows", "Windows that it was sampled in.";
         score: Option<f64>, "", "Score of the selection, from 0 to 1; none where a value is not finite.";

@@ -178,16 +178,11 @@ impl Maker<'_> {
         watch: &mut dyn FnMut(ArrayView2<f32>) -> std::io::Result<()>,
     ) -> Result<Array2<f32>, Failure> {
         let strength = self.settings.constraint_strength;
-        let is_exact = !self.settings.soft;
         let track = Track {
             features: music.features,
             seed,
             style: self.settings.style,
-            constraints: constraints.map(|constraints| Constrained {
-                constraints,
-                strength,
-                is_exact,
-            }),
+            constraints: constraints.map(|constraints| Constrained { constraints, strength }),
             primed: priming.zip(self.settings.prime.as_ref()).map(|(priming, prime)| Primed {
                 motion: priming.motion.view(),
                 n_left: prime.n_left,
@@ -211,7 +206,7 @@ impl Maker<'_> {
         let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
         let mut frames =
             concatenate(Axis(0), &views).unwrap_or_else(|_| Array2::zeros((0, MOTION_DIM)));
-        if let Some(Constrained { constraints, is_exact: true, .. }) = track.constraints {
+        if let Some(constraints) = constraints.filter(|_| !self.settings.soft) {
             constraints.bend(&mut frames, 0, 1.0);
         }
         Ok(frames)

@@ -314,7 +314,8 @@ impl Settings {
             n_left >= n_steps,
             "--prime {strength} leaves {n_left} of {n_all} steps, fewer than the {n_steps} of the sampler; \
              give up to {:.3}, or fewer --steps",
-            1.0 - n_steps as f64 / n_all as f64
+            // Rounded down, so that what is told is enough.
+            (1000 * n_all.saturating_sub(n_steps) / n_all) as f64 / 1000.0
         );
         self.prime = Some(Prime { n_left, library: library.to_owned() });
         Ok(())
