@@ -50,14 +50,16 @@ fn generate(store: &Path, more: &[&str]) -> Output {
 }
 
 /// The parts of generated motion: names and bytes.
+///
+/// A process killed while it writes a part leaves a file whose name begins with a dot, which no reader
+/// lists and a later run sweeps away when it is a day old.
 fn parts(store: &Path) -> BTreeMap<String, Vec<u8>> {
     let Ok(entries) = std::fs::read_dir(store.join(GENERATED)) else { return BTreeMap::new() };
     entries
         .map(|entry| entry.expect("an entry").path())
-        .map(|path| {
-            let name = path.file_name().expect("a name").to_string_lossy().into_owned();
-            (name, std::fs::read(path).expect("a part"))
-        })
+        .map(|path| (path.file_name().expect("a name").to_string_lossy().into_owned(), path))
+        .filter(|(name, _)| !name.starts_with(".partial-"))
+        .map(|(name, path)| (name, std::fs::read(path).expect("a part")))
         .collect()
 }
 
