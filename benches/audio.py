@@ -20,13 +20,10 @@ benches/requirements.txt.
 """
 
 import argparse
-import datetime
 import importlib.metadata
 import json
 import os
 import pathlib
-import platform
-import re
 import shutil
 import statistics
 import subprocess
@@ -35,6 +32,7 @@ import time
 from dataclasses import asdict, dataclass
 
 from bench import HERE, Run, first_line, run, table
+from machine import heading
 
 SONG_RATIO_TARGET, SONG_RATIO_AIM = 20, 30
 REAL_TIME_TARGET = 200
@@ -306,25 +304,14 @@ def measured(done: Run) -> dict[str, float]:
 
 
 def machine(bench: Bench, profile: str) -> str:
-    cpu = re.search(r"model name\s*: (.*)", pathlib.Path("/proc/cpuinfo").read_text())
-    memory = re.search(r"MemTotal:\s*(\d+)", pathlib.Path("/proc/meminfo").read_text())
-    now = datetime.datetime.now(datetime.UTC)
-    facts = [
-        f"{cpu.group(1) if cpu else platform.machine()}, {os.cpu_count()} cores",
-        f"{int(memory.group(1)) / 1e6 if memory else 0:.0f} GB",
-        f"Linux {platform.release()}",
-        f"load {os.getloadavg()[0]:.1f} at the start",
-    ]
     packages = ["librosa", "numpy", "scipy", "numba", "soxr", "soundfile"]
-    versions = [
-        f"{first_line([bench.motiongen, '--version'])} (profile {profile})",
-        f"Python {platform.python_version()}",
-        *[f"{name} {importlib.metadata.version(name)}" for name in packages],
-    ]
-    repeats = f"{bench.sizes.repeats} runs of each, taking turns"
-    return (
-        f"## {now:%Y-%m-%d %H:%M} UTC, audio features\n\n"
-        f"{', '.join(facts)}; {', '.join(versions)}; {repeats}.\n"
+    return heading(
+        "audio features",
+        [
+            f"{first_line([bench.motiongen, '--version'])} (profile {profile})",
+            *[f"{name} {importlib.metadata.version(name)}" for name in packages],
+            f"{bench.sizes.repeats} runs of each, taking turns",
+        ],
     )
 
 

@@ -17,13 +17,11 @@ medians. The Python that runs this needs NumPy and polars (benches/requirements.
 """
 
 import argparse
-import datetime
 import hashlib
 import importlib.metadata
 import json
 import os
 import pathlib
-import platform
 import random
 import re
 import shutil
@@ -34,6 +32,8 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+
+from machine import heading
 
 HERE = pathlib.Path(__file__).resolve().parent
 QUERY = "select avg(velocity_x) as mean from motion"
@@ -352,24 +352,14 @@ def first_line(command: list[str | pathlib.Path]) -> str:
 
 
 def machine(bench: Bench, profile: str) -> str:
-    cpu = re.search(r"model name\s*: (.*)", pathlib.Path("/proc/cpuinfo").read_text())
-    memory = re.search(r"MemTotal:\s*(\d+)", pathlib.Path("/proc/meminfo").read_text())
-    load = os.getloadavg()[0]
-    now = datetime.datetime.now(datetime.UTC)
-    facts = [
-        f"{now:%Y-%m-%d %H:%M} UTC",
-        f"{cpu.group(1) if cpu else platform.machine()}, {os.cpu_count()} cores",
-        f"{int(memory.group(1)) / 1e6 if memory else 0:.0f} GB",
-        f"Linux {platform.release()}",
-        f"load {load:.1f} at the start",
-    ]
-    versions = [
-        f"{first_line([bench.motiongen, '--version'])} (profile {profile})",
-        first_line(["rustc", "--version"]),
-        f"Python {platform.python_version()}",
-        f"polars {importlib.metadata.version('polars')}",
-    ]
-    return f"## {facts[0]}\n\n{', '.join(facts[1:])}; {', '.join(versions)}.\n"
+    return heading(
+        "ingest and query",
+        [
+            f"{first_line([bench.motiongen, '--version'])} (profile {profile})",
+            first_line(["rustc", "--version"]),
+            f"polars {importlib.metadata.version('polars')}",
+        ],
+    )
 
 
 def builds(log: pathlib.Path) -> str:

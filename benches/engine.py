@@ -17,12 +17,10 @@ two turns of each are not counted. Times are medians with their range, ratios ar
 """
 
 import argparse
-import datetime
 import importlib.metadata
 import json
 import os
 import pathlib
-import platform
 import re
 import statistics
 import subprocess
@@ -31,6 +29,7 @@ import time
 
 from bench import HERE, first_line, table
 from engine_parity import parity
+from machine import heading
 
 OURS, TORCH, ONNX = "motiongen", "PyTorch", "onnxruntime"
 FRAMES = 120
@@ -237,21 +236,15 @@ class Bench:
 
 
 def machine(bench: Bench, profile: str) -> str:
-    cpu = re.search(r"model name\s*: (.*)", pathlib.Path("/proc/cpuinfo").read_text())
-    memory = re.search(r"MemTotal:\s*(\d+)", pathlib.Path("/proc/meminfo").read_text())
-    facts = [
-        f"{cpu.group(1) if cpu else platform.machine()}, {os.cpu_count()} cores",
-        f"{int(memory.group(1)) / 1e6 if memory else 0:.0f} GB",
-        f"Linux {platform.release()}",
-        f"load {os.getloadavg()[0]:.1f} at the start",
-        f"engine-bench (profile {profile})",
-        first_line(["rustc", "--version"]),
-        f"Python {platform.python_version()}",
-        *[f"{name} {importlib.metadata.version(name)}" for name in PACKAGES],
-        f"{bench.repeats} runs of each, taking turns",
-    ]
-    now = datetime.datetime.now(datetime.UTC)
-    return f"## {now:%Y-%m-%d %H:%M} UTC, training engine\n\n{', '.join(facts)}.\n"
+    return heading(
+        "training engine",
+        [
+            f"engine-bench (profile {profile})",
+            first_line(["rustc", "--version"]),
+            *[f"{name} {importlib.metadata.version(name)}" for name in PACKAGES],
+            f"{bench.repeats} runs of each, taking turns",
+        ],
+    )
 
 
 def main() -> None:

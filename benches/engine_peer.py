@@ -17,7 +17,6 @@ Each line of standard input is a request, {"cmd": ...}, and gets one line on sta
   quit
 """
 
-import json
 import logging
 import pathlib
 import sys
@@ -25,6 +24,7 @@ import time
 from typing import Any
 
 import numpy as np
+from peer import serve
 
 GOLDEN = pathlib.Path(__file__).resolve().parents[1] / "tests" / "golden" / "engine"
 sys.path.insert(0, str(GOLDEN))
@@ -172,15 +172,7 @@ class Onnxruntime:
 
 
 def main() -> None:
-    peer = {"pytorch": Torch, "onnxruntime": Onnxruntime}[sys.argv[1]]()
-    # Libraries print as they like; answers keep standard output to themselves.
-    answers, sys.stdout = sys.stdout, sys.stderr
-    for line in sys.stdin:
-        request = json.loads(line)
-        command = request.pop("cmd")
-        if command == "quit":
-            return
-        print(json.dumps(getattr(peer, command)(**request)), file=answers, flush=True)
+    serve({"pytorch": Torch, "onnxruntime": Onnxruntime}[sys.argv[1]]())
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ import sys
 import tempfile
 
 from bench import HERE, first_line, table, verdict
-from engine import Worker, in_turns, spread
+from engine import Worker, spread
 from machine import heading
 
 EAGER, ONNX, TORCH = "motiongen, eager", "motiongen, onnxruntime", "PyTorch, eager"

@@ -6,12 +6,12 @@ batch, guidance), predict (batch), quit. Also `check` (folder): what Python's on
 of the files that motiongen wrote.
 """
 
-import json
 import pathlib
 import sys
 import time
 
 import numpy as np
+from peer import serve
 
 GOLDEN = pathlib.Path(__file__).resolve().parents[1] / "tests" / "golden" / "engine"
 sys.path.insert(0, str(GOLDEN))
@@ -77,14 +77,7 @@ class Torch:
 
 
 def main() -> None:
-    peer = Torch()
-    answers, sys.stdout = sys.stdout, sys.stderr
-    for line in sys.stdin:
-        request = json.loads(line)
-        command = request.pop("cmd")
-        if command == "quit":
-            return
-        print(json.dumps(getattr(peer, command)(**request)), file=answers, flush=True)
+    serve(Torch())
 
 
 if __name__ == "__main__":

@@ -14,13 +14,10 @@ number of threads and take turns. The Python that runs this needs benches/requir
 
 import argparse
 import csv
-import datetime
 import importlib.metadata
 import io
 import os
 import pathlib
-import platform
-import re
 import shutil
 import statistics
 import subprocess
@@ -28,6 +25,7 @@ import sys
 
 from bench import HERE, first_line, table
 from engine import FRAMES, OURS, TORCH, Worker, in_turns, median, spread
+from machine import heading
 
 ROOT = HERE.parent
 # What the reference trains on, and its and PyTorch's times for an epoch of it (issue and section 13.1).
@@ -122,18 +120,15 @@ def train(arguments: argparse.Namespace) -> str:
 
 
 def machine(arguments: argparse.Namespace) -> str:
-    cpu = re.search(r"model name\s*: (.*)", pathlib.Path("/proc/cpuinfo").read_text())
-    facts = [
-        f"{cpu.group(1) if cpu else platform.machine()}, {os.cpu_count()} cores",
-        f"Linux {platform.release()}",
-        f"load {os.getloadavg()[0]:.1f} at the start",
-        f"profile {arguments.profile}",
-        first_line(["rustc", "--version"]),
-        f"PyTorch {importlib.metadata.version('torch')}",
-        f"{arguments.repeats} runs of each, taking turns",
-    ]
-    now = datetime.datetime.now(datetime.UTC)
-    return f"## {now:%Y-%m-%d %H:%M} UTC, training\n\n{', '.join(facts)}.\n"
+    return heading(
+        "training",
+        [
+            f"profile {arguments.profile}",
+            first_line(["rustc", "--version"]),
+            f"PyTorch {importlib.metadata.version('torch')}",
+            f"{arguments.repeats} runs of each, taking turns",
+        ],
+    )
 
 
 def main() -> None:

@@ -10,7 +10,6 @@ Each line of standard input is a request, {"cmd": ...}, and gets one line on sta
 Networks, sampler and losses are those that made the golden files of tests/golden, in float32.
 """
 
-import json
 import pathlib
 import sys
 import time
@@ -23,6 +22,7 @@ import diffusion  # noqa: E402
 import losses  # noqa: E402
 import network  # noqa: E402
 import torch  # noqa: E402
+from peer import serve  # noqa: E402
 
 CHANNELS, FEATURES, N_STEPS = 25, 163, 5
 
@@ -81,15 +81,7 @@ class Finetune:
 
 
 def main() -> None:
-    peer = Finetune()
-    # Libraries print as they like; answers keep standard output to themselves.
-    answers, sys.stdout = sys.stdout, sys.stderr
-    for line in sys.stdin:
-        request = json.loads(line)
-        command = request.pop("cmd")
-        if command == "quit":
-            return
-        print(json.dumps(getattr(peer, command)(**request)), file=answers, flush=True)
+    serve(Finetune())
 
 
 if __name__ == "__main__":

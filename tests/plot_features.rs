@@ -7,7 +7,8 @@ use motiongen::store::{Commit, Item, ItemTables, Ledger, Location, Row as _};
 use ndarray::Array2;
 
 use crate::support::files::{coherent, trajectory, wav};
-use crate::support::{Dir, Output, finish, ingest, motiongen, run};
+use crate::support::plots::{self, png_size, svg, text};
+use crate::support::{Dir, finish, ingest, motiongen, run};
 
 fn golden(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/audio").join(name)
@@ -17,41 +18,16 @@ fn music() -> String {
     golden("music_48k_stereo.ogg").display().to_string()
 }
 
-fn plot(arguments: &[&str]) -> Output {
-    run(["plot", "features"].iter().chain(arguments))
-}
-
 /// Draws, and returns the summary.
 #[track_caller]
 fn drawn(arguments: &[&str]) -> String {
-    let output = plot(arguments);
-    assert_eq!((output.code, output.stderr.as_str()), (0, ""), "{arguments:?}");
-    output.stdout
+    plots::drawn("features", arguments)
 }
 
-/// Asks for something that cannot be drawn, and returns the sentence that comes back.
+/// Returns the sentence with which the program refuses.
 #[track_caller]
 fn refusal(arguments: &[&str]) -> String {
-    let output = plot(arguments);
-    assert_eq!((output.code, output.stdout.as_str()), (2, ""), "{arguments:?}: {output:?}");
-    let first = output.stderr.lines().next().expect("an error");
-    first.strip_prefix("error: ").expect("an error").to_owned()
-}
-
-fn text(path: &Path) -> String {
-    path.to_str().expect("UTF-8").to_owned()
-}
-
-/// Returns width and height of a PNG, as its header has them.
-fn png_size(path: &Path) -> (u32, u32) {
-    let bytes = std::fs::read(path).expect("a picture");
-    assert_eq!(bytes[..8], *b"\x89PNG\r\n\x1a\n");
-    let number = |at: usize| u32::from_be_bytes(bytes[at..at + 4].try_into().expect("4 bytes"));
-    (number(16), number(20))
-}
-
-fn svg(path: &Path) -> String {
-    std::fs::read_to_string(path).expect("a picture")
+    plots::refusal("features", arguments)
 }
 
 #[test]
@@ -338,7 +314,7 @@ fn help_lists_the_kinds_and_what_each_takes() {
         ["MOTIONGEN_PANEL", "MOTIONGEN_VERBOSE", "[plot.features]", "Writes: an image file"];
     let found = wanted.map(|text| output.stdout.contains(text));
     assert_eq!(found, [true, false, true, true], "{}", output.stdout);
-    assert_eq!(plot(&[]).code, 2);
+    assert_eq!(plots::plot("features", &[]).code, 2);
     assert_eq!(run(["plot"]).code, 2);
 }
 

@@ -9,35 +9,19 @@ use motiongen::store::{Commit, Item, Label, Ledger, Location, Row as _, Timestam
 use ndarray::Array2;
 
 use crate::support::files::{Frame, coherent, trajectory};
-use crate::support::{Dir, Output, ingest, run};
-
-fn plot(arguments: &[&str]) -> Output {
-    run(["plot", "motion"].iter().chain(arguments))
-}
+use crate::support::plots::{self, svg, text};
+use crate::support::{Dir, ingest};
 
 /// Draws, and returns the summary.
 #[track_caller]
 fn drawn(arguments: &[&str]) -> String {
-    let output = plot(arguments);
-    assert_eq!((output.code, output.stderr.as_str()), (0, ""), "{arguments:?}");
-    output.stdout
+    plots::drawn("motion", arguments)
 }
 
 /// Returns the sentence with which the program refuses.
 #[track_caller]
 fn refusal(arguments: &[&str]) -> String {
-    let output = plot(arguments);
-    assert_eq!((output.code, output.stdout.as_str()), (2, ""), "{arguments:?}: {output:?}");
-    let line = output.stderr.lines().next().unwrap_or_default();
-    line.strip_prefix("error: ").unwrap_or(line).to_owned()
-}
-
-fn text(path: &Path) -> String {
-    path.display().to_string()
-}
-
-fn svg(path: &str) -> String {
-    std::fs::read_to_string(path).expect("a picture")
+    plots::refusal("motion", arguments)
 }
 
 /// Commits rows as a stage does; the item is the phrase or the motion.

@@ -9,43 +9,19 @@ use motiongen::training::{
     DecoderLearner, DiffusionLearner, FinetuneLearner, Learner as _, RowKind,
 };
 
-use crate::support::{Dir, Output, finish, motiongen, run};
-
-fn plot(arguments: &[&str]) -> Output {
-    run(["plot", "training"].iter().chain(arguments))
-}
+use crate::support::plots::{self, png_size, svg, text};
+use crate::support::{Dir, finish, motiongen};
 
 /// Draws, and returns the summary.
 #[track_caller]
 fn drawn(arguments: &[&str]) -> String {
-    let output = plot(arguments);
-    assert_eq!((output.code, output.stderr.as_str()), (0, ""), "{arguments:?}");
-    output.stdout
+    plots::drawn("training", arguments)
 }
 
 /// Returns the sentence with which the program refuses.
 #[track_caller]
 fn refusal(arguments: &[&str]) -> String {
-    let output = plot(arguments);
-    assert_eq!((output.code, output.stdout.as_str()), (2, ""), "{arguments:?}: {}", output.stderr);
-    let line = output.stderr.lines().next().unwrap_or_default();
-    line.strip_prefix("error: ").unwrap_or(line).to_owned()
-}
-
-fn text(path: &Path) -> String {
-    path.display().to_string()
-}
-
-fn svg(path: &str) -> String {
-    std::fs::read_to_string(path).expect("a picture")
-}
-
-/// Returns width and height from the header of a PNG.
-fn png_size(path: &str) -> (u32, u32) {
-    let bytes = std::fs::read(path).expect("a picture");
-    assert_eq!(&bytes[..8], b"\x89PNG\r\n\x1a\n");
-    let number = |at: usize| u32::from_be_bytes(bytes[at..at + 4].try_into().expect("4 bytes"));
-    (number(16), number(20))
+    plots::refusal("training", arguments)
 }
 
 /// A row of which nothing but its place is known.

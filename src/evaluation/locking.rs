@@ -15,8 +15,6 @@ const SIMPLE: std::ops::RangeInclusive<u32> = 1..=4;
 const MIN_LOG_DISTANCE: f64 = 0.04;
 /// Tempi among which wrong ones are chosen.
 const N_CANDIDATES: usize = 4000;
-/// A fall of the phase by more than this begins a new bar.
-const WRAP: f64 = 0.5;
 /// Scores over wrong tempi that spread less than this do not spread.
 const MIN_DEVIATION: f64 = 1e-12;
 
@@ -24,7 +22,7 @@ const MIN_DEVIATION: f64 = 1e-12;
 #[derive(Clone, Copy, Debug)]
 pub struct Passage<'a> {
     pub signal: &'a [f64],
-    /// Counted on from bar to bar: see [`unwrapped`] and [`since_start`].
+    /// Counted on from bar to bar: see [`unwrapped`](crate::motion::phase::unwrapped) and [`since_start`].
     pub bars: &'a [f64],
 }
 
@@ -120,22 +118,6 @@ pub fn wrong_tempi(n: usize) -> Vec<f64> {
     (0..n).map(|i| apart[i * (apart.len() - 1) / step]).collect()
 }
 
-/// Returns bars that are counted on, of a bar phase that begins anew with each.
-pub fn unwrapped(phase: &[f64]) -> Vec<f64> {
-    let mut n_bars = 0.0;
-    let mut last = phase.first().copied().unwrap_or(0.0);
-    phase
-        .iter()
-        .map(|&x| {
-            if last - x > WRAP {
-                n_bars += 1.0;
-            }
-            last = x;
-            n_bars + x
-        })
-        .collect()
-}
-
 /// Returns bars since the song began, of a passage that begins `start_frames` into it: as many whole bars
 /// more as its tempo makes until there.
 ///
@@ -216,13 +198,11 @@ mod tests {
     }
 
     #[test]
-    fn bars_are_counted_on_and_from_the_beginning_of_the_song() {
-        let bars = unwrapped(&[0.4, 0.7, 0.0, 0.3, 0.6]);
-        assert_eq!(bars, [0.4, 0.7, 1.0, 1.3, 1.6]);
+    fn bars_are_counted_from_the_beginning_of_the_song() {
+        let bars = [0.4, 0.7, 1.0, 1.3, 1.6];
         // 0.3 bars a frame: 35 frames are 10.5 bars, nearest to which are 10 bars and 0.4.
         assert_eq!(since_start(&bars, 35.0)[0], 10.4);
         assert_eq!(since_start(&[0.3], 21.0), [0.3]);
-        assert_eq!(unwrapped(&[]), [0.0; 0]);
     }
 
     #[test]

@@ -6,12 +6,10 @@
 
 use ndarray::ArrayView2;
 
+use crate::motion::phase::WRAP_BARS;
 use crate::motion::quaternion::{Quaternion, angular_velocity, dot, normalize};
 use crate::motion::{Channel, ChannelLimits};
 use crate::units::FPS;
-
-/// A fall of the phase by more than this begins a new bar.
-const WRAP: f64 = 0.5;
 
 /// Which set a check is of; the two are never mixed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -256,7 +254,7 @@ impl Measured {
             n_falls: (0..pairs)
                 .filter(|&t| {
                     let change = phase(t + 1) - phase(t);
-                    (-WRAP..-1e-6).contains(&change)
+                    (-WRAP_BARS..-1e-6).contains(&change)
                 })
                 .count(),
         }

@@ -2,9 +2,10 @@
 
 use ndarray::ArrayView2;
 
-use super::locking::{unwrapped, wrong_tempi};
+use super::locking::wrong_tempi;
 use super::sanity::checks;
 use crate::motion::locking::bar_locking;
+use crate::motion::phase::unwrapped;
 use crate::motion::{Channel, ChannelLimits};
 
 /// Error of a decoded velocity at which coherence counts half, m/s: about a quarter of the mean speed of dance.

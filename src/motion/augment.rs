@@ -8,12 +8,10 @@ use crate::units::FPS;
 
 use super::channels::Channel;
 use super::kinematics::{Poses, frames_of};
+use super::phase::unwrapped;
 use super::placement::Placement;
 use super::quaternion::{Quaternion, make_sign_continuous, normalize};
 use super::spline::{CubicSpline, SplineError};
-
-/// A phase that falls by more than this between two frames has begun a new bar.
-const WRAP: f64 = 0.5;
 
 /// Mirrors motion in the plane x = 0, in place, `[n_frames, 25]`.
 ///
@@ -71,7 +69,8 @@ pub fn stretch_motion(frames: ArrayView2<f32>, rate: f64) -> Result<Array2<f32>,
     let mut stretched = frames_of(&Poses { position_m, orientation }, n_kept);
 
     let phase = Channel::Phase.range().start;
-    let bars = unwrapped(frames.column(phase).iter().map(|&x| f64::from(x)));
+    let in_bar: Vec<f64> = frames.column(phase).iter().map(|&x| f64::from(x)).collect();
+    let bars = unwrapped(&in_bar);
     let style = Channel::Style.range();
     for (t, mut row) in stretched.rows_mut().into_iter().enumerate() {
         let (before, share) = place(t, rate, n_frames);
@@ -106,20 +105,6 @@ fn place(t: usize, rate: f64, n_frames: usize) -> (usize, f64) {
     let at = t as f64 * rate;
     let before = (at.floor() as usize).min(n_frames - 1);
     (before, (at - before as f64).clamp(0.0, 1.0))
-}
-
-/// Returns a phase that counts bars instead of beginning anew with each.
-fn unwrapped(phase: impl Iterator<Item = f64>) -> Vec<f64> {
-    let (mut bars, mut last) = (0.0, None);
-    phase
-        .map(|x| {
-            if last.is_some_and(|last: f64| last - x > WRAP) {
-                bars += 1.0;
-            }
-            last = Some(x);
-            bars + x
-        })
-        .collect()
 }
 
 #[cfg(test)]

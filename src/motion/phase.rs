@@ -13,6 +13,9 @@ pub const MAX_BEATS_LINES: usize = 1_000_000;
 /// Highest beat number, so that one mistyped number does not make a bar of a thousand beats.
 pub const MAX_BEATS_PER_BAR: u32 = 64;
 
+/// A bar phase that falls by more than this, in bars, has begun a new bar.
+pub const WRAP_BARS: f64 = 0.5;
+
 const SHOWN_CHARS: usize = 40;
 
 /// Why a list of beats was refused.
@@ -233,6 +236,22 @@ pub fn bar_phase(times_s: &[f64], beats: &Beats) -> Vec<f64> {
     times_s.iter().map(|&t| fraction((position(t) - first_downbeat) / bars)).collect()
 }
 
+/// Returns bars that are counted on, of a bar phase that begins anew with each.
+pub fn unwrapped(phase: &[f64]) -> Vec<f64> {
+    let mut n_bars = 0.0;
+    let mut last = phase.first().copied().unwrap_or(0.0);
+    phase
+        .iter()
+        .map(|&x| {
+            if last - x > WRAP_BARS {
+                n_bars += 1.0;
+            }
+            last = x;
+            n_bars + x
+        })
+        .collect()
+}
+
 /// Bar phase in `[0, 1)` at `times_s` for a constant tempo with a downbeat at `downbeat_s`.
 ///
 /// `φ(t) = frac((t - t₀) bpm / (60 B))`.
@@ -260,6 +279,14 @@ mod tests {
 
     fn refusal(text: &str) -> String {
         Beats::parse(text).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn bars_are_counted_on() {
+        assert_eq!(unwrapped(&[0.4, 0.7, 0.0, 0.3, 0.6]), [0.4, 0.7, 1.0, 1.3, 1.6]);
+        // A small fall is none of a bar's.
+        assert_eq!(unwrapped(&[0.7, 0.3, 0.9]), [0.7, 0.3, 0.9]);
+        assert_eq!(unwrapped(&[]), [0.0; 0]);
     }
 
     #[test]

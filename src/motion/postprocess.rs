@@ -22,6 +22,7 @@ pub use config::{
 
 use super::channels::{Channel, MOTION_DIM};
 use super::kinematics::{Poses, forward_differences, frames_of};
+use super::phase::WRAP_BARS;
 use super::quaternion::Quaternion;
 use smoothing::{Polynomials, moving_average};
 
@@ -31,9 +32,6 @@ const VECTORS: [Channel; 4] =
 
 /// Channel groups that follow from position and quaternion.
 const DERIVED: [Channel; 3] = [Channel::Velocity, Channel::Acceleration, Channel::AngularVelocity];
-
-/// A fall of the phase by more than this, in bars, is the step into the next bar.
-const WRAP_BARS: f32 = -0.5;
 
 /// Processes motion in place, `[T, 25]` in metres, seconds and radians; `phase` is the bar phase of
 /// the music, `[T]`, for `relock_phase`.
@@ -152,7 +150,7 @@ fn hold_falling_phase(frames: &mut Array2<f32>) {
         }
         if let Some(held) = running {
             let change = *x - held;
-            if (WRAP_BARS..0.0).contains(&change) {
+            if (-WRAP_BARS as f32..0.0).contains(&change) {
                 *x = held;
             }
         }

@@ -74,6 +74,24 @@ pub struct Picture {
     pub height_px: u32,
 }
 
+/// Returns the names of panels, as messages list them.
+fn names_of<P: Copy>(all: &[P], name_of: fn(P) -> &'static str) -> String {
+    all.iter().map(|&panel| name_of(panel)).collect::<Vec<_>>().join(", ")
+}
+
+/// Returns the panel of a name.
+fn panel_named<P: Copy>(
+    all: &[P],
+    name_of: fn(P) -> &'static str,
+    name: &str,
+) -> Result<P, PlotError> {
+    let found = all.iter().copied().find(|&panel| name_of(panel) == name);
+    found.ok_or_else(|| PlotError::UnknownPanel {
+        name: name.to_owned(),
+        known: names_of(all, name_of),
+    })
+}
+
 fn check_width(width_px: u32) -> Result<(), PlotError> {
     if (MIN_WIDTH_PX..=MAX_WIDTH_PX).contains(&width_px) {
         return Ok(());

@@ -12,6 +12,7 @@ use super::style::{
 };
 use super::value_axis::ValueAxis;
 use super::{font, frame};
+use crate::motion::phase::WRAP_BARS;
 use crate::motion::trajectory::QUATERNION_NORM_TOLERANCE;
 use crate::motion::{Channel, Trajectory};
 use crate::units::FPS;
@@ -20,8 +21,6 @@ use crate::units::FPS;
 const BAND_OPACITY: f64 = 0.2;
 /// Free space above the greatest and below the least value, as a share of what lies between.
 const PAD_SHARE: f64 = 0.05;
-/// A phase that falls by more than this has begun a new bar.
-const WRAP: f64 = 0.5;
 /// Norms beyond this factor of 1 are no quaternions, and have an axis from 0.
 const MAX_NORM_FACTOR: f64 = 2.0;
 /// The log axis of jerk ends so far below its head: nobody looks for less.
@@ -255,7 +254,7 @@ fn dashes(scene: &mut Scene, rect: Rect, y: f64) {
 
 /// Parts the stretches of a phase where a bar ends, so that no line joins its end to the next begin.
 fn parted_at_bars(runs: Vec<Vec<(usize, Extent)>>) -> Vec<Vec<(usize, Extent)>> {
-    let is_same_bar = |a: &(usize, Extent), b: &(usize, Extent)| b.1.mean >= a.1.mean - WRAP;
+    let is_same_bar = |a: &(usize, Extent), b: &(usize, Extent)| b.1.mean >= a.1.mean - WRAP_BARS;
     runs.iter().flat_map(|run| run.chunk_by(is_same_bar).map(<[_]>::to_vec)).collect()
 }
 

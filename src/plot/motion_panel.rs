@@ -2,7 +2,7 @@
 
 use std::str::FromStr;
 
-use super::PlotError;
+use super::{PlotError, names_of, panel_named};
 use crate::motion::Channel;
 
 /// A panel of a plot of motion: one quantity over time, or the path from above.
@@ -61,7 +61,7 @@ impl MotionPanel {
 
     /// Returns the names of every panel, as messages list them.
     pub(super) fn known() -> String {
-        Self::ALL.map(Self::name).join(", ")
+        names_of(&Self::ALL, Self::name)
     }
 
     pub(super) fn heading(self) -> &'static str {
@@ -113,10 +113,7 @@ impl FromStr for MotionPanel {
     type Err = PlotError;
 
     fn from_str(name: &str) -> Result<Self, PlotError> {
-        Self::ALL
-            .into_iter()
-            .find(|panel| panel.name() == name)
-            .ok_or_else(|| PlotError::UnknownPanel { name: name.to_owned(), known: Self::known() })
+        panel_named(&Self::ALL, Self::name, name)
     }
 }
 

@@ -3,7 +3,7 @@
 use std::ops::Range;
 use std::str::FromStr;
 
-use super::PlotError;
+use super::{PlotError, names_of, panel_named};
 
 /// Values of a frame.
 pub(super) const FEATURE_DIM: usize = 163;
@@ -46,7 +46,7 @@ impl Panel {
 
     /// Returns the names of every panel, as messages list them.
     pub(super) fn known() -> String {
-        Self::ALL.map(Self::name).join(", ")
+        names_of(&Self::ALL, Self::name)
     }
 
     /// Returns where the block is in a frame.
@@ -120,10 +120,7 @@ impl FromStr for Panel {
     type Err = PlotError;
 
     fn from_str(name: &str) -> Result<Self, PlotError> {
-        Self::ALL
-            .into_iter()
-            .find(|panel| panel.name() == name)
-            .ok_or_else(|| PlotError::UnknownPanel { name: name.to_owned(), known: Self::known() })
+        panel_named(&Self::ALL, Self::name, name)
     }
 }
 

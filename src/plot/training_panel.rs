@@ -2,8 +2,8 @@
 
 use std::str::FromStr;
 
-use super::PlotError;
 use super::value_axis::Scale;
+use super::{PlotError, names_of, panel_named};
 
 /// A stage of training.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, clap::ValueEnum)]
@@ -186,7 +186,7 @@ impl TrainingPanel {
 
     /// Returns the names of every panel, as messages list them.
     pub fn known() -> String {
-        Self::ALL.map(Self::name).join(", ")
+        names_of(&Self::ALL, Self::name)
     }
 }
 
@@ -194,10 +194,7 @@ impl FromStr for TrainingPanel {
     type Err = PlotError;
 
     fn from_str(name: &str) -> Result<Self, PlotError> {
-        Self::ALL
-            .into_iter()
-            .find(|panel| panel.name() == name)
-            .ok_or_else(|| PlotError::UnknownPanel { name: name.to_owned(), known: Self::known() })
+        panel_named(&Self::ALL, Self::name, name)
     }
 }
 

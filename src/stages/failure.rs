@@ -1,107 +1,94 @@
 //! Why an item was refused: one kind, one sentence.
 
 use std::fmt;
+use std::io::{self, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use crate::store::digest;
 
-/// Classes of failure, as the `kind` column of `failures` spells them.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum FailureKind {
-    AudioCodec,
-    AudioData,
-    AudioHeader,
-    AudioNoSamples,
-    AudioNotFinite,
-    AudioSampleRate,
-    BeatsFormat,
-    BvhFormat,
+/// Spells each kind once: its name here, its name in tables, and its place among all.
+macro_rules! kinds {
+    ($($(#[$doc:meta])* $kind:ident = $name:literal,)*) => {
+        /// Classes of failure, as the `kind` column of `failures` spells them.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+        pub enum FailureKind {
+            $($(#[$doc])* $kind,)*
+        }
+
+        impl FailureKind {
+            /// Every kind, for looking one up by the name that a reader gives.
+            const ALL: &'static [Self] = &[$(Self::$kind,)*];
+
+            /// Returns the kind as tables spell it.
+            pub fn name(self) -> &'static str {
+                match self {
+                    $(Self::$kind => $name,)*
+                }
+            }
+        }
+    };
+}
+
+kinds! {
+    AudioCodec = "audio_codec",
+    AudioData = "audio_data",
+    AudioHeader = "audio_header",
+    AudioNoSamples = "audio_no_samples",
+    AudioNotFinite = "audio_not_finite",
+    AudioSampleRate = "audio_sample_rate",
+    BeatsFormat = "beats_format",
+    BvhFormat = "bvh_format",
     /// The file was written to while it was read, or since it was ingested.
-    Changed,
-    ChannelLimit,
+    Changed = "changed",
+    ChannelLimit = "channel_limit",
     /// A constraint that the track cannot keep.
-    Constraint,
-    DuplicateId,
-    EmptyFile,
+    Constraint = "constraint",
+    DuplicateId = "duplicate_id",
+    EmptyFile = "empty_file",
     /// What runs a model stopped.
-    Engine,
-    Layout,
-    LengthMismatch,
-    MissingKey,
-    Name,
+    Engine = "engine",
+    Layout = "layout",
+    LengthMismatch = "length_mismatch",
+    MissingKey = "missing_key",
+    Name = "name",
     /// A song without enough beats to dance to.
-    NoBeats,
+    NoBeats = "no_beats",
     /// A phrase with nothing to dance to.
-    NoMusic,
+    NoMusic = "no_music",
     /// A capture that nothing can be danced of.
-    NoPrimitive,
-    NonFinite,
-    NotAFile,
-    NpyFormat,
-    NpzFormat,
+    NoPrimitive = "no_primitive",
+    NonFinite = "non_finite",
+    NotAFile = "not_a_file",
+    NpyFormat = "npy_format",
+    NpzFormat = "npz_format",
     /// The program itself broke on the phrase: a defect of ours, kept from stopping the job.
-    Panic,
-    Pickle,
-    QuaternionNorm,
-    Shape,
-    Symlink,
+    Panic = "panic",
+    Pickle = "pickle",
+    QuaternionNorm = "quaternion_norm",
+    Shape = "shape",
+    Symlink = "symlink",
     /// A tempo that nobody dances to.
-    Tempo,
-    Timeout,
-    TooLarge,
-    TooLong,
-    TooShort,
-    Truncated,
-    Unreadable,
-    Unwritable,
+    Tempo = "tempo",
+    Timeout = "timeout",
+    TooLarge = "too_large",
+    TooLong = "too_long",
+    TooShort = "too_short",
+    Truncated = "truncated",
+    Unreadable = "unreadable",
+    Unwritable = "unwritable",
     /// What is in the store was written by another version of the program.
-    Version,
+    Version = "version",
 }
 
 impl FailureKind {
-    /// Returns the kind as tables spell it.
-    pub fn name(self) -> &'static str {
-        match self {
-            FailureKind::AudioCodec => "audio_codec",
-            FailureKind::AudioData => "audio_data",
-            FailureKind::AudioHeader => "audio_header",
-            FailureKind::AudioNoSamples => "audio_no_samples",
-            FailureKind::AudioNotFinite => "audio_not_finite",
-            FailureKind::AudioSampleRate => "audio_sample_rate",
-            FailureKind::BeatsFormat => "beats_format",
-            FailureKind::BvhFormat => "bvh_format",
-            FailureKind::Changed => "changed",
-            FailureKind::ChannelLimit => "channel_limit",
-            FailureKind::Constraint => "constraint",
-            FailureKind::DuplicateId => "duplicate_id",
-            FailureKind::EmptyFile => "empty_file",
-            FailureKind::Engine => "engine",
-            FailureKind::Layout => "layout",
-            FailureKind::LengthMismatch => "length_mismatch",
-            FailureKind::MissingKey => "missing_key",
-            FailureKind::Name => "name",
-            FailureKind::NoBeats => "no_beats",
-            FailureKind::NoMusic => "no_music",
-            FailureKind::NoPrimitive => "no_primitive",
-            FailureKind::NonFinite => "non_finite",
-            FailureKind::NotAFile => "not_a_file",
-            FailureKind::NpyFormat => "npy_format",
-            FailureKind::NpzFormat => "npz_format",
-            FailureKind::Panic => "panic",
-            FailureKind::Pickle => "pickle",
-            FailureKind::QuaternionNorm => "quaternion_norm",
-            FailureKind::Shape => "shape",
-            FailureKind::Symlink => "symlink",
-            FailureKind::Tempo => "tempo",
-            FailureKind::Timeout => "timeout",
-            FailureKind::TooLarge => "too_large",
-            FailureKind::TooLong => "too_long",
-            FailureKind::TooShort => "too_short",
-            FailureKind::Truncated => "truncated",
-            FailureKind::Unreadable => "unreadable",
-            FailureKind::Unwritable => "unwritable",
-            FailureKind::Version => "version",
-        }
+    /// Returns the kind that a reader names.
+    ///
+    /// # Panics
+    /// When a reader names a kind that does not exist.
+    pub fn of_reader(name: &str) -> Self {
+        let named = Self::ALL.iter().find(|kind| kind.name() == name);
+        *named
+            .unwrap_or_else(|| panic!("invariant: readers know their failure kinds, not {name:?}"))
     }
 }
 
@@ -148,58 +135,29 @@ pub fn guarded<T>(path: &str, work: impl FnOnce() -> Result<T, Failure>) -> Resu
     })
 }
 
-impl FailureKind {
-    /// Every kind, for looking one up by the name that a reader gives.
-    const ALL: [FailureKind; 39] = [
-        FailureKind::AudioCodec,
-        FailureKind::AudioData,
-        FailureKind::AudioHeader,
-        FailureKind::AudioNoSamples,
-        FailureKind::AudioNotFinite,
-        FailureKind::AudioSampleRate,
-        FailureKind::BeatsFormat,
-        FailureKind::BvhFormat,
-        FailureKind::Changed,
-        FailureKind::ChannelLimit,
-        FailureKind::Constraint,
-        FailureKind::DuplicateId,
-        FailureKind::EmptyFile,
-        FailureKind::Engine,
-        FailureKind::Layout,
-        FailureKind::LengthMismatch,
-        FailureKind::MissingKey,
-        FailureKind::Name,
-        FailureKind::NoBeats,
-        FailureKind::NoMusic,
-        FailureKind::NoPrimitive,
-        FailureKind::NonFinite,
-        FailureKind::NotAFile,
-        FailureKind::NpyFormat,
-        FailureKind::NpzFormat,
-        FailureKind::Panic,
-        FailureKind::Pickle,
-        FailureKind::QuaternionNorm,
-        FailureKind::Shape,
-        FailureKind::Symlink,
-        FailureKind::Tempo,
-        FailureKind::Timeout,
-        FailureKind::TooLarge,
-        FailureKind::TooLong,
-        FailureKind::TooShort,
-        FailureKind::Truncated,
-        FailureKind::Unreadable,
-        FailureKind::Unwritable,
-        FailureKind::Version,
-    ];
+/// Failures that a summary spells out; the rest are in the table.
+pub(in crate::stages) const N_SHOWN: usize = 10;
 
-    /// Returns the kind that a reader names.
-    ///
-    /// # Panics
-    /// When a reader names a kind that does not exist.
-    pub fn of_reader(name: &str) -> Self {
-        Self::ALL
-            .into_iter()
-            .find(|kind| kind.name() == name)
-            .unwrap_or_else(|| panic!("invariant: readers know their failure kinds, not {name:?}"))
+/// Writes the first failures of a job, each with its name and sentence, and where to find all of them.
+pub(in crate::stages) fn write_failures<'a, N: fmt::Display>(
+    out: &mut dyn Write,
+    failed: impl ExactSizeIterator<Item = (N, &'a Failure)>,
+    store: Option<&str>,
+) -> io::Result<()> {
+    let n_failed = failed.len();
+    for (name, failure) in failed.take(N_SHOWN) {
+        writeln!(out, "  failed [{}] {name}: {}", failure.kind.name(), failure.message)?;
     }
+    if n_failed > N_SHOWN {
+        writeln!(out, "  … and {} more", n_failed - N_SHOWN)?;
+    }
+    match store {
+        Some(store) if n_failed > 0 => writeln!(out, "  all of them: {}", query_of_failures(store)),
+        _ => Ok(()),
+    }
+}
+
+/// Returns the command that shows the failures of a store.
+pub(in crate::stages) fn query_of_failures(store: &str) -> String {
+    format!("motiongen query --store {store} \"select phrase_id, kind, message from failures\"")
 }

@@ -21,6 +21,7 @@ mod trained;
 pub mod view;
 
 use std::io::{self, Write};
+use std::num::NonZeroUsize;
 
 use crate::store::ClientOptions;
 
@@ -98,6 +99,11 @@ pub trait Summary {
 
     /// Returns how many items failed; they are in the `failures` table.
     fn n_failed(&self) -> u64;
+}
+
+/// Returns how many threads this machine runs side by side, the default of every stage that has workers.
+pub(in crate::stages) fn all_threads() -> NonZeroUsize {
+    std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN)
 }
 
 /// How remote storage is used; the same flags in every stage.

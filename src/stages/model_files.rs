@@ -8,6 +8,7 @@ use anyhow::{Context as _, bail};
 use bytes::Bytes;
 use sha2::{Digest as _, Sha256};
 
+use super::all_threads;
 use crate::autodiff::Parameters;
 use crate::generation::{
     CardError, EagerEngine, Engine, FileEntry, ModelCard, OnnxEngine, SessionPlan, file_names,
@@ -43,10 +44,6 @@ pub struct EngineParams {
     /// Folder for models as this machine's processor likes them [default: ~/.cache/motiongen]
     #[arg(long, value_name = "DIR", help_heading = "Engine")]
     pub model_cache: Option<PathBuf>,
-}
-
-fn all_threads() -> NonZeroUsize {
-    std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN)
 }
 
 impl EngineParams {

@@ -5,19 +5,17 @@ use std::sync::Arc;
 
 use ndarray::Array3;
 
-use crate::autodiff::{
-    AdamW, Arena, Eager, Gradients, Interpreter, Parameters, Stream, Tape, Threads,
-};
+use crate::autodiff::{Arena, Eager, Gradients, Interpreter, Parameters, Stream, Tape, Threads};
 use crate::diffusion::{Schedule, ddim_update};
 use crate::model::{DecoderConfig, MotionDecoder, ParameterList};
 use crate::motion::{Channel, ChannelLimits, MOTION_DIM, Normalizer};
 use crate::weights::{Archive, Section};
 
+use super::averaged::Averaged;
 use super::checkpoint::Progress;
 use super::config::DecoderTraining;
-use super::diffusion::{AVERAGE, MOMENTS, section, tape_seed};
+use super::diffusion::tape_seed;
 use super::drive::{Alone, Learner, Losses, Reducer, Step, Validation};
-use super::ema::Ema;
 use super::error::TrainingError;
 use super::objective::{Reconstruction, reconstruction};
 use super::sampling::{Condition, Denoiser, motion_view};
@@ -35,10 +33,8 @@ const STARTS: u64 = 7 << 60;
 /// Trains a decoder on the latents of a UNet that stays as it is.
 pub struct DecoderLearner<'u> {
     decoder: MotionDecoder,
-    parameters: Parameters<f32>,
+    network: Averaged,
     gradients: Gradients<f32>,
-    optimizer: AdamW<f32>,
-    ema: Ema<f32>,
     arena: Arena<f32>,
     threads: Arc<Threads>,
     denoiser: Denoiser<'u>,
@@ -64,9 +60,7 @@ impl<'u> DecoderLearner<'u> {
         Self {
             decoder,
             gradients: Gradients::new(&parameters),
-            optimizer: AdamW::new(config.optimizer.adamw(), &parameters),
-            ema: Ema::new(config.ema, &parameters),
-            parameters,
+            network: Averaged::new(DECODER, parameters, &config.optimizer, config.ema),
             arena: Arena::default(),
             threads: Arc::new(Threads::of_process()),
             denoiser,
@@ -158,7 +152,7 @@ impl<'u> DecoderLearner<'u> {
         let latents = self.latents(batch, is_sampled, step)?;
         self.gradients.clear();
         let seed = tape_seed(self.seed, step);
-        let mut tape = Tape::new(&self.parameters, &self.arena, Some(seed));
+        let mut tape = Tape::new(self.network.live(), &self.arena, Some(seed));
         let found = self.losses(&mut tape, batch, &latents)?;
         let losses = named(&found);
         tape.backward(found.all, &mut self.gradients)?;
@@ -249,14 +243,8 @@ impl Learner for DecoderLearner<'_> {
         let learning_rate = self.config.learning_rate.at(step, n_steps);
         threads.run(|| {
             let losses = self.differentiate(batch, step)?;
-            let gradient_norm = if losses.total.is_finite() {
-                self.optimizer.step(&mut self.parameters, &mut self.gradients, learning_rate)
-            } else {
-                f64::NAN
-            };
-            if gradient_norm.is_finite() {
-                self.ema.after_step(step + 1, &self.parameters);
-            }
+            let gradient_norm =
+                self.network.step(&mut self.gradients, losses.total, learning_rate, step);
             Ok(Step { losses, gradient_norm, learning_rate, lr_decoder: None })
         })
     }
@@ -277,29 +265,21 @@ impl Learner for DecoderLearner<'_> {
 
     fn validate(&mut self) -> Result<Validation, TrainingError> {
         let threads = Arc::clone(&self.threads);
-        let losses = threads.run(|| self.validation_losses(self.ema.average()))?;
-        let live = threads.run(|| self.validation_losses(&self.parameters))?.total;
+        let losses = threads.run(|| self.validation_losses(self.network.average()))?;
+        let live = threads.run(|| self.validation_losses(self.network.live()))?.total;
         Ok(Validation { losses, live: Some(live) })
     }
 
     fn sections(&self) -> Vec<Section<'_, f32>> {
-        let plan = self.parameters.plan();
-        let ([m, v], _) = self.optimizer.state();
-        vec![
-            Section { prefix: DECODER, plan, values: self.parameters.all() },
-            Section { prefix: AVERAGE, plan, values: self.ema.average().all() },
-            Section { prefix: MOMENTS[0], plan, values: m },
-            Section { prefix: MOMENTS[1], plan, values: v },
-        ]
+        self.network.sections()
     }
 
     fn best(&self) -> Vec<Section<'_, f32>> {
-        let plan = self.parameters.plan();
-        vec![Section { prefix: DECODER, plan, values: self.ema.average().all() }]
+        self.network.best()
     }
 
     fn n_updates(&self) -> (u64, u64) {
-        (self.optimizer.state().1, self.ema.n_updates())
+        self.network.n_updates()
     }
 
     fn restore(
@@ -308,12 +288,6 @@ impl Learner for DecoderLearner<'_> {
         place: &str,
         at: &Progress,
     ) -> Result<(), TrainingError> {
-        let read = |prefix: &str| section(archive, prefix, &self.parameters, place);
-        let (parameters, average) = (read(DECODER)?, read(AVERAGE)?);
-        let [m, v] = [read(MOMENTS[0])?, read(MOMENTS[1])?];
-        self.optimizer.restore([m.all(), v.all()], at.n_updates);
-        self.ema = Ema::resume(self.config.ema, average, at.n_averaged);
-        self.parameters = parameters;
-        Ok(())
+        self.network.restore(archive, place, at)
     }
 }

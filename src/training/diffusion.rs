@@ -2,19 +2,17 @@
 
 use std::sync::Arc;
 
-use crate::autodiff::{
-    AdamW, Arena, Eager, Gradients, Interpreter, Parameters, Tape, Tensor, Threads,
-};
+use crate::autodiff::{Arena, Eager, Gradients, Interpreter, Parameters, Tape, Tensor, Threads};
 use crate::diffusion::Schedule;
 use crate::model::{UNet1D, UNetInputs};
 use crate::motion::MOTION_DIM;
 use crate::motion::style::STYLE_DIM;
 use crate::weights::{Archive, Section};
 
+use super::averaged::Averaged;
 use super::checkpoint::Progress;
 use super::config::{DiffusionTraining, NetworkConfig};
 use super::drive::{Alone, Learner, Losses, Reducer, Step, Validation};
-use super::ema::Ema;
 use super::error::TrainingError;
 use super::objective::Objective;
 use super::sampling::{Denoiser, is_partial, motion_view};
@@ -25,19 +23,24 @@ const MIN_VALIDATION_WINDOWS: usize = 256;
 /// A validation of a large library stops here, always at the same windows.
 const MAX_VALIDATION_WINDOWS: usize = 1024;
 
-/// Names of a file's sections.
+/// Name of the section of the UNet's weights.
 pub(super) const UNET: &str = "unet.";
-pub(super) const AVERAGE: &str = "ema.";
-pub(super) const MOMENTS: [&str; 2] = ["adam.m.", "adam.v."];
+
+/// Losses on the validation windows that a trained network should be far below.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Baselines {
+    /// Of the mean of all that was to be told, which is the best constant for squared errors.
+    pub constant: f64,
+    /// Of nothing: the last convolution of a UNet begins with zeros.
+    pub untrained: f64,
+}
 
 /// Trains a UNet.
 pub struct DiffusionLearner {
     unet: Arc<UNet1D>,
-    parameters: Parameters<f32>,
+    network: Averaged,
     /// Of the parts that are done side by side; the first gathers all.
     gradients: Vec<Gradients<f32>>,
-    optimizer: AdamW<f32>,
-    ema: Ema<f32>,
     /// Of the parts that are done side by side.
     arenas: Vec<Arena<f32>>,
     threads: Arc<Threads>,
@@ -68,9 +71,7 @@ impl DiffusionLearner {
             gradients: (0..config.side_by_side.max(1))
                 .map(|_| Gradients::new(&parameters))
                 .collect(),
-            optimizer: AdamW::new(config.optimizer.adamw(), &parameters),
-            ema: Ema::new(config.ema, &parameters),
-            parameters,
+            network: Averaged::new(UNET, parameters, &config.optimizer, config.ema),
             arenas: (0..config.side_by_side.max(1)).map(|_| Arena::default()).collect(),
             threads: Arc::new(Threads::of_process()),
             schedule: Schedule::new(&network.diffusion)?,
@@ -103,7 +104,7 @@ impl DiffusionLearner {
         let Self {
             gradients,
             arenas,
-            parameters,
+            network,
             unet,
             schedule,
             config,
@@ -113,6 +114,7 @@ impl DiffusionLearner {
             ..
         } = &mut *self;
         let (withhold, takes_style, seed) = (Withhold::of(config), *takes_style, *seed);
+        let parameters = network.live();
         gradients.iter_mut().for_each(Gradients::clear);
         let mut loss = 0.0;
         for first in (0..n_parts).step_by(side_by_side) {
@@ -143,30 +145,62 @@ impl DiffusionLearner {
 
     /// Returns the mean loss of the validation windows with some weights, nothing dropped.
     fn validation_loss(&self, parameters: &Parameters<f32>) -> Result<f64, TrainingError> {
+        let [loss] = self.mean_over_validation(|given| {
+            let mut g = Eager::new(parameters, &self.arenas[0]);
+            let loss = given.loss(&mut g, &self.unet, &self.schedule, &self.config.objective)?;
+            Ok([loss.scalar().into()])
+        })?;
+        Ok(loss)
+    }
+
+    /// Returns what is lost on the validation windows by those who do not look.
+    ///
+    /// # Errors
+    /// What reading the windows says.
+    pub fn baselines(&self) -> Result<Baselines, TrainingError> {
+        let mean = self.mean_over_validation(|given| Ok(given.mean_target()))?;
+        let [constant, untrained] = self.mean_over_validation(|given| {
+            let batch = given.batch;
+            let shape = [batch.n_windows, batch.n_frames, MOTION_DIM];
+            let mut g = Eager::new(self.network.live(), &self.arenas[0]);
+            let mut loss_of = |frame: [f32; MOTION_DIM]| {
+                let says = g.constant(&shape, &frame.repeat(batch.n_windows * batch.n_frames));
+                let loss = given.loss_of(&mut g, &says, &self.schedule, &self.config.objective)?;
+                Ok::<_, TrainingError>(loss.scalar().into())
+            };
+            Ok([loss_of(mean.map(|x| x as f32))?, loss_of([0.0; MOTION_DIM])?])
+        })?;
+        Ok(Baselines { constant, untrained })
+    }
+
+    /// Returns the means of some numbers over the frames of the validation windows, nothing dropped.
+    fn mean_over_validation<const N: usize>(
+        &self,
+        of: impl Fn(&Given) -> Result<[f64; N], TrainingError> + Sync,
+    ) -> Result<[f64; N], TrainingError> {
         let n = self.windows.n_validation();
         let n_wanted = n.clamp(MIN_VALIDATION_WINDOWS, MAX_VALIDATION_WINDOWS);
-        let (mut sum, mut count) = (0.0, 0.0);
+        let (mut sums, mut count) = ([0.0; N], 0.0);
         let size = self.config.batch_size.min(32);
         for first in (0..n_wanted).step_by(size) {
             let batch = self.windows.validation(first..(first + size).min(n_wanted))?;
             let weight: f64 = batch.mask.iter().map(|&w| f64::from(w)).sum();
             let given =
                 Given::of(&batch, &self.schedule, Withhold::of(&self.config), self.takes_style);
-            let loss = self.threads.run(|| {
-                let mut g = Eager::new(parameters, &self.arenas[0]);
-                given.loss(&mut g, &self.unet, &self.schedule, &self.config.objective)
-            })?;
-            sum += weight * f64::from(loss.scalar());
+            let found = self.threads.run(|| of(&given))?;
+            for (sum, value) in sums.iter_mut().zip(found) {
+                *sum += weight * value;
+            }
             count += weight;
         }
-        Ok(sum / count.max(1.0))
+        Ok(sums.map(|sum| sum / count.max(1.0)))
     }
 
     /// Returns the UNet with its averaged weights, for sampling.
     pub fn denoiser(&self) -> Denoiser<'_> {
         Denoiser {
             unet: &self.unet,
-            parameters: self.ema.average(),
+            parameters: self.network.average(),
             arena: &self.arenas[0],
             takes_style: self.takes_style,
         }
@@ -253,9 +287,33 @@ impl<'a> Given<'a> {
         objective: &Objective,
     ) -> Result<Tensor<f32>, TrainingError> {
         let y = self.predict(g, unet)?;
-        let target = g.constant(y.shape(), &self.target);
+        self.loss_of(g, &y, schedule, objective)
+    }
+
+    /// Returns the loss of any prediction, \[batch, frames, 25\].
+    fn loss_of<I: Interpreter<Element = f32>>(
+        &self,
+        g: &mut I,
+        prediction: &Tensor<f32>,
+        schedule: &Schedule,
+        objective: &Objective,
+    ) -> Result<Tensor<f32>, TrainingError> {
+        let target = g.constant(prediction.shape(), &self.target);
         let mask = &self.batch.mask;
-        Ok(objective.loss(g, schedule, &self.t, [&y, &target], mask)?)
+        Ok(objective.loss(g, schedule, &self.t, [prediction, &target], mask)?)
+    }
+
+    /// Returns the mean of what should be told, channel by channel, over frames that count.
+    fn mean_target(&self) -> [f64; MOTION_DIM] {
+        let (mut sums, mut n) = ([0.0; MOTION_DIM], 0.0);
+        for (frame, &w) in self.target.chunks_exact(MOTION_DIM).zip(&self.batch.mask) {
+            let w = f64::from(w);
+            for (sum, &x) in sums.iter_mut().zip(frame) {
+                *sum += w * f64::from(x);
+            }
+            n += w;
+        }
+        sums.map(|sum| sum / n.max(1.0))
     }
 
     /// Returns the network's prediction, \[batch, frames, 25\].
@@ -294,17 +352,9 @@ impl Learner for DiffusionLearner {
     fn step(&mut self, batch: &Batch, step: u64, n_steps: u64) -> Result<Step, TrainingError> {
         let loss = self.differentiate(batch, step)?;
         let learning_rate = self.config.learning_rate.at(step, n_steps);
-        // A loss that is not finite has a gradient that is not, and then the optimizer does nothing.
-        let gradient_norm = if loss.is_finite() {
-            let Self { optimizer, parameters, gradients, .. } = self;
-            self.threads.run(|| optimizer.step(parameters, &mut gradients[0], learning_rate))
-        } else {
-            f64::NAN
-        };
-        if gradient_norm.is_finite() {
-            let Self { ema, parameters, .. } = self;
-            self.threads.run(|| ema.after_step(step + 1, parameters));
-        }
+        let Self { network, gradients, threads, .. } = self;
+        let gradient_norm =
+            threads.run(|| network.step(&mut gradients[0], loss, learning_rate, step));
         let losses = Losses { total: loss, parts: vec![("diffusion", loss)] };
         Ok(Step { losses, gradient_norm, learning_rate, lr_decoder: None })
     }
@@ -314,30 +364,22 @@ impl Learner for DiffusionLearner {
     }
 
     fn validate(&mut self) -> Result<Validation, TrainingError> {
-        let loss = self.validation_loss(self.ema.average())?;
-        let live = self.validation_loss(&self.parameters)?;
+        let loss = self.validation_loss(self.network.average())?;
+        let live = self.validation_loss(self.network.live())?;
         let losses = Losses { total: loss, parts: vec![("diffusion", loss)] };
         Ok(Validation { losses, live: Some(live) })
     }
 
     fn sections(&self) -> Vec<Section<'_, f32>> {
-        let plan = self.parameters.plan();
-        let ([m, v], _) = self.optimizer.state();
-        vec![
-            Section { prefix: UNET, plan, values: self.parameters.all() },
-            Section { prefix: AVERAGE, plan, values: self.ema.average().all() },
-            Section { prefix: MOMENTS[0], plan, values: m },
-            Section { prefix: MOMENTS[1], plan, values: v },
-        ]
+        self.network.sections()
     }
 
     fn best(&self) -> Vec<Section<'_, f32>> {
-        let plan = self.parameters.plan();
-        vec![Section { prefix: UNET, plan, values: self.ema.average().all() }]
+        self.network.best()
     }
 
     fn n_updates(&self) -> (u64, u64) {
-        (self.optimizer.state().1, self.ema.n_updates())
+        self.network.n_updates()
     }
 
     fn restore(
@@ -346,27 +388,8 @@ impl Learner for DiffusionLearner {
         place: &str,
         at: &Progress,
     ) -> Result<(), TrainingError> {
-        let read = |prefix: &str| section(archive, prefix, &self.parameters, place);
-        let (parameters, average) = (read(UNET)?, read(AVERAGE)?);
-        let [m, v] = [read(MOMENTS[0])?, read(MOMENTS[1])?];
-        self.optimizer.restore([m.all(), v.all()], at.n_updates);
-        self.ema = Ema::resume(self.config.ema, average, at.n_averaged);
-        self.parameters = parameters;
-        Ok(())
+        self.network.restore(archive, place, at)
     }
-}
-
-/// Reads a section of a checkpoint that lies as `like` does.
-pub(super) fn section(
-    archive: &Archive,
-    prefix: &str,
-    like: &Parameters<f32>,
-    place: &str,
-) -> Result<Parameters<f32>, TrainingError> {
-    let place = place.to_owned();
-    archive
-        .section(prefix, like.list().clone())
-        .map_err(|source| TrainingError::Weights { place, source })
 }
 
 #[cfg(test)]

@@ -21,10 +21,11 @@ use crate::motion::{Channel, MOTION_DIM};
 use crate::units::FPS;
 use crate::weights::{Archive, Section};
 
+use super::averaged::{MOMENTS, section};
 use super::checkpoint::Progress;
 use super::config::{FinetuneConfig, NetworkConfig};
 use super::decoder::DECODER;
-use super::diffusion::{Given, MOMENTS, UNET, Withhold, section, tape_seed};
+use super::diffusion::{Given, UNET, Withhold, tape_seed};
 use super::drive::{Alone, Learner, Losses, Reducer, Step, Validation};
 use super::error::TrainingError;
 use super::objective::{Objective, reconstruction};

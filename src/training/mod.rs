@@ -4,6 +4,7 @@
 //! makes them into batches ahead of time. What is learned and what that costs is in `objective` and
 //! `temporal`. Everything depends on seeds and numbers of steps, nothing on threads or clocks.
 
+mod averaged;
 mod checkpoint;
 mod config;
 mod dataset;
@@ -29,7 +30,7 @@ pub use config::{
 };
 pub use dataset::{Dataset, DatasetError, LeftOut, Phrase, Reading, Split};
 pub use decoder::DecoderLearner;
-pub use diffusion::{DiffusionLearner, Given, Withhold};
+pub use diffusion::{Baselines, DiffusionLearner, Given, Withhold};
 pub use drive::{Alone, Drive, End, Learner, Losses, Plan, Reducer, Step, Validation, Watch};
 pub use ema::{Ema, EmaConfig};
 pub use error::TrainingError;

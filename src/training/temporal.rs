@@ -10,10 +10,8 @@ use crate::autodiff::op::reduce::{Over, Reduce};
 use crate::autodiff::{Element, Interpreter, Tensor};
 use crate::model::{Activation, Graph, Result};
 use crate::motion::Channel;
+use crate::motion::phase::WRAP_BARS;
 use crate::units::FPS;
-
-/// A phase that falls by more than this has begun a new bar.
-const WRAP: f64 = 0.5;
 
 /// Weights and targets of the losses; the defaults are the reference's \[7.2\].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -166,7 +164,7 @@ pub fn temporal_losses<I: Interpreter>(
     let is_fall: Vec<I::Element> = change
         .data()
         .iter()
-        .map(|d| if d.to_f64() < -WRAP { I::Element::ZERO } else { I::Element::ONE })
+        .map(|d| if d.to_f64() < -WRAP_BARS { I::Element::ZERO } else { I::Element::ONE })
         .collect();
     let is_fall = g.constant(change.shape(), &is_fall);
     let change = g.mul(&change, &is_fall)?;

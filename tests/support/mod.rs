@@ -12,6 +12,7 @@
 #![allow(dead_code)]
 
 pub mod files;
+pub mod plots;
 
 use std::collections::BTreeMap;
 use std::ffi::OsStr;

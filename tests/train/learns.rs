@@ -31,6 +31,24 @@ fn a_run_learns_and_its_log_has_every_step() {
     assert!((loss(steps[0]) - 1.0).abs() < 0.1, "{}", loss(steps[0]));
     let best = validations.iter().map(|row| loss(row)).fold(f64::INFINITY, f64::min);
     assert!(best < 0.9, "validation loss {best}");
+    // The summary holds it against what is lost without looking: the variance of 256 windows of noise, 1 within
+    // 0.02 (five standard deviations of 150,000 squares), of which their mean can take no more than that.
+    let said = output.stdout.lines().next().unwrap_or_default();
+    let numbers: Vec<f64> = said
+        .split(&[' ', '(', ')', ','][..])
+        .map(|word| word.trim_end_matches(|c: char| !c.is_ascii_digit()))
+        .filter_map(|word| word.parse().ok())
+        .collect();
+    let [_, _, said_best, _, below_constant, constant, below_untrained, untrained] = numbers[..]
+    else {
+        panic!("{said}");
+    };
+    assert!((said_best - best).abs() < 1e-4, "{said}");
+    assert!((untrained - 1.0).abs() < 0.02 && constant <= untrained, "{said}");
+    assert!(untrained - constant < 0.02, "{said}");
+    for (below, loss) in [(below_constant, constant), (below_untrained, untrained)] {
+        assert!((below - 100.0 * (1.0 - best / loss)).abs() < 0.6, "{said}");
+    }
     // The epoch's row is the mean of its steps: the first is over within step 4.
     let first = of_kind("epoch")[0];
     let mean = steps[..4].iter().map(|row| loss(row)).sum::<f64>() / 4.0;

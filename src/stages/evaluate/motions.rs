@@ -4,9 +4,10 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use anyhow::bail;
 
-use crate::evaluation::locking::{since_start, unwrapped};
+use crate::evaluation::locking::since_start;
 use crate::evaluation::metrics::Music;
 use crate::motion::bar_phase;
+use crate::motion::phase::unwrapped;
 use crate::stages::generate::{beats_in_bars, beats_of, url_of};
 use crate::stages::plot::nearest::nearest;
 use crate::store::tables::{GenerationRow, PhraseRow};

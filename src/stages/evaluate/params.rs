@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use anyhow::ensure;
 
 use crate::motion::ChannelLimits;
-use crate::stages::ClientParams;
+use crate::stages::{ClientParams, all_threads};
 use crate::store::digest;
 
 /// Raised when evaluate writes something else for the same motions and settings.
@@ -34,8 +34,7 @@ pub struct Params {
     #[arg(long, value_enum, default_value_t = ChannelLimits::Wide)]
     pub limits: ChannelLimits,
     /// Threads that measure motions [default: all cores]
-    #[arg(long, value_name = "N", default_value_t =
-          std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN))]
+    #[arg(long, value_name = "N", default_value_t = all_threads())]
     pub threads: NonZeroUsize,
     /// The page, FILE.html; written whole or not at all.
     #[arg(long, value_name = "FILE", help_heading = "Report")]

@@ -10,8 +10,8 @@ use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use super::failure::Failure;
-use super::{ClientParams, Contract, Progress, Stage, Summary};
+use super::failure::{Failure, N_SHOWN, write_failures};
+use super::{ClientParams, Contract, Progress, Stage, Summary, all_threads};
 use crate::audio::Tuning;
 use crate::store::{Location, Shard, digest};
 
@@ -20,9 +20,6 @@ pub(in crate::stages) use one::{Origin, extract, needed_bytes};
 
 /// Raised when extract writes something else for the same input and parameters.
 const OUTPUT_VERSION: u32 = 1;
-
-/// Files and failures that the summary spells out.
-const N_SHOWN: usize = 10;
 
 /// The stage.
 pub struct Extract;
@@ -48,7 +45,7 @@ pub struct Params {
     #[arg(long, value_name = "I/N", default_value_t = Shard::WHOLE.to_string())]
     pub shard: String,
     /// Files under way at once.
-    #[arg(long, value_name = "N", default_value_t = default_workers())]
+    #[arg(long, value_name = "N", default_value_t = all_threads())]
     pub workers: NonZeroUsize,
     /// Memory that the files under way may take, in GB (10^9 bytes); a file that needs more is done
     /// alone.
@@ -68,10 +65,6 @@ pub struct Params {
     /// Do every phrase again, done or not.
     #[arg(long)]
     pub force: bool,
-}
-
-fn default_workers() -> NonZeroUsize {
-    std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN)
 }
 
 /// What both ways of running share.
@@ -245,20 +238,11 @@ impl Summary for Report {
                 writeln!(out, "  {line}")?;
             }
         }
-        for (name, failure) in done.failed.iter().take(N_SHOWN) {
-            writeln!(out, "  failed [{}] {name}: {}", failure.kind.name(), failure.message)?;
-        }
-        if n_failed > N_SHOWN {
-            writeln!(out, "  … and {} more", n_failed - N_SHOWN)?;
-        }
-        if let (Place::Store(store), true) = (&*place, n_failed > 0) {
-            writeln!(
-                out,
-                "  all of them: motiongen query --store {store} \
-                 \"select phrase_id, kind, message from failures\""
-            )?;
-        }
-        Ok(())
+        let store = match place {
+            Place::Store(store) => Some(store.as_str()),
+            Place::Files(_) => None,
+        };
+        write_failures(out, done.failed.iter().map(|(name, why)| (name, why)), store)
     }
 
     fn n_failed(&self) -> u64 {

@@ -15,7 +15,7 @@ use std::time::Instant;
 
 use anyhow::bail;
 
-use super::failure::Failure;
+use super::failure::{Failure, N_SHOWN, write_failures};
 use super::model_files::{OpenModel, sha256};
 use super::retrieval::Primer;
 use super::{Contract, Progress, Stage, Summary};
@@ -31,9 +31,6 @@ pub use params::{Params, SamplerName, Tracks};
 pub(in crate::stages) use files::listen;
 pub(in crate::stages) use maker::generation_id;
 pub(in crate::stages) use tracks::{beats_in_bars, beats_of, url_of};
-
-/// Motions and failures that the summary spells out.
-const N_SHOWN: usize = 10;
 
 /// The stage.
 pub struct Generate;
@@ -261,12 +258,11 @@ impl Summary for Report {
                 writeln!(out, "    {}", file.display())?;
             }
         }
-        for (name, failure) in done.failed.iter().take(N_SHOWN) {
-            writeln!(out, "  failed [{}] {name}: {}", failure.kind.name(), failure.message)?;
-        }
-        if n_failed > N_SHOWN {
-            writeln!(out, "  … and {} more", n_failed - N_SHOWN)?;
-        }
+        let url = match place {
+            Place::Store { store, .. } => Some(store.as_str()),
+            Place::Folder(_) => None,
+        };
+        write_failures(out, done.failed.iter().map(|(name, why)| (name, why)), url)?;
         if let Place::Store { store, run } = place {
             if done.is_interrupted {
                 writeln!(out, "  stopped as asked; the same command goes on with what is missing")?;

@@ -9,19 +9,16 @@ use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::time::Instant;
 
-use super::{ClientParams, Contract, Progress, Stage, Summary};
+use super::{ClientParams, Contract, Progress, Stage, Summary, all_threads};
 use crate::store::{Cache, Ledger, Location, Shard, Source, StoreError, digest};
 
-use super::failure::Failure;
+use super::failure::{Failure, write_failures};
 pub use layout::{Layout, Plan, Planned, Role, plan};
 pub use phrase::{Rules, content_hash_of_audio};
 pub(in crate::stages) use phrase::{read_beats, read_bvh, read_trajectory};
 
 /// Raised when ingest writes something else for the same input and rules.
 const OUTPUT_VERSION: u32 = 1;
-
-/// Failures that the summary spells out; the rest are in the table.
-const N_SHOWN: usize = 10;
 
 /// The stage.
 pub struct Ingest;
@@ -44,7 +41,7 @@ pub struct Params {
     #[arg(long, value_name = "I/N", default_value_t = Shard::WHOLE.to_string())]
     pub shard: String,
     /// Batches under way at once.
-    #[arg(long, value_name = "N", default_value_t = default_workers())]
+    #[arg(long, value_name = "N", default_value_t = all_threads())]
     pub workers: NonZeroUsize,
     /// Phrases committed together, about; also how many a kill can cost each worker.
     #[arg(long, value_name = "N", default_value_t = NonZeroUsize::new(512).expect("512 is not 0"))]
@@ -66,10 +63,6 @@ pub struct Params {
     /// Read every file again instead of trusting its size and time (or entity tag).
     #[arg(long)]
     pub verify: bool,
-}
-
-fn default_workers() -> NonZeroUsize {
-    std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN)
 }
 
 impl Stage for Ingest {
@@ -245,21 +238,9 @@ impl Summary for Report {
             let n = self.ignored.len();
             writeln!(out, "  {n} files belong to no phrase and were left alone, such as {first}")?;
         }
-        for Refused { id, failure } in tally.failed.iter().take(N_SHOWN) {
-            writeln!(out, "  failed [{}] phrase {id}: {}", failure.kind.name(), failure.message)?;
-        }
-        if n_failed > N_SHOWN {
-            writeln!(out, "  … and {} more", n_failed - N_SHOWN)?;
-        }
-        if n_failed > 0 && !self.dry_run {
-            let store = &self.store;
-            writeln!(
-                out,
-                "  all of them: motiongen query --store {store} \
-                 \"select phrase_id, kind, message from failures\""
-            )?;
-        }
-        Ok(())
+        let failed =
+            tally.failed.iter().map(|refused| (format!("phrase {}", refused.id), &refused.failure));
+        write_failures(out, failed, (!self.dry_run).then_some(&self.store))
     }
 
     fn n_failed(&self) -> u64 {

@@ -16,7 +16,7 @@ use super::{Params, one, params_hash};
 use crate::stages::Progress;
 use crate::stages::extract::needed_bytes;
 use crate::stages::extract::pool::{self, Budget, lock};
-use crate::stages::failure::guarded;
+use crate::stages::failure::{guarded, query_of_failures};
 use crate::store::{ClientOptions, Ledger, Location};
 
 /// Memory that songs under way may take while their audio is decoded.
@@ -110,10 +110,9 @@ impl Job<'_> {
         if !todo.is_empty() && loaded.repertoire.primitives().is_empty() {
             let first = loaded.failed.first().map_or(String::new(), |(_, _, f)| f.message.clone());
             bail!(
-                "none of the {} captures can be danced ({first}); name others with --captures; all \
-                 of them: motiongen query --store {} \"select phrase_id, kind, message from failures\"",
+                "none of the {} captures can be danced ({first}); name others with --captures; all of them: {}",
                 capture_names.len(),
-                self.store
+                query_of_failures(&self.store.to_string())
             );
         }
         self.dance(songs, todo, &writer, report)?;
@@ -125,10 +124,9 @@ impl Job<'_> {
         if report.tally.n_done + report.tally.n_unchanged == 0 {
             let first = report.tally.failed.first().map_or("", |(_, f)| f.message.as_str());
             bail!(
-                "none of the {} songs can be danced to ({first}); all of them: motiongen query --store \
-                 {} \"select phrase_id, kind, message from failures\"",
+                "none of the {} songs can be danced to ({first}); all of them: {}",
                 songs.songs.len(),
-                self.store
+                query_of_failures(&self.store.to_string())
             );
         }
         Ok(())

@@ -17,7 +17,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use super::failure::{Failure, FailureKind};
-use super::{ClientParams, Contract, Progress, Stage, Summary};
+use super::{ClientParams, Contract, Progress, Stage, Summary, all_threads};
 use crate::store::{Ledger, Location, StoreError, digest};
 use captures::Captures;
 use job::Job;
@@ -60,7 +60,7 @@ pub struct Params {
     #[arg(long, value_name = "N|FRACTION", default_value_t = Share::Fraction(0.1))]
     pub test_songs: Share,
     /// Songs under way at once.
-    #[arg(long, value_name = "N", default_value_t = default_workers())]
+    #[arg(long, value_name = "N", default_value_t = all_threads())]
     pub workers: NonZeroUsize,
     #[command(flatten)]
     pub client: ClientParams,
@@ -89,10 +89,6 @@ pub struct Rules {
     /// Chooses other dances of the same songs and captures.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
-}
-
-fn default_workers() -> NonZeroUsize {
-    std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN)
 }
 
 impl Stage for Library {

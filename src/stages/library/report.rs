@@ -7,10 +7,7 @@ use std::path::PathBuf;
 use super::songs::Song;
 use super::write::Written;
 use crate::stages::Summary;
-use crate::stages::failure::Failure;
-
-/// Failures that the summary spells out; the rest are in the table.
-const N_SHOWN: usize = 10;
+use crate::stages::failure::{Failure, write_failures};
 
 /// What became of songs and captures.
 #[derive(Debug, Default)]
@@ -105,20 +102,7 @@ impl Summary for Report {
         if let Some(output) = output {
             writeln!(out, "  files: {}", output.display())?;
         }
-        for (name, failure) in tally.failed.iter().take(N_SHOWN) {
-            writeln!(out, "  failed [{}] {name}: {}", failure.kind.name(), failure.message)?;
-        }
-        if n_failed > N_SHOWN {
-            writeln!(out, "  … and {} more", n_failed - N_SHOWN)?;
-        }
-        if n_failed > 0 {
-            writeln!(
-                out,
-                "  all of them: motiongen query --store {store} \
-                 \"select phrase_id, kind, message from failures\""
-            )?;
-        }
-        Ok(())
+        write_failures(out, tally.failed.iter().map(|(name, why)| (name, why)), Some(store))
     }
 
     fn n_failed(&self) -> u64 {

@@ -1,7 +1,6 @@
 //! `plot features`: the blocks of features of a file or a phrase, one panel each.
 
 use std::fs::File;
-use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use anyhow::{anyhow, bail};
@@ -16,8 +15,9 @@ use crate::stages::failure::{Failure, guarded};
 use crate::stages::{ClientParams, Stage as _, Summary};
 use crate::store::tables::{self, BeatRow, ExtractionRow, FailureRow, PhraseRow};
 use crate::store::{ItemTables, Location, Row as _, Snapshot, StoreError};
-use crate::units::{frames_to_s, s_to_frames};
+use crate::units::frames_to_s;
 
+use super::excerpt::ExcerptParams;
 use super::nearest::nearest;
 use super::output::{Drawn, WIDTHS_PX, format_of, write_picture};
 
@@ -41,12 +41,9 @@ pub struct Params {
     #[arg(long = "panel", value_name = "PANEL", value_delimiter = ',',
           default_values = Panel::ALL.map(Panel::name))]
     pub panels: Vec<Panel>,
-    /// Where the picture begins, in seconds; features stay relative to the whole file.
-    #[arg(long, value_name = "S", default_value_t = 0.0, allow_negative_numbers = true)]
-    pub start: f64,
-    /// Length of the excerpt, in seconds; without it, up to the end.
-    #[arg(long, value_name = "S", allow_negative_numbers = true)]
-    pub duration: Option<f64>,
+    // Features stay relative to the whole file.
+    #[command(flatten)]
+    pub excerpt: ExcerptParams,
     /// Width in CSS pixels, 320 to 8192; a PNG has two pixels for each.
     #[arg(long, value_name = "PX", default_value_t = 1000,
           value_parser = clap::value_parser!(u32).range(WIDTHS_PX))]
@@ -65,7 +62,7 @@ pub struct Params {
 pub fn run(params: &Params) -> anyhow::Result<Box<dyn Summary>> {
     let output = &params.output;
     let format = format_of(output)?;
-    check_excerpt(params.start, params.duration)?;
+    params.excerpt.check()?;
     let subject = match (&params.audio, &params.phrase, &params.store) {
         (Some(_), Some(phrase), _) => {
             bail!("--audio and --phrase {phrase} name two things to draw; give one of them")
@@ -82,7 +79,7 @@ pub fn run(params: &Params) -> anyhow::Result<Box<dyn Summary>> {
             bail!("nothing to draw: give --audio FILE, or --store URL and --phrase ID")
         }
     };
-    let frames = excerpt(&subject, params.start, params.duration)?;
+    let frames = params.excerpt.frames(subject.frames.nrows(), &subject.title)?;
     let features = FeaturesPlot {
         title: &subject.title,
         values: subject.frames.slice(s![frames.clone(), ..]),
@@ -105,39 +102,6 @@ struct Subject {
     frames: Array2<f32>,
     tempo_bpm: Option<f64>,
     beat_times_s: Vec<f64>,
-}
-
-fn check_excerpt(start_s: f64, duration_s: Option<f64>) -> anyhow::Result<()> {
-    if !(start_s.is_finite() && start_s >= 0.0) {
-        bail!("--start {start_s} is no time in a file; give seconds from 0 on");
-    }
-    match duration_s {
-        Some(s) if !(s.is_finite() && s > 0.0) => {
-            bail!("--duration {s} is not above 0; give a positive number of seconds")
-        }
-        _ => Ok(()),
-    }
-}
-
-/// Returns the frames of an excerpt, at least one.
-fn excerpt(
-    subject: &Subject,
-    start_s: f64,
-    duration_s: Option<f64>,
-) -> anyhow::Result<Range<usize>> {
-    let n_frames = subject.frames.nrows();
-    let nearest = |time_s: f64| s_to_frames(time_s).round() as usize;
-    let first = nearest(start_s);
-    if first >= n_frames {
-        bail!(
-            "--start {start_s} is after the end of {}, whose last frame of {n_frames} is at {:.2} s; \
-             begin earlier",
-            subject.title,
-            frames_to_s(n_frames.saturating_sub(1))
-        );
-    }
-    let length = duration_s.map_or(n_frames, nearest).max(1);
-    Ok(first..first.saturating_add(length).min(n_frames))
 }
 
 /// Extracts the features of an audio file.

@@ -237,10 +237,11 @@ impl<'a> Run<'a> {
         let patience = params.machine.patience();
         claim(self.store, &params.run, Train::NAME, config, patience, self.watch)?;
         let end = self.stage(&mut learner, &augmented, &mut account)?;
-        drop(learner);
         if end == End::Interrupted {
             return Ok(Box::new(account.interrupted(&resume_command(params))));
         }
+        account.beside(learner.baselines()?);
+        drop(learner);
 
         let (unet, list) = UNet1D::new(&config.network.unet);
         let weights = best_unet(&self.checkpoints(DiffusionLearner::STAGE), &params.run, list)?;

@@ -10,7 +10,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::autodiff::Threads;
-use crate::stages::Progress;
+use crate::stages::{Progress, all_threads};
 use crate::store::tables::FailureRow;
 use crate::store::{
     Commit, Item, Ledger, Location, Patience, Put, Row as _, StoreError, TimestampUs, digest,
@@ -43,10 +43,6 @@ pub struct MachineParams {
     /// Share of the phrases that may be unfit to learn from; training refuses to start beyond.
     #[arg(long, value_name = "SHARE", default_value_t = 0.05, help_heading = "Machine")]
     pub max_failed: f64,
-}
-
-fn all_threads() -> NonZeroUsize {
-    std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN)
 }
 
 impl MachineParams {

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use crate::stages::Summary;
 use crate::store::Location;
-use crate::training::{End, LeftOut, Progress};
+use crate::training::{Baselines, End, LeftOut, Progress};
 
 /// Phrases left out that the account spells out.
 const N_SHOWN: usize = 10;
@@ -16,12 +16,13 @@ pub struct StageAccount {
     started_at: u64,
     progress: Progress,
     end: End,
+    baselines: Option<Baselines>,
 }
 
 impl StageAccount {
     /// Returns the account of a stage that began at a step and ended.
     pub fn of(stage: &'static str, progress: &Progress, started_at: u64, end: End) -> Self {
-        Self { stage, started_at, progress: progress.clone(), end }
+        Self { stage, started_at, progress: progress.clone(), end, baselines: None }
     }
 }
 
@@ -47,6 +48,13 @@ impl Account {
         self.stages.push(stage);
     }
 
+    /// Holds the last stage's validation loss against what is lost without looking.
+    pub fn beside(&mut self, baselines: Baselines) {
+        if let Some(stage) = self.stages.last_mut() {
+            stage.baselines = Some(baselines);
+        }
+    }
+
     /// Says how to go on.
     pub fn interrupted(mut self, resume: &str) -> Self {
         self.resume = Some(resume.to_owned());
@@ -56,7 +64,7 @@ impl Account {
 
 impl Summary for Account {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        for StageAccount { stage, started_at, progress, end } in &self.stages {
+        for StageAccount { stage, started_at, progress, end, baselines } in &self.stages {
             let n = progress.step - started_at;
             let how = match end {
                 End::Done if n == 0 => "was complete already",
@@ -69,6 +77,16 @@ impl Summary for Account {
             write!(out, "{stage}: {how}, {} steps in {minutes:.1} min", progress.step)?;
             if let Some(best) = progress.best {
                 write!(out, ", best validation loss {:.4} at step {}", best.loss, best.step)?;
+                if let Some(Baselines { constant, untrained }) = baselines {
+                    let below = |loss: f64| 100.0 * (1.0 - best.loss / loss);
+                    write!(
+                        out,
+                        " ({:.0} % below the best constant's {constant:.4}, {:.0} % below an untrained \
+                         network's {untrained:.4})",
+                        below(*constant),
+                        below(*untrained)
+                    )?;
+                }
             }
             if progress.n_skipped > 0 {
                 write!(out, ", {} steps skipped (not finite)", progress.n_skipped)?;

@@ -1,0 +1,126 @@
+//! A network in training: its weights, their running average, and the optimizer's moments.
+
+use crate::autodiff::{AdamW, Gradients, Parameters};
+use crate::weights::{Archive, Section};
+
+use super::checkpoint::Progress;
+use super::config::OptimizerConfig;
+use super::ema::{Ema, EmaConfig};
+use super::error::TrainingError;
+
+/// Names of a checkpoint's sections beside that of the weights.
+pub(super) const AVERAGE: &str = "ema.";
+pub(super) const MOMENTS: [&str; 2] = ["adam.m.", "adam.v."];
+
+/// What changes while one network is trained, and how it is saved.
+pub struct Averaged {
+    /// Section of the weights.
+    prefix: &'static str,
+    parameters: Parameters<f32>,
+    optimizer: AdamW<f32>,
+    ema: Ema<f32>,
+    ema_config: EmaConfig,
+}
+
+impl Averaged {
+    /// Begins with some weights.
+    pub fn new(
+        prefix: &'static str,
+        parameters: Parameters<f32>,
+        optimizer: &OptimizerConfig,
+        ema: EmaConfig,
+    ) -> Self {
+        Self {
+            prefix,
+            optimizer: AdamW::new(optimizer.adamw(), &parameters),
+            ema: Ema::new(ema, &parameters),
+            ema_config: ema,
+            parameters,
+        }
+    }
+
+    /// Returns the weights themselves.
+    pub fn live(&self) -> &Parameters<f32> {
+        &self.parameters
+    }
+
+    /// Returns the weights to use.
+    pub fn average(&self) -> &Parameters<f32> {
+        self.ema.average()
+    }
+
+    /// Takes step number `step` (from 0); returns the norm of the gradient before it was clipped.
+    ///
+    /// Where loss or gradient is not finite, nothing changes, and the norm is not finite.
+    pub fn step(
+        &mut self,
+        gradients: &mut Gradients<f32>,
+        loss: f64,
+        learning_rate: f64,
+        step: u64,
+    ) -> f64 {
+        if !loss.is_finite() {
+            return f64::NAN;
+        }
+        let norm = self.optimizer.step(&mut self.parameters, gradients, learning_rate);
+        if norm.is_finite() {
+            self.ema.after_step(step + 1, &self.parameters);
+        }
+        norm
+    }
+
+    /// Returns all numbers, to go on from.
+    pub fn sections(&self) -> Vec<Section<'_, f32>> {
+        let plan = self.parameters.plan();
+        let ([m, v], _) = self.optimizer.state();
+        vec![
+            Section { prefix: self.prefix, plan, values: self.parameters.all() },
+            Section { prefix: AVERAGE, plan, values: self.average().all() },
+            Section { prefix: MOMENTS[0], plan, values: m },
+            Section { prefix: MOMENTS[1], plan, values: v },
+        ]
+    }
+
+    /// Returns the weights to use, as a file's section.
+    pub fn best(&self) -> Vec<Section<'_, f32>> {
+        let plan = self.parameters.plan();
+        vec![Section { prefix: self.prefix, plan, values: self.average().all() }]
+    }
+
+    /// Returns how many updates optimizer and average have seen.
+    pub fn n_updates(&self) -> (u64, u64) {
+        (self.optimizer.state().1, self.ema.n_updates())
+    }
+
+    /// Takes up the numbers of [`Averaged::sections`].
+    ///
+    /// # Errors
+    /// When they are not those of this network.
+    pub fn restore(
+        &mut self,
+        archive: &Archive,
+        place: &str,
+        at: &Progress,
+    ) -> Result<(), TrainingError> {
+        let read = |prefix: &str| section(archive, prefix, &self.parameters, place);
+        let (parameters, average) = (read(self.prefix)?, read(AVERAGE)?);
+        let [m, v] = [read(MOMENTS[0])?, read(MOMENTS[1])?];
+        self.optimizer.restore([m.all(), v.all()], at.n_updates);
+        self.ema = Ema::resume(self.ema_config, average, at.n_averaged);
+        self.parameters = parameters;
+        Ok(())
+    }
+}
+
+/// Reads a section of a checkpoint that lies as `like` does.
+pub(super) fn section(
+    archive: &Archive,
+    prefix: &str,
+    like: &Parameters<f32>,
+    place: &str,
+) -> Result<Parameters<f32>, TrainingError> {
+    let place = place.to_owned();
+    archive
+        .section(prefix, like.list().clone())
+        .map_err(|source| TrainingError::Weights { place, source })
+}
