@@ -46,6 +46,7 @@ fn a_run_learns_and_its_log_has_every_step() {
     assert!((said_best - best).abs() < 1e-4, "{said}");
     assert!((untrained - 1.0).abs() < 0.02 && constant <= untrained, "{said}");
     assert!(untrained - constant < 0.02, "{said}");
+    // Percentages are said as whole numbers, of losses of four digits.
     for (below, loss) in [(below_constant, constant), (below_untrained, untrained)] {
         assert!((below - 100.0 * (1.0 - best / loss)).abs() < 0.6, "{said}");
     }
