@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::LearnedFrom;
 use crate::audio::{FEATURE_DIM, FeatureScale, feature_names};
 use crate::diffusion::DiffusionConfig;
 use crate::model::{DecoderConfig, UNetConfig};
@@ -70,6 +71,9 @@ pub struct Provenance {
     pub validation_loss: Option<f64>,
     /// Digest of the phrases.
     pub data: String,
+    /// Which music that was; cards of release 0.1 do not tell.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub learned_from: Option<LearnedFrom>,
 }
 
 /// Something of each network.

@@ -7,6 +7,7 @@ mod card;
 mod control;
 mod eager;
 mod engine;
+mod learned;
 mod pool;
 mod retrieval;
 mod runtime;
@@ -24,6 +25,7 @@ pub use card::{
 pub use control::{Constraints, ControlError, Miss, REACH_FRAMES, Wanted, continuing, facing};
 pub use eager::EagerEngine;
 pub use engine::{Engine, EngineError, Inputs};
+pub use learned::{LearnedFrom, MusicDigests, MusicSplit, ShortDigest, Use};
 pub use pool::Pool;
 pub use retrieval::Retrieval;
 pub use runtime::{OnnxEngine, SessionPlan};

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use anyhow::ensure;
 
+use super::learned::{learned_path, remember};
 use super::train::session::{
     Looker, MachineParams, check_run_name, claim, claim_path, read_phrases,
 };
@@ -293,6 +294,7 @@ impl Stage for Finetune {
             checkpoints.clear()?;
             Journal::open(&store, Self::NAME, run, Self::NAME)?.clear()?;
             store.remove(&claim_path(run, Self::NAME))?;
+            store.remove(&learned_path(run, Self::NAME))?;
         }
         store.sweep()?;
         let machine = &params.machine;
@@ -326,6 +328,7 @@ impl Stage for Finetune {
             windows.scales().clone(),
         );
         let state = restore(&mut learner, &checkpoints, fresh, run, &watch)?;
+        remember(&store, run, Self::NAME, &phrases.dataset, machine.patience(), &watch)?;
         let started_at = state.progress.step;
         let plan = params.plan(&windows);
         let mut drive = Drive {

@@ -8,6 +8,7 @@ pub mod feature_file;
 pub mod finetune;
 pub mod generate;
 pub mod ingest;
+pub mod learned;
 pub mod library;
 pub mod model;
 mod model_files;

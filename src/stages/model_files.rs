@@ -75,6 +75,13 @@ pub fn folder_of(name: &str) -> String {
     format!("models/{name}")
 }
 
+/// Returns whether a name can be that of a model: 1 to 100 letters, digits, `-`, `_` and `.`, and no `.` at the
+/// beginning.
+pub fn is_model_name(name: &str) -> bool {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || ['-', '_', '.'].contains(&c);
+    (1..=100).contains(&name.len()) && name.chars().all(is_plain) && !name.starts_with('.')
+}
+
 impl OpenModel {
     /// Opens a model of a store, and fetches its files if the store is far away.
     ///

@@ -30,6 +30,17 @@ pub struct Trained {
     pub stage: &'static str,
     /// The validation loss of what the stage minimises.
     pub loss: Option<f64>,
+    /// What fine-tuned weights learned from; none for those of train.
+    pub tuned: Option<Tuned>,
+}
+
+/// What finetune learned from.
+#[derive(Clone, Debug)]
+pub struct Tuned {
+    /// Fingerprint of its dataset.
+    pub data: String,
+    /// Most training phrases.
+    pub num_phrases: Option<usize>,
 }
 
 /// Weights, and the step at which they validated best.
@@ -67,12 +78,15 @@ impl Trained {
             let best = |prefix, list: ParameterList| -> Result<Best, TrainingError> {
                 Ok(Best { parameters: section(&tuned, step, prefix, list)?, step })
             };
-            let loss = tuned.read(Kind::Best, step, |archive, place| {
-                let state: State<serde_json::Value> = State::of(archive, place)?;
-                Ok(state.progress.best.map(|best| best.loss))
-            })?;
+            // Only what is looked at has to be as this version has it.
+            let of_tuned: State<serde_json::Value> = tuned.read(Kind::Best, step, State::of)?;
+            let loss = of_tuned.progress.best.map(|best| best.loss);
+            let num_phrases = of_tuned.config["num_phrases"].as_u64();
+            let num_phrases = num_phrases.and_then(|n| usize::try_from(n).ok());
+            let tuned_on = Tuned { data: of_tuned.data, num_phrases };
             let (unet, decoder) = (best("unet.", unet)?, best("decoder.", decoder)?);
-            return Ok(Self { state, unet, decoder, stage: FinetuneLearner::STAGE, loss });
+            let stage = FinetuneLearner::STAGE;
+            return Ok(Self { state, unet, decoder, stage, loss, tuned: Some(tuned_on) });
         }
         if stand == Stand::Finetune {
             let way_out = format!("run motiongen finetune --run {run} first");
@@ -83,7 +97,7 @@ impl Trained {
         let (stage, what) = (of(DecoderLearner::STAGE), "trained decoder");
         let decoder = best(&stage, run, "decoder.", what, decoder)?;
         let loss = state.progress.best.map(|best| best.loss);
-        Ok(Self { state, unet, decoder, stage: DiffusionLearner::STAGE, loss })
+        Ok(Self { state, unet, decoder, stage: DiffusionLearner::STAGE, loss, tuned: None })
     }
 }
 

@@ -205,6 +205,17 @@ impl Location {
         }
     }
 
+    /// Reads a whole object; none where there is no such object.
+    ///
+    /// # Errors
+    /// What the storage says.
+    pub fn read_if_there(&self, path: &str) -> Result<Option<Bytes>, StoreError> {
+        match self.read(path) {
+            Err(StoreError::NotFound { .. }) => Ok(None),
+            read => read.map(Some),
+        }
+    }
+
     /// Reads many listed objects, remote ones concurrently, in the order given; for small ones.
     ///
     /// # Errors

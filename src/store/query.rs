@@ -1,6 +1,6 @@
 //! SQL over the tables of a store: the one file that knows polars.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write;
 use std::str::FromStr;
 
@@ -12,7 +12,7 @@ use polars::sql::{SQLContext, extract_table_identifiers};
 use super::commit::{LivePart, live_parts};
 use super::location::{Kind, Location};
 use super::reader::check_version;
-use super::schema::{ColumnType, TableSchema};
+use super::schema::{Column as TableColumn, ColumnType, TableSchema};
 use super::tables;
 use super::{ClientOptions, StoreError};
 
@@ -201,15 +201,23 @@ fn scan(
     let failed = |e: PolarsError| StoreError::Query(first_line(&e));
     // Whole parts are scanned together; a part with superseded rows gets a filter of its own.
     let (whole, partial): (Vec<_>, Vec<_>) = live.iter().partition(|l| l.superseded.is_empty());
+    let mut by_version: BTreeMap<u32, Vec<&LivePart>> = BTreeMap::new();
+    for part in whole {
+        by_version.entry(part.part.schema_version).or_default().push(part);
+    }
+    let read = |version: u32, parts: &[&LivePart]| {
+        let frame = scan_parts(store, parts, options)?;
+        if version == schema.version { Ok(frame) } else { completed(frame, schema).map_err(failed) }
+    };
     let mut frames = Vec::new();
-    if !whole.is_empty() {
-        frames.push(scan_parts(store, &whole, options)?);
+    for (version, parts) in by_version {
+        frames.push(read(version, &parts)?);
     }
     for part in partial {
         let item = schema.item_column();
         let superseded = Series::new(item.into(), part.superseded.as_slice());
         let dead = col(item).is_in(lit(superseded).implode(false), false);
-        frames.push(scan_parts(store, &[part], options)?.filter(dead.not()));
+        frames.push(read(part.part.schema_version, &[part])?.filter(dead.not()));
     }
     match frames.len() {
         0 => Ok(empty(schema).lazy()),
@@ -248,22 +256,35 @@ fn scan_parts(
     LazyFrame::scan_parquet_sources(sources, args).map_err(|e| StoreError::Query(first_line(&e)))
 }
 
+/// Adds the nullable columns that parts of an older version lack, null in every row.
+fn completed(mut frame: LazyFrame, schema: &TableSchema) -> PolarsResult<LazyFrame> {
+    let known = frame.collect_schema()?;
+    let columns: Vec<Expr> = schema
+        .columns
+        .iter()
+        .map(|c| match c.nullable && !known.contains(c.name.as_ref()) {
+            true => lit(NULL).cast(data_type(c.column_type)).alias(c.name.as_ref()),
+            false => col(c.name.as_ref()),
+        })
+        .collect();
+    Ok(frame.select(columns))
+}
+
 fn empty(schema: &TableSchema) -> DataFrame {
-    let columns = schema.columns.iter().map(|c| {
-        let data_type = match c.column_type {
-            ColumnType::Utf8 => DataType::String,
-            ColumnType::Boolean => DataType::Boolean,
-            ColumnType::Int32 => DataType::Int32,
-            ColumnType::Int64 => DataType::Int64,
-            ColumnType::Float32 => DataType::Float32,
-            ColumnType::Float64 => DataType::Float64,
-            ColumnType::TimestampUs => {
-                DataType::Datetime(TimeUnit::Microseconds, Some(TimeZone::UTC))
-            }
-        };
-        Field::new(c.name.as_ref().into(), data_type)
-    });
-    DataFrame::empty_with_schema(&columns.collect())
+    let field = |c: &TableColumn| Field::new(c.name.as_ref().into(), data_type(c.column_type));
+    DataFrame::empty_with_schema(&schema.columns.iter().map(field).collect())
+}
+
+fn data_type(column_type: ColumnType) -> DataType {
+    match column_type {
+        ColumnType::Utf8 => DataType::String,
+        ColumnType::Boolean => DataType::Boolean,
+        ColumnType::Int32 => DataType::Int32,
+        ColumnType::Int64 => DataType::Int64,
+        ColumnType::Float32 => DataType::Float32,
+        ColumnType::Float64 => DataType::Float64,
+        ColumnType::TimestampUs => DataType::Datetime(TimeUnit::Microseconds, Some(TimeZone::UTC)),
+    }
 }
 
 /// Says what is wrong with a statement in terms of the store's tables.

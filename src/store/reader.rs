@@ -4,8 +4,8 @@ use std::collections::BTreeSet;
 use std::ops::Range;
 use std::sync::Arc;
 
-use arrow_array::{Array as _, BooleanArray, RecordBatch, StringArray};
-use arrow_schema::ArrowError;
+use arrow_array::{Array as _, BooleanArray, RecordBatch, StringArray, new_null_array};
+use arrow_schema::{ArrowError, Schema};
 use bytes::Bytes;
 use futures::future::BoxFuture;
 use futures::{FutureExt as _, StreamExt as _, TryFutureExt as _};
@@ -90,6 +90,11 @@ impl Snapshot {
         &self.parts
     }
 
+    /// Returns the version of the table that this program writes.
+    pub fn version(&self) -> u32 {
+        self.schema.version
+    }
+
     /// Returns the live rows, part by part; within a part they are sorted as the schema says.
     pub fn batches(&self) -> impl Iterator<Item = Result<RecordBatch, StoreError>> + '_ {
         let wanted = match &self.item {
@@ -123,7 +128,10 @@ impl Snapshot {
                 Err(e) => Box::new(std::iter::once(Err(e))),
             };
             batches.map(move |batch| {
-                let batch = batch.map_err(failed)?;
+                let mut batch = batch.map_err(failed)?;
+                if live.part.schema_version < self.schema.version {
+                    batch = completed(&batch, &self.schema).map_err(failed)?;
+                }
                 self.check_columns(&batch, &live.part.path)?;
                 without(&batch, column, &live.superseded).map_err(failed)
             })
@@ -202,7 +210,7 @@ pub(super) fn check_version(
     live: &LivePart,
 ) -> Result<(), StoreError> {
     let found = live.part.schema_version;
-    if found == schema.version {
+    if schema.is_read(found) {
         return Ok(());
     }
     let remedy = if found > schema.version {
@@ -213,6 +221,19 @@ pub(super) fn check_version(
     let place = store.url_of(&live.part.path);
     let table = schema.name.to_owned();
     Err(StoreError::SchemaVersion { table, place, found, supported: schema.version, remedy })
+}
+
+/// Adds the nullable columns that a part of an older version lacks, null in every row.
+fn completed(batch: &RecordBatch, schema: &TableSchema) -> Result<RecordBatch, ParquetError> {
+    let (mut fields, mut columns) =
+        (batch.schema_ref().fields().to_vec(), batch.columns().to_vec());
+    for field in schema.arrow().fields() {
+        if field.is_nullable() && batch.column_by_name(field.name()).is_none() {
+            columns.push(new_null_array(field.data_type(), batch.num_rows()));
+            fields.push(Arc::clone(field));
+        }
+    }
+    Ok(RecordBatch::try_new(Arc::new(Schema::new(fields)), columns)?)
 }
 
 /// Returns the rows whose item is not among `superseded`.

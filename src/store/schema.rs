@@ -13,8 +13,10 @@ use arrow_schema::{DataType, Field, Schema, SchemaRef, TimeUnit};
 #[derive(Clone, Debug, PartialEq)]
 pub struct TableSchema {
     pub name: &'static str,
-    /// Raised when a column changes; parts of another version are refused, not guessed at.
+    /// Raised when a column changes; parts of another version are refused, not guessed at, down to `reads`.
     pub version: u32,
+    /// Oldest version whose parts are read: it lacks nothing but nullable columns, which are null in its rows.
+    pub reads: u32,
     /// What one row is.
     pub description: &'static str,
     pub columns: Vec<Column>,
@@ -87,6 +89,11 @@ impl TableSchema {
     /// else names it (labels), behind it the channels.
     pub fn frame_column(&self) -> usize {
         self.columns.iter().position(|column| column.name == FRAME_COLUMN).unwrap_or(0)
+    }
+
+    /// Returns whether parts of a version are read.
+    pub fn is_read(&self, version: u32) -> bool {
+        (self.reads..=self.version).contains(&version)
     }
 
     /// Returns the Arrow schema of the table's parts.
@@ -224,11 +231,15 @@ pub trait Row: Sized {
     fn from_batch(batch: &RecordBatch) -> Option<Vec<Self>>;
 }
 
-/// Declares a table and its row type at once, so that neither can drift from the other.
+/// Declares a table and its row type at once, so that neither can drift from the other. `version 3 reads 2` reads
+/// parts of version 2, too: what they lack is nullable.
 macro_rules! rows {
+    (@oldest $version:literal) => { $version };
+    (@oldest $version:literal $oldest:literal) => { $oldest };
     (
         $description:literal
-        $row:ident in $name:literal version $version:literal sorted by [$($sort:ident),+]
+        $row:ident in $name:literal version $version:literal $(reads $oldest:literal)?
+        sorted by [$($sort:ident),+]
         { $($field:ident: $type:ty, $unit:literal, $meaning:literal;)+ }
     ) => {
         #[doc = $description]
@@ -243,6 +254,7 @@ macro_rules! rows {
                 TableSchema {
                     name: $name,
                     version: $version,
+                    reads: $crate::store::schema::rows!(@oldest $version $($oldest)?),
                     description: $description,
                     columns: vec![$(Column {
                         name: stringify!($field).into(),

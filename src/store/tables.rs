@@ -11,7 +11,7 @@ const ITEM_COLUMN: &str = "phrase_id";
 
 rows! {
     "One row per phrase that ingest accepted or library constructed."
-    PhraseRow in "phrases" version 2 sorted by [phrase_id]
+    PhraseRow in "phrases" version 3 reads 2 sorted by [phrase_id]
     {
         phrase_id: String, "", "Name of the phrase: its folder in a phrase layout, its relative path in a music library; of a constructed one `SONG.tTAKE.NUMBER`.";
         source: String, "URL", "The source it came from; of a constructed phrase, the song.";
@@ -24,6 +24,7 @@ rows! {
         audio_bytes: Option<i64>, "bytes", "Size of the audio file.";
         beats_bytes: Option<i64>, "bytes", "Size of the beat list.";
         content_hash: String, "BLAKE3", "Digest of the phrase's files: BLAKE3 over one line `role digest` per file, roles sorted; of a constructed phrase, over its features and motion as little-endian 32-bit floats.";
+        song_hash: Option<String>, "BLAKE3", "Identity of the music, whatever it is called and whatever lies beside it: digest of the audio file, without audio of the feature file; of a constructed phrase, that of its song. None where there is neither, and in rows of release 0.1.";
         has_motion: bool, "", "Whether the phrase has motion.";
         has_features: bool, "", "Whether the phrase has a feature file, or was constructed with features.";
         has_audio: bool, "", "Whether the phrase has audio.";
@@ -316,6 +317,7 @@ fn frame_table(
     TableSchema {
         name,
         version: 1,
+        reads: 1,
         description,
         columns: ids.into_iter().chain(channels).collect(),
         sorted_by: &["phrase_id", "frame"],

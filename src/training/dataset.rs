@@ -49,6 +49,10 @@ pub struct Phrase {
     pub id: Arc<str>,
     pub split: Split,
     pub n_frames: usize,
+    /// Identity of the music, where the table of phrases tells it.
+    pub song_hash: Option<Arc<str>>,
+    /// Digest of the phrase's files, or of its motion and features.
+    pub content_hash: Arc<str>,
     motion_row: u64,
     feature_row: u64,
 }
@@ -200,6 +204,8 @@ impl Dataset {
                 id: id.into(),
                 split,
                 n_frames: motion.n_frames.min(features.n_frames),
+                song_hash: row.song_hash.map(Into::into),
+                content_hash: row.content_hash.into(),
                 motion_row: motion.row,
                 feature_row: features.row,
             });
@@ -238,10 +244,13 @@ impl Dataset {
             };
             let (a, b) = (digest_of(&of_motion), digest_of(&of_features));
             digests.push(format!("{id}\n{}\n{a}\n{b}", split.name()));
+            let content_hash = digest(format!("features {b}\nmotion {a}\n").as_bytes());
             phrases.push(Phrase {
                 id: id.into(),
                 split,
                 n_frames: of_motion.nrows().min(of_features.nrows()),
+                song_hash: None,
+                content_hash: content_hash.into(),
                 motion_row: motion.append(of_motion.view())?,
                 feature_row: features.append(of_features.view())?,
             });

@@ -9,8 +9,8 @@ use super::Params;
 use crate::autodiff::Parameters;
 use crate::diffusion::Schedule;
 use crate::generation::{
-    FileEntry, MODEL_FORMAT, ModelCard, Networks, Provenance, file_names, own_channels,
-    own_features,
+    FileEntry, LearnedFrom, MODEL_FORMAT, ModelCard, Networks, Provenance, file_names,
+    own_channels, own_features,
 };
 use crate::model::ParameterId;
 use crate::motion::rates::MotionRange;
@@ -36,6 +36,7 @@ impl Files {
         trained: &Trained,
         params: &Params,
         range: Option<MotionRange>,
+        learned_from: Option<LearnedFrom>,
     ) -> anyhow::Result<Self> {
         let config = &trained.state.config.network;
         let scales = &trained.state.scales;
@@ -62,6 +63,7 @@ impl Files {
                 decoder_step: trained.decoder.step,
                 validation_loss: trained.loss,
                 data: trained.state.data.clone(),
+                learned_from,
             },
             precision: storage,
             unet: config.unet.clone(),

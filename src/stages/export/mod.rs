@@ -7,12 +7,12 @@ mod report;
 use std::path::PathBuf;
 
 use anyhow::{bail, ensure};
-use bytes::Bytes;
 
 use self::checks::{Checking, Held};
 use self::files::Files;
 use self::report::{Planned, Report};
-use super::model_files::{folder_of, sha256};
+use super::learned;
+use super::model_files::{folder_of, is_model_name, sha256};
 use super::train::session::{Looker, MachineParams, check_run_name, read_phrases};
 use super::trained::{Stand, Trained};
 use super::{ClientParams, Contract, Progress, Stage, Summary};
@@ -86,11 +86,19 @@ impl Stage for Export {
         let watch = Looker(progress);
         let most = Some(MAX_TRAIN_PHRASES);
         let phrases = read_phrases(&store, Self::NAME, machine, most, progress, &watch)?;
-        let files = Files::make(&trained, &params, motion_range(&phrases.dataset)?)?;
+        let learned_from = learned::of_run(&store, &params.run, &trained, machine, progress)?;
+        if learned_from.is_none() {
+            progress.note(&format!(
+                "run {} does not tell what it learned from, and the phrases of {store} are others by now: the \
+                 model's card will not tell either, and evaluate will hold no music for held out",
+                params.run
+            ));
+        }
+        let files = Files::make(&trained, &params, motion_range(&phrases.dataset)?, learned_from)?;
         if params.dry_run {
             return Ok(Box::new(Planned::new(&params, &files, &store)));
         }
-        match read_if_there(&store, &card_path(&params.model))? {
+        match store.read_if_there(&card_path(&params.model))? {
             Some(there) if there == files.card_text => {
                 return Ok(Box::new(Report::up_to_date(&params, &store, &files)));
             }
@@ -137,9 +145,8 @@ fn motion_range(dataset: &Dataset) -> Result<Option<MotionRange>, StoreError> {
 }
 
 fn check_model_name(model: &str) -> anyhow::Result<()> {
-    let is_plain = |c: char| c.is_ascii_alphanumeric() || ['-', '_', '.'].contains(&c);
     ensure!(
-        (1..=100).contains(&model.len()) && model.chars().all(is_plain) && !model.starts_with('.'),
+        is_model_name(model),
         "--model {model:?} is no name for a model; use 1 to 100 letters, digits, -, _ and ., and no . at \
          the beginning"
     );
@@ -148,13 +155,6 @@ fn check_model_name(model: &str) -> anyhow::Result<()> {
 
 fn card_path(model: &str) -> String {
     format!("{}/{}", folder_of(model), file_names::CARD)
-}
-
-fn read_if_there(store: &Location, path: &str) -> Result<Option<Bytes>, StoreError> {
-    match store.read(path) {
-        Err(StoreError::NotFound { .. }) => Ok(None),
-        read => read.map(Some),
-    }
 }
 
 /// Puts the files in place; the card comes last, and without it there is no model.

@@ -29,6 +29,8 @@ pub struct Job<'a> {
     pub rules: &'a Rules,
     pub params_hash: &'a str,
     pub progress: &'a dyn Progress,
+    /// Phrases of the store that lack the identity of their music, and have it now.
+    pub unidentified: &'a BTreeSet<String>,
     /// Write phrases even when nothing about them changed.
     pub force: bool,
 }
@@ -191,6 +193,7 @@ impl Job<'_> {
         }
         let failure = outcome.as_ref().err().map(Failure::digest);
         let unchanged = !self.force
+            && !self.unidentified.contains(&id)
             && self.ledger.get(&id).is_some_and(|known| {
                 known.params_hash == self.params_hash
                     && known.item.input_hash == input_hash
@@ -283,6 +286,7 @@ impl Job<'_> {
             audio_bytes: bytes("audio"),
             beats_bytes: bytes("beats"),
             content_hash: phrase.content_hash,
+            song_hash: phrase.song_hash,
             has_motion: phrase.motion.is_some(),
             has_features: phrase.n_feature_frames.is_some(),
             has_audio: phrase.audio.is_some(),

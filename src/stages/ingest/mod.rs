@@ -4,13 +4,17 @@ mod batch;
 mod layout;
 mod phrase;
 
+use std::collections::BTreeSet;
 use std::io::{self, Write};
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::time::Instant;
 
 use super::{ClientParams, Contract, Progress, Stage, Summary, all_threads};
-use crate::store::{Cache, Ledger, Location, Shard, Source, StoreError, digest};
+use crate::store::tables::PhraseRow;
+use crate::store::{
+    Cache, Ledger, Location, Row as _, Shard, Snapshot, Source, StoreError, digest,
+};
 
 use super::failure::{Failure, write_failures};
 pub use layout::{Layout, Plan, Planned, Role, plan};
@@ -93,10 +97,16 @@ impl Stage for Ingest {
         let ledger = Ledger::read(&store, Self::NAME)?;
         let params_hash = params_hash(&params.rules);
 
+        // With --force everything is done again anyway, also where old parts cannot be read.
+        let unidentified = if params.force { BTreeSet::new() } else { unidentified(&store)? };
+
         let mine: Vec<_> = plan.phrases.iter().filter(|p| shard.takes(&p.id)).collect();
         let origin = source.location().url();
         let is_done = |p: &Planned| {
-            !params.force && !params.verify && is_settled(p, &ledger, &params_hash, origin)
+            !params.force
+                && !params.verify
+                && !unidentified.contains(&p.id)
+                && is_settled(p, &ledger, &params_hash, origin)
         };
         let (done, todo): (Vec<_>, Vec<_>) = mine.into_iter().partition(|p| is_done(p));
         tracing::info!(
@@ -134,6 +144,7 @@ impl Stage for Ingest {
                 rules: &params.rules,
                 params_hash: &params_hash,
                 progress,
+                unidentified: &unidentified,
                 force: params.force,
             };
             report.tally.add(job.run(&batches, params.workers.get())?);
@@ -170,6 +181,28 @@ fn is_settled(planned: &Planned, ledger: &Ledger, params_hash: &str, origin: &st
                 && known.item.succeeded()
                 && known.item.fingerprint == batch::fingerprint(planned)
         })
+}
+
+/// Returns the phrases with audio or a feature file whose rows do not tell the identity of the music: release 0.1
+/// did not write it.
+///
+/// # Errors
+/// [`StoreError`] when a part of an older version cannot be read.
+fn unidentified(store: &Location) -> Result<BTreeSet<String>, StoreError> {
+    // Parts that this program does not read are not its to mend; it says so where they are wanted.
+    let (table, _) = Snapshot::take_known(store, PhraseRow::schema())?;
+    let lacks = |row: &PhraseRow| {
+        let has_music = row.audio_url.is_some() || row.features_url.is_some();
+        row.song_hash.is_none() && has_music
+    };
+    let mut found = BTreeSet::new();
+    for i in 0..table.parts().len() {
+        if table.parts()[i].part.schema_version < table.version() {
+            let rows = table.part(i).rows_where(lacks)?;
+            found.extend(rows.into_iter().map(|row| row.phrase_id));
+        }
+    }
+    Ok(found)
 }
 
 /// What became of the phrases.

@@ -35,6 +35,8 @@ pub struct Rules {
 #[derive(Clone, Debug)]
 pub struct Phrase {
     pub content_hash: String,
+    /// Digest of the audio file, without audio of the feature file.
+    pub song_hash: Option<String>,
     pub motion: Option<Trajectory>,
     pub motion_format: Option<&'static str>,
     pub n_feature_frames: Option<usize>,
@@ -62,6 +64,7 @@ impl Phrase {
 /// A phrase's files as they came from the source, digests first.
 pub struct Files {
     content_hash: String,
+    song_hash: Option<String>,
     files: Vec<(Role, SourceFile, Content)>,
 }
 
@@ -75,6 +78,7 @@ impl Files {
     ) -> Result<Self, Failure> {
         let mut taken = Vec::with_capacity(files.len());
         let mut lines = String::new();
+        let (mut of_audio, mut of_features) = (None, None);
         for (role, file, content) in files {
             let mut content = content.map_err(|e| unreadable(&file, &e))?;
             let hash = match &mut content {
@@ -84,9 +88,15 @@ impl Files {
                     .map_err(|e| Failure::new(FailureKind::Unreadable, &file.path, e))?,
             };
             lines += &hash_line(role, &hash);
+            match role {
+                Role::Audio => of_audio = Some(hash),
+                Role::Features => of_features = Some(hash),
+                Role::Beats | Role::MotionNpy | Role::MotionBvh => {}
+            }
             taken.push((role, file, content));
         }
-        Ok(Self { content_hash: digest(lines.as_bytes()), files: taken })
+        let song_hash = of_audio.or(of_features);
+        Ok(Self { content_hash: digest(lines.as_bytes()), song_hash, files: taken })
     }
 
     pub fn content_hash(&self) -> &str {
@@ -100,6 +110,7 @@ impl Files {
     pub fn check(self, rules: &Rules) -> Result<Phrase, Failure> {
         let mut phrase = Phrase {
             content_hash: self.content_hash,
+            song_hash: self.song_hash,
             motion: None,
             motion_format: None,
             n_feature_frames: None,

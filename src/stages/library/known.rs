@@ -1,6 +1,6 @@
 //! What a store knows: songs, captures, and the phrases that were constructed before.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use super::songs::{BeatList, Files, Song, slug, slug_of};
 use super::split::TRAIN;
@@ -21,6 +21,9 @@ pub struct Known {
     /// Constructed phrases with the URLs of their songs, by the part of their name that stands for the
     /// song.
     pub constructed: BTreeMap<String, BTreeMap<String, String>>,
+    /// What stands for the songs of constructed phrases that do not tell which music they are to: release 0.1 did
+    /// not write it.
+    pub unidentified: BTreeSet<String>,
     /// Names of all other phrases, and their sources.
     pub others: HashMap<String, String>,
 }
@@ -35,7 +38,11 @@ impl Known {
         let mut with_audio: BTreeMap<String, PhraseRow> = BTreeMap::new();
         each(store, |row: PhraseRow| {
             if row.is_constructed() {
-                let of_song = known.constructed.entry(slug_of(&row.phrase_id).to_owned());
+                let slug = slug_of(&row.phrase_id).to_owned();
+                if row.song_hash.is_none() {
+                    known.unidentified.insert(slug.clone());
+                }
+                let of_song = known.constructed.entry(slug);
                 of_song.or_default().insert(row.phrase_id, row.source);
                 return;
             }
@@ -70,14 +77,17 @@ impl Known {
             let beat_list =
                 row.beats_url.map(|url| BeatList { source: row.source, url, size_bytes });
             let params_hash = extract.get(&id).map_or("", |settled| &settled.params_hash);
+            let slug = slug(&id);
             let song = Song {
-                slug: slug(&id),
+                is_unidentified: row.song_hash.is_some() && known.unidentified.contains(&slug),
+                slug,
                 url,
                 fingerprint: format!("store {} {params_hash}", row.content_hash),
                 split: TRAIN,
                 problem: None,
                 files: Files::Store {
                     n_frames,
+                    song_hash: row.song_hash,
                     tracked_s: tracked.into_iter().map(|beat| beat.1).collect(),
                     beat_list,
                 },

@@ -111,7 +111,7 @@ impl Stage for Library {
             None => Captures::of_store(&store, &known),
         };
         let mut songs = match &params.songs {
-            Some(url) => Songs::of_folder(url, &options)?,
+            Some(url) => Songs::of_folder(url, &options, &known)?,
             None => Songs::of_store(&store, &mut known)?,
         };
         prepare(&mut songs, &params)?;

@@ -31,6 +31,8 @@ pub struct Music {
     pub tempo_source: &'static str,
     /// Digest of the files that it was read from, or of what stands for them.
     pub input_hash: String,
+    /// Digest of the audio file; none where the store does not tell it.
+    pub song_hash: Option<String>,
 }
 
 /// A phrase as it goes into the tables.
@@ -64,10 +66,11 @@ impl Music {
 /// A [`Failure`] that names the file.
 pub fn read(song: &Song, input: Input, options: &ClientOptions) -> Result<Music, Failure> {
     match (&song.files, input) {
-        (Files::Store { tracked_s, beat_list, .. }, Input::Features(features)) => {
+        (Files::Store { tracked_s, beat_list, song_hash, .. }, Input::Features(features)) => {
             let list = beat_list.as_ref().map(|list| recorded_beats(list, options)).transpose()?;
             let input_hash = digest(song.fingerprint.as_bytes());
-            music(song, features?, tracked_s.clone(), list, input_hash)
+            let song_hash = song_hash.clone();
+            music(song, features?, tracked_s.clone(), list, Digests { input_hash, song_hash })
         }
         (
             Files::Folder { audio, beat_list },
@@ -84,16 +87,25 @@ pub fn read(song: &Song, input: Input, options: &ClientOptions) -> Result<Music,
                 }
                 _ => None,
             };
+            let mut song_hash = None;
             let see = |hash: &str| {
+                song_hash = Some(hash.to_owned());
                 lines += &format!("audio {hash}\n");
                 true
             };
             let found = extract::extract(extract::Origin::Audio, audio, content, see, &rules)?;
             let tracked_s = found.beats.iter().map(|beat| beat.1).collect();
-            music(song, found.frames, tracked_s, list, digest(lines.as_bytes()))
+            let input_hash = digest(lines.as_bytes());
+            music(song, found.frames, tracked_s, list, Digests { input_hash, song_hash })
         }
         _ => Err(Failure::new(FailureKind::Unreadable, &song.id, "was not read")),
     }
+}
+
+/// What a song's files are told by.
+struct Digests {
+    input_hash: String,
+    song_hash: Option<String>,
 }
 
 fn music(
@@ -101,7 +113,7 @@ fn music(
     features: Array2<f32>,
     tracked_s: Vec<f64>,
     list: Option<Beats>,
-    input_hash: String,
+    Digests { input_hash, song_hash }: Digests,
 ) -> Result<Music, Failure> {
     let tempo_source = if list.is_some() { "beats_file" } else { "beat_tracker" };
     let beats = match list {
@@ -112,7 +124,7 @@ fn music(
             Beats::new(tracked_s, None, None).map_err(none)?
         }
     };
-    Ok(Music { features, beats, tempo_source, input_hash })
+    Ok(Music { features, beats, tempo_source, input_hash, song_hash })
 }
 
 /// Reads the beat list beside the audio of a phrase of the store.

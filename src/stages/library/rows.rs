@@ -21,6 +21,7 @@ pub fn phrase_row(song: &Song, music: &Music, phrase: &Constructed) -> PhraseRow
         audio_bytes: None,
         beats_bytes: None,
         content_hash: content_hash(phrase),
+        song_hash: music.song_hash.clone(),
         has_motion: true,
         has_features: true,
         has_audio: false,

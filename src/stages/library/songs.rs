@@ -28,6 +28,8 @@ pub struct Song {
     /// What is known of its files without reading them.
     pub fingerprint: String,
     pub split: &'static str,
+    /// Whether the store has phrases of it that do not tell which music they are to, and now could.
+    pub is_unidentified: bool,
     /// What keeps it from being danced to, where that is known already.
     pub problem: Option<Failure>,
     pub files: Files,
@@ -39,6 +41,8 @@ pub enum Files {
     /// Features in the store; beats there, too, or in a beat list beside the audio.
     Store {
         n_frames: usize,
+        /// Digest of the audio file, as ingest recorded it.
+        song_hash: Option<String>,
         tracked_s: Vec<f64>,
         beat_list: Option<BeatList>,
     },
@@ -113,7 +117,7 @@ impl Songs {
     ///
     /// # Errors
     /// When the folder cannot be listed or has no audio.
-    pub fn of_folder(url: &str, options: &ClientOptions) -> anyhow::Result<Self> {
+    pub fn of_folder(url: &str, options: &ClientOptions, known: &Known) -> anyhow::Result<Self> {
         let source = Source::open(url, options, None)?;
         let plan = plan(source.list()?, Layout::Library);
         if plan.phrases.is_empty() {
@@ -136,10 +140,12 @@ impl Songs {
                 SourceFile { path: planned.id.clone(), size_bytes: 0, fingerprint: String::new() }
             });
             let beat_list = file(Role::Beats);
+            let slug = slug(&planned.id);
             let list_fingerprint = beat_list.as_ref().map_or("none", |f| &f.fingerprint);
             songs.push(Song {
                 url: source.location().url_of(&planned.id),
-                slug: slug(&planned.id),
+                is_unidentified: known.unidentified.contains(&slug),
+                slug,
                 fingerprint: format!("files {} {list_fingerprint}", audio.fingerprint),
                 split: super::split::TRAIN,
                 problem,

@@ -80,6 +80,7 @@ pub fn is_settled(
     let is_refused = ledger.get(&song.id).is_some_and(|known| known.item.failure.is_some());
     let first = ledger.get(&one::phrase_id(song, rules, 0, 0));
     !is_refused
+        && !song.is_unidentified
         && first.is_some_and(|known| {
             known.params_hash == params_hash
                 && known.origin == origin
@@ -101,6 +102,7 @@ impl Writer<'_> {
         let input_hash = self.input_hash(song, music);
         let first = self.ledger.get(&one::phrase_id(song, self.rules, 0, 0));
         let is_there = !self.force
+            && !song.is_unidentified
             && first.is_some_and(|known| {
                 known.params_hash == self.params_hash
                     && known.origin == self.origin

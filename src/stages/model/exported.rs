@@ -10,7 +10,7 @@ use super::thousands;
 use crate::audio::FEATURE_DIM;
 use crate::autodiff::Stream;
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
-use crate::generation::{ModelCard, Sampling, sample};
+use crate::generation::{LearnedFrom, ModelCard, MusicDigests, Sampling, sample};
 use crate::motion::MOTION_DIM;
 use crate::stages::model_files::{EngineParams, OpenModel};
 use crate::stages::{Progress, Summary};
@@ -86,6 +86,25 @@ pub fn look(
     Ok(Box::new(Account { card, place, engine: engine.name(), load_s, timed }))
 }
 
+/// Counts the music that a model learned from.
+fn summary_of(learned: &LearnedFrom) -> String {
+    let counts = |digests: &MusicDigests| {
+        let count =
+            |n: usize, what| format!("{} {what}{}", thousands(n), if n == 1 { "" } else { "s" });
+        format!(
+            "{}, {}",
+            count(digests.songs.len(), "song"),
+            count(digests.phrases.len(), "phrase")
+        )
+    };
+    format!(
+        "trained on {}; validated on {}{}",
+        counts(&learned.trained_on),
+        counts(&learned.validated_on),
+        if learned.is_complete { "" } else { "; the song of some phrases is not known" }
+    )
+}
+
 impl Summary for Account {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
         let Self { card, place, engine, load_s, timed } = self;
@@ -104,6 +123,10 @@ impl Summary for Account {
                     .map_or_else(|| "not known".to_owned(), |x| format!("{x:.4}")),
             ),
             row("data", provenance.data.clone()),
+            row(
+                "learned from",
+                provenance.learned_from.as_ref().map_or_else(|| "not known".to_owned(), summary_of),
+            ),
             row(
                 "parameters",
                 format!(

@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use anyhow::{bail, ensure};
 
+use super::learned::{learned_path, remember};
 use super::trained::best;
 use super::{ClientParams, Contract, Progress, Stage, Summary};
 use crate::autodiff::{Arena, Parameters};
@@ -190,6 +191,7 @@ impl<'a> Run<'a> {
         Journal::open(self.store, "finetune", &self.params.run, "finetune")?.clear()?;
         for command in [Train::NAME, "finetune"] {
             self.store.remove(&claim_path(&self.params.run, command))?;
+            self.store.remove(&learned_path(&self.params.run, command))?;
         }
         Ok(())
     }
@@ -283,6 +285,9 @@ impl<'a> Run<'a> {
             windows.scales().clone(),
         );
         let state = restore(learner, &checkpoints, state, &self.params.run, self.watch)?;
+        let patience = self.params.machine.patience();
+        let (run, dataset) = (&self.params.run, windows.dataset());
+        remember(self.store, run, Train::NAME, dataset, patience, self.watch)?;
         let started_at = state.progress.step;
         let mut drive = Drive {
             plan,

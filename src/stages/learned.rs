@@ -1,0 +1,170 @@
+//! What a run learns from, what its model's card says of it, and what evaluate may believe.
+
+use super::generate::weights_digest;
+use super::model_files::{folder_of, is_model_name};
+use super::train::session::{Looker, MachineParams, read_phrases};
+use super::trained::{Trained, Tuned};
+use super::{Progress, Stage as _, finetune::Finetune, train::Train};
+use crate::generation::{CardError, LearnedFrom, ModelCard, Use, file_names};
+use crate::store::{Location, Patience, StoreError};
+use crate::training::{Dataset, Split};
+
+/// Returns where the list of what a command of a run learns from lies below the store.
+pub fn learned_path(run: &str, command: &str) -> String {
+    format!("runs/{run}/{command}.learned.json")
+}
+
+/// Lists what is learned from a dataset: phrases of the training and of the validation split.
+fn of_dataset(dataset: &Dataset) -> LearnedFrom {
+    let used = dataset.phrases().iter().filter_map(|phrase| {
+        let used_for = match phrase.split {
+            Split::Train => Use::Training,
+            Split::Validation => Use::Validation,
+            Split::Test => return None,
+        };
+        Some((used_for, phrase.song_hash.as_deref(), &*phrase.content_hash))
+    });
+    LearnedFrom::new(dataset.fingerprint(), used)
+}
+
+/// Writes what a command of a run learns from, once it is certain that it does: a dataset that the run's
+/// checkpoints agree with.
+///
+/// A list of the same data stays as it is, unless digests are known now that were not before. One of other data is
+/// of a training that left no checkpoint, and is replaced.
+///
+/// # Errors
+/// When the store cannot be read or written.
+pub fn remember(
+    store: &Location,
+    run: &str,
+    command: &str,
+    dataset: &Dataset,
+    patience: Patience,
+    watch: &Looker,
+) -> anyhow::Result<()> {
+    let path = learned_path(run, command);
+    let notice = |error: &StoreError, pause| watch.notice(error, pause);
+    let found = of_dataset(dataset);
+    let there = patience.wait_out(notice, || store.read_if_there(&path))?;
+    let known: Option<LearnedFrom> =
+        there.as_ref().and_then(|text| serde_json::from_slice(text).ok());
+    let wanted = match &known {
+        Some(known) if known.data == found.data => known.clone().refreshed(found),
+        _ => found,
+    };
+    if known.as_ref() == Some(&wanted) {
+        return Ok(());
+    }
+    if there.is_some() {
+        patience.wait_out(notice, || store.remove(&path))?;
+    }
+    let text = serde_json::to_vec_pretty(&wanted)?;
+    patience.wait_out(notice, || store.put_new(&path, text.clone().into()))?;
+    Ok(())
+}
+
+/// Returns what the weights of a run learned from: train's phrases and, where they were fine-tuned, those of
+/// finetune. None where the run has no list, as those of release 0.1, and the store's phrases are others by now.
+///
+/// # Errors
+/// When the store cannot be read.
+pub fn of_run(
+    store: &Location,
+    run: &str,
+    trained: &Trained,
+    machine: &MachineParams,
+    progress: &dyn Progress,
+) -> anyhow::Result<Option<LearnedFrom>> {
+    let of = |command, data: &str, most| {
+        of_command(store, run, command, (data, most), machine, progress)
+    };
+    let Some(by_train) = of(Train::NAME, &trained.state.data, None)? else { return Ok(None) };
+    let Some(Tuned { data, num_phrases }) = &trained.tuned else { return Ok(Some(by_train)) };
+    if *data == by_train.data {
+        return Ok(Some(by_train));
+    }
+    let by_finetune = of(Finetune::NAME, data, *num_phrases)?;
+    Ok(by_finetune.map(|by_finetune| by_train.and(by_finetune)))
+}
+
+/// Returns what a command learned from the data with a fingerprint: from its list, else from the store.
+fn of_command(
+    store: &Location,
+    run: &str,
+    command: &str,
+    (data, max_train_phrases): (&str, Option<usize>),
+    machine: &MachineParams,
+    progress: &dyn Progress,
+) -> anyhow::Result<Option<LearnedFrom>> {
+    let text = store.read_if_there(&learned_path(run, command))?;
+    let listed: Option<LearnedFrom> = text.and_then(|text| serde_json::from_slice(&text).ok());
+    if let Some(listed) = listed.filter(|listed| listed.data == data) {
+        return Ok(Some(listed));
+    }
+    let watch = Looker(progress);
+    let stage = super::export::Export::NAME;
+    let phrases = read_phrases(store, stage, machine, max_train_phrases, progress, &watch)?;
+    let is_same = phrases.dataset.fingerprint() == data;
+    Ok(is_same.then(|| of_dataset(&phrases.dataset)))
+}
+
+/// Why nobody knows what the model of a motion learned from.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum NotKnown {
+    #[error(
+        "store {store} has no model \"{model}\", so what it learned from is not known; copy the folder of the \
+         model to models/{model} there"
+    )]
+    NoModel { store: String, model: String },
+    #[error(
+        "model \"{model}\" of store {store} has other weights ({found}) than the motions were made with \
+         ({expected}), so what those learned from is not known; generate the motions again, or copy the model \
+         there that made them"
+    )]
+    OtherWeights { store: String, model: String, found: String, expected: String },
+    #[error(
+        "the card of model \"{model}\" does not tell what it learned from; export it again from its run with this \
+         version of motiongen"
+    )]
+    NotListed { model: String },
+    #[error(transparent)]
+    Card(#[from] CardError),
+}
+
+/// Returns what the model that made a motion learned from, as the card in the store says; only the card is read.
+///
+/// `model` and `weights` are those of the motion's row in `generations`.
+///
+/// # Errors
+/// [`StoreError`] when the store cannot be read; within, why the card does not tell.
+pub fn of_model(
+    store: &Location,
+    model: &str,
+    weights: &str,
+) -> Result<Result<LearnedFrom, NotKnown>, StoreError> {
+    let path = format!("{}/{}", folder_of(model), file_names::CARD);
+    // The name is from a table, where a foreign one may say anything.
+    let bytes = if is_model_name(model) { store.read_if_there(&path)? } else { None };
+    let Some(bytes) = bytes else {
+        let (store, model) = (store.to_string(), model.to_owned());
+        return Ok(Err(NotKnown::NoModel { store, model }));
+    };
+    let card = match ModelCard::read(&bytes, &store.url_of(&path)) {
+        Ok(card) => card,
+        Err(error) => return Ok(Err(error.into())),
+    };
+    let found = weights_digest(&card);
+    if found != weights {
+        let short = |digest: &str| digest.chars().take(12).collect();
+        return Ok(Err(NotKnown::OtherWeights {
+            store: store.to_string(),
+            model: model.to_owned(),
+            found: short(&found),
+            expected: short(weights),
+        }));
+    }
+    let model = model.to_owned();
+    Ok(card.provenance.learned_from.ok_or(NotKnown::NotListed { model }))
+}
