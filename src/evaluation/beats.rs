@@ -8,7 +8,8 @@ use crate::motion::kinematics::forward_differences;
 use crate::units::frames_to_s;
 
 use super::body::{BODY_RADIUS_M, norm, turn_rates};
-use super::interval::{Draws, mean_and_deviation};
+use super::draws::Draws;
+use super::interval::mean_and_deviation;
 
 /// Frames on either side that a beat of motion is slower than; as in GCD at 30 fps.
 pub const MINIMUM_ORDER_FRAMES: usize = 5;

@@ -35,51 +35,26 @@ pub struct BarLocking {
     pub wrong_mean: f64,
     /// `(r2 - wrong_mean) / s`, s the standard deviation over wrong tempi; none where they all agree.
     pub effect: Option<f64>,
-    /// `(1 + number of wrong tempi that do as well) / (1 + number of them)`.
-    pub p: f64,
+    /// `(1 + number of wrong tempi that do as well) / (1 + number of them)`. No p-value: neighbouring tempi are no
+    /// independent draws.
+    pub wrong_share: f64,
     pub n_wrong: usize,
     /// Fits that were made.
     pub n_fits: usize,
 }
 
-/// Returns how strongly signals are locked to the bar, against the tempi `ratios` times the music's.
-///
-/// Each item of `fits` is one regression: a single passage for a fit of its own, or all passages of a song
-/// for one fit of them. `R²` is [`bar_locking`](crate::motion::locking::bar_locking) of the passages of a fit one behind the other, with phases
-/// `bars · ratio`, averaged over fits. For p below 0.01 there must be a hundred ratios.
-///
-/// None where no fit has more values than the nine that are fitted, there are fewer than two ratios, or
-/// something is not finite.
-pub fn locking_against(fits: &[Vec<Passage<'_>>], ratios: &[f64]) -> Option<BarLocking> {
-    let fit_of: Vec<usize> =
-        fits.iter().enumerate().flat_map(|(i, fit)| fit.iter().map(move |_| i)).collect();
-    let passages: Vec<Passage<'_>> = fits.iter().flatten().copied().collect();
-    let at: Vec<Vec<f64>> = std::iter::once(&1.0)
-        .chain(ratios)
-        .map(|&ratio| r2_at(&passages, &[&fit_of], ratio).swap_remove(0))
-        .collect();
-    BarLocking::against(at.first()?, &at[1..])
-}
-
-/// Returns R² of each fit with the bar's tempo multiplied by `ratio`, for several ways to put passages into
-/// fits: `groupings[g][i]` is the fit of passage i.
+/// Returns R² of each fit with the bar's tempo multiplied by `ratio`; `groups[i]` is the fit of passage i, and
+/// all passages of a fit lie one behind the other in it.
 ///
 /// Fits that have no more values than are fitted are left out.
-pub fn r2_at(passages: &[Passage<'_>], groupings: &[&[usize]], ratio: f64) -> Vec<Vec<f64>> {
-    let n_fits = |grouping: &&[usize]| grouping.iter().max().map_or(0, |last| last + 1);
-    let mut fits: Vec<Vec<BarSums>> =
-        groupings.iter().map(|grouping| vec![BarSums::default(); n_fits(grouping)]).collect();
-    for (i, Passage { signal, bars }) in passages.iter().enumerate() {
+pub fn r2_at(passages: &[Passage<'_>], groups: &[usize], ratio: f64) -> Vec<f64> {
+    let n_fits = groups.iter().max().map_or(0, |last| last + 1);
+    let mut fits = vec![BarSums::default(); n_fits];
+    for (Passage { signal, bars }, group) in passages.iter().zip(groups) {
         let phases = bars.iter().map(|bars| bars * ratio);
-        let sums = BarSums::of(signal.iter().copied().zip(phases));
-        for (fits, grouping) in fits.iter_mut().zip(groupings) {
-            fits[grouping[i]].add(&sums);
-        }
+        fits[*group].add(&BarSums::of(signal.iter().copied().zip(phases)));
     }
-    let fitted = |fits: Vec<BarSums>| {
-        fits.into_iter().filter(BarSums::can_be_fitted).map(|fit| fit.r2()).collect()
-    };
-    fits.into_iter().map(fitted).collect()
+    fits.into_iter().filter(BarSums::can_be_fitted).map(|fit| fit.r2()).collect()
 }
 
 impl BarLocking {
@@ -87,17 +62,17 @@ impl BarLocking {
     ///
     /// None without fits, for fewer than two wrong tempi, or where something is not finite.
     pub fn against(r2: &[f64], wrong: &[Vec<f64>]) -> Option<Self> {
-        let mean = |of: &[f64]| of.iter().sum::<f64>() / of.len() as f64;
+        let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
         let n_fits = r2.len();
         let r2 = mean(r2);
-        let wrong: Vec<f64> = wrong.iter().map(|of| mean(of)).collect();
+        let wrong: Vec<f64> = wrong.iter().map(|values| mean(values)).collect();
         let (wrong_mean, deviation) = mean_and_deviation(&wrong)?;
         let n_as_good = wrong.iter().filter(|&&x| x >= r2).count();
         r2.is_finite().then(|| Self {
             r2,
             wrong_mean,
             effect: (deviation > MIN_DEVIATION).then(|| (r2 - wrong_mean) / deviation),
-            p: (1 + n_as_good) as f64 / (1 + wrong.len()) as f64,
+            wrong_share: (1 + n_as_good) as f64 / (1 + wrong.len()) as f64,
             n_wrong: wrong.len(),
             n_fits,
         })
@@ -139,6 +114,16 @@ mod tests {
         (0..n).map(|t| (start_frames + t as f64) / bar_frames).collect()
     }
 
+    /// One regression for each item of `fits`, against tempi.
+    fn locking_against(fits: &[Vec<Passage<'_>>], ratios: &[f64]) -> Option<BarLocking> {
+        let groups: Vec<usize> =
+            fits.iter().enumerate().flat_map(|(i, fit)| fit.iter().map(move |_| i)).collect();
+        let passages: Vec<Passage<'_>> = fits.iter().flatten().copied().collect();
+        let wrong: Vec<Vec<f64>> =
+            ratios.iter().map(|&ratio| r2_at(&passages, &groups, ratio)).collect();
+        BarLocking::against(&r2_at(&passages, &groups, 1.0), &wrong)
+    }
+
     fn wave(bars: &[f64]) -> Vec<f64> {
         bars.iter().map(|x| (TAU * x).sin() + 0.3 * (TAU * 2.0 * x).cos()).collect()
     }
@@ -152,7 +137,7 @@ mod tests {
         assert!((found.r2 - 1.0).abs() < 1e-9, "{found:?}");
         // Ten bars tell tempi a tenth apart; nearer ones share a part of the wave.
         assert!(found.wrong_mean < 0.2 && found.effect > Some(3.0), "{found:?}");
-        assert_eq!((found.p, found.n_wrong, found.n_fits), (0.01, 99, 1));
+        assert_eq!((found.wrong_share, found.n_wrong, found.n_fits), (0.01, 99, 1));
     }
 
     #[test]
@@ -161,7 +146,7 @@ mod tests {
         let signal = wave(&other);
         let fits = [vec![Passage { signal: &signal, bars: &own }]];
         let found = locking_against(&fits, &wrong_tempi(60)).expect("finite");
-        assert!(found.r2 < 0.1 && found.p > 0.2, "{found:?}");
+        assert!(found.r2 < 0.1 && found.wrong_share > 0.2, "{found:?}");
     }
 
     #[test]
@@ -218,7 +203,7 @@ mod tests {
         // Whoever stands still is not locked, at this tempo as little as at others.
         let still = [0.0; 60];
         let found = locking_against(&[vec![Passage { signal: &still, bars: &bars }]], &ratios);
-        assert_eq!(found.map(|x| (x.r2, x.effect, x.p)), Some((0.0, None, 1.0)));
+        assert_eq!(found.map(|x| (x.r2, x.effect, x.wrong_share)), Some((0.0, None, 1.0)));
         signal[5] = f64::NAN;
         assert_eq!(
             locking_against(&[vec![Passage { signal: &signal, bars: &bars }]], &ratios),

@@ -1,4 +1,4 @@
-//! What is kept of a motion once it was looked at: enough for every number of a set of motions.
+//! What is kept of a window once it was measured: enough for every number of a set of windows.
 
 use ndarray::{Array2, ArrayView2};
 
@@ -9,17 +9,19 @@ use super::beats::motion_beats;
 use super::body::{norm, poses};
 use super::consistency::{Consistency, consistency};
 use super::reference_statistics::{FeatureSet, ReferenceStatistics};
-use super::sanity::{Check, checks};
-use super::training_range::range_checks;
+use super::sanity::{Check, CheckSet, checks};
+use super::window_range::Posture;
 
-/// A motion as its numbers.
+/// A window of motion as its numbers.
 #[derive(Clone, Debug)]
 pub struct Measured {
     pub n_frames: usize,
-    /// The reference's checks and the strict ones; with reference statistics, those of the training set's
-    /// speeds too.
+    /// The reference's checks and the strict ones; with reference statistics, those of the training split's
+    /// windows too.
     pub checks: Vec<Check>,
     pub consistency: Option<Consistency>,
+    /// None where a position or an orientation is not finite.
+    pub posture: Option<Posture>,
     /// Mean speed, m/s; none where a position is not finite.
     pub mean_speed_m_s: Option<f64>,
     /// Vertical velocity of the body, m/s, from frame to frame: one fewer. Taken from positions, since the
@@ -34,26 +36,28 @@ pub struct Measured {
 }
 
 impl Measured {
-    /// Looks at a motion, `[T, 25]`.
+    /// Measures a window, `[T, 25]`.
     ///
     /// # Panics
     /// When there are other than 25 channels.
-    pub fn of(
+    pub fn new(
         frames: ArrayView2<f32>,
         limits: ChannelLimits,
         reference: Option<&ReferenceStatistics>,
     ) -> Self {
-        let mut checks = checks(frames, limits);
         let poses = poses(frames);
+        let posture = poses.as_ref().and_then(Posture::new);
+        let mut checks = checks(frames, limits);
+        checks.extend(reference.iter().flat_map(|r| r.window_range.checks(posture.as_ref())));
         let velocity =
             poses.as_ref().map(|p| forward_differences(&p.position_m)).unwrap_or_default();
         let mean = |n: usize, sum: f64| (n > 0).then(|| sum / n as f64);
-        let of_set = |set: FeatureSet| reference.and_then(|r| r.features(set, frames));
-        checks.extend(reference.iter().flat_map(|r| range_checks(&r.training_range, frames)));
+        let features = |set: FeatureSet| reference.and_then(|r| r.features(set, frames));
         Self {
             n_frames: frames.nrows(),
             checks,
             consistency: consistency(frames, limits),
+            posture,
             mean_speed_m_s: mean(velocity.len(), velocity.iter().map(|v| norm(*v)).sum()),
             rise_m_s: velocity.iter().map(|v| v[1]).collect(),
             phase: frames
@@ -62,7 +66,7 @@ impl Measured {
                 .map(|&x| f64::from(x))
                 .collect(),
             beats: poses.as_ref().map(motion_beats).unwrap_or_default(),
-            features: FeatureSet::ALL.map(of_set).into(),
+            features: FeatureSet::ALL.map(features).into(),
         }
     }
 
@@ -73,9 +77,15 @@ impl Measured {
         self.features[i].as_ref().map(|rows| rows.view())
     }
 
-    /// Whether it passed every check of a set.
-    pub fn passes(&self, set: super::CheckSet) -> bool {
-        self.checks.iter().filter(|check| check.set == set).all(|check| check.passed)
+    /// Whether it passed every check of a set that counts; `holds` tells those that hold by construction.
+    pub fn passes(&self, set: CheckSet, holds: &dyn Fn(&str) -> bool) -> bool {
+        let counted = |check: &&Check| check.set == set && !holds(check.name);
+        self.checks.iter().filter(counted).all(|check| check.passed)
+    }
+
+    /// Whether it passed a check; none where the check was not made.
+    pub fn passed(&self, name: &str) -> Option<bool> {
+        self.checks.iter().find(|check| check.name == name).map(|check| check.passed)
     }
 }
 
@@ -101,9 +111,9 @@ mod tests {
     #[test]
     fn a_motion_is_measured_by_its_positions() {
         let mut frames = bounce(91);
-        let found = Measured::of(frames.view(), ChannelLimits::Wide, None);
+        let found = Measured::new(frames.view(), ChannelLimits::Wide, None);
         assert_eq!((found.n_frames, found.rise_m_s.len(), found.phase.len()), (91, 90, 91));
-        assert_eq!((found.checks.len(), found.passes(CheckSet::Reference)), (13, true));
+        assert_eq!((found.checks.len(), found.passes(CheckSet::Reference, &|_| false)), (13, true));
         // Four amplitudes a second, less what frames half a frame from the peaks miss.
         let expected = 0.4 * (std::f64::consts::PI / 30.0).cos();
         assert!((found.mean_speed_m_s.unwrap() - expected).abs() < 1e-6, "{found:?}");
@@ -113,18 +123,18 @@ mod tests {
         assert!(found.features(FeatureSet::Axes).is_none());
         // What the velocity channel says changes checks, not the speed.
         frames.column_mut(4).fill(90.0);
-        let lying = Measured::of(frames.view(), ChannelLimits::Wide, None);
+        let lying = Measured::new(frames.view(), ChannelLimits::Wide, None);
         assert_eq!(lying.mean_speed_m_s, found.mean_speed_m_s);
-        assert!(!lying.passes(CheckSet::Reference) && !lying.passes(CheckSet::Strict));
+        assert!(!lying.passes(CheckSet::Reference, &|_| false) && !lying.passes(CheckSet::Strict, &|_| false));
     }
 
     #[test]
     fn a_motion_that_is_not_finite_has_checks_and_nothing_else() {
         let mut frames = bounce(31);
         frames[[7, 0]] = f32::NAN;
-        let found = Measured::of(frames.view(), ChannelLimits::Wide, None);
+        let found = Measured::new(frames.view(), ChannelLimits::Wide, None);
         assert_eq!((found.mean_speed_m_s, found.rise_m_s.len(), found.beats.len()), (None, 0, 0));
         assert_eq!(found.consistency, None);
-        assert!(!found.passes(CheckSet::Strict));
+        assert!(!found.passes(CheckSet::Strict, &|_| false));
     }
 }

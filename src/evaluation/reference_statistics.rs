@@ -1,14 +1,14 @@
-//! What is known of the ground truth, by which all models are measured: an artefact with a version.
+//! What is known of real motion, by which all models are measured: an artefact with a version.
 //!
-//! Thresholds, means and deviations come from the ground truth alone and stay fixed, so that the numbers of
-//! two models can be compared. The hash says which data they are of.
+//! Thresholds, means and deviations come from the windows of the training split alone and stay fixed, so that
+//! the numbers of two models can be compared, and held-out real motion is measured as any other. The hash says
+//! which data they are of.
 
 use ndarray::{Array2, ArrayView2, Axis, concatenate};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::motion::Poses;
-use crate::motion::rates::MotionRange;
 
 use super::body::{BODY_RADIUS_M, part, poses};
 use super::frechet::{DEVIATION_EPS, Gaussian};
@@ -16,9 +16,10 @@ use super::geometric::{GEOMETRIC_NAMES, GeometricThresholds, geometric_features}
 use super::kinetic::{
     AXIS_NAMES, CHUNK_FRAMES, Formula, MARKER_NAMES, axis_features, chunks, marker_features,
 };
+use super::window_range::{Posture, WindowRange};
 
 /// Version of the artefact: another meaning of any of its numbers is another version.
-pub const REFERENCE_VERSION: u32 = 1;
+pub const REFERENCE_VERSION: u32 = 2;
 
 /// Features of which all of the ground truth has the same value keep their unit.
 const MIN_DEVIATION: f64 = 1e-6;
@@ -147,6 +148,12 @@ pub enum ReferenceError {
          truth again"
     )]
     Features { set: &'static str, dim: usize },
+    /// Bounds of windows are missing or not in order.
+    #[error(
+        "reference statistics have bounds of windows that are no numbers or not in order; measure the ground \
+         truth again"
+    )]
+    Bounds,
 }
 
 /// What is known of the ground truth.
@@ -155,12 +162,14 @@ pub struct ReferenceStatistics {
     pub version: u32,
     /// Hash of the data that were measured, as the store has it.
     pub data_hash: String,
-    pub n_motions: usize,
+    /// Windows of the training split.
+    pub n_windows: usize,
+    pub window_frames: usize,
     pub n_chunks: usize,
     pub chunk_frames: usize,
     pub body_radius_m: f64,
     pub thresholds: GeometricThresholds,
-    pub training_range: MotionRange,
+    pub window_range: WindowRange,
     pub axes: FeatureStatistics,
     pub axes_compat: FeatureStatistics,
     pub markers: FeatureStatistics,
@@ -169,25 +178,28 @@ pub struct ReferenceStatistics {
 }
 
 impl ReferenceStatistics {
-    /// Measures the motions of the ground truth, `[T, 25]` each.
+    /// Measures windows of real motion of the training split, `[T, 25]` each, all of one length.
     ///
     /// None for fewer than two chunks of 75 frames, or where a motion is not finite.
-    pub fn fit(motions: &[ArrayView2<f32>], data_hash: String) -> Option<Self> {
-        let mut all = Vec::new();
-        for frames in motions {
-            all.extend(chunks_of(*frames)?);
+    pub fn fit(windows: &[ArrayView2<f32>], data_hash: String) -> Option<Self> {
+        let (mut all, mut postures) = (Vec::new(), Vec::new());
+        for frames in windows {
+            let whole = poses(*frames)?;
+            postures.push(Posture::new(&whole)?);
+            all.extend(chunks(whole.len()).map(|chunk| part(&whole, chunk)));
         }
         let thresholds = GeometricThresholds::fit(&all)?;
         let of = |set: FeatureSet| FeatureStatistics::fit(set.stacked(&all, &thresholds).view());
         Some(Self {
             version: REFERENCE_VERSION,
             data_hash,
-            n_motions: motions.len(),
+            n_windows: windows.len(),
+            window_frames: windows.first().map_or(0, |frames| frames.nrows()),
             n_chunks: all.len(),
             chunk_frames: CHUNK_FRAMES,
             body_radius_m: BODY_RADIUS_M,
             thresholds,
-            training_range: MotionRange::fit(motions.iter().copied())?,
+            window_range: WindowRange::fit(&postures)?,
             axes: of(FeatureSet::Axes)?,
             axes_compat: of(FeatureSet::AxesCompat)?,
             markers: of(FeatureSet::Markers)?,
@@ -218,6 +230,9 @@ impl ReferenceStatistics {
             if !found.statistics(set).is_sound(dim) {
                 return Err(ReferenceError::Features { set: set.name(), dim });
             }
+        }
+        if !found.window_range.is_sound() || found.window_frames == 0 {
+            return Err(ReferenceError::Bounds);
         }
         Ok(found)
     }

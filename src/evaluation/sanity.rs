@@ -7,6 +7,7 @@
 use ndarray::ArrayView2;
 
 use crate::motion::phase::WRAP_BARS;
+use crate::motion::postprocess::{Coherence, PostProcessConfig};
 use crate::motion::quaternion::{Quaternion, angular_velocity, dot, normalize};
 use crate::motion::{Channel, ChannelLimits};
 use crate::units::FPS;
@@ -176,6 +177,24 @@ pub fn checks(frames: ArrayView2<f32>, limits: ChannelLimits) -> Vec<Check> {
     reference.into_iter().chain(strict).collect()
 }
 
+/// Returns whether post-processing makes a check pass whatever was decoded, so that passing is no merit.
+///
+/// `has_phase` tells whether the phase of the music was known, to which `relock_phase` sets that of the motion.
+pub fn holds_by_construction(check: &str, config: &PostProcessConfig, has_phase: bool) -> bool {
+    let is_derived = config.coherence == Coherence::Derive;
+    let is_relocked = config.relock_phase && has_phase;
+    match check {
+        "velocity" | "acceleration" | "angular_velocity" | "velocity_coherence"
+        | "accel_coherence" => is_derived,
+        "quaternion" => config.normalize_quaternions,
+        "quaternion_continuity" => config.normalize_quaternions && config.range.is_some(),
+        "phase" => is_relocked || config.clamp_phase,
+        "phase_monotonic" => is_relocked || config.enforce_phase_monotonic,
+        "speed" | "turn_rate" => config.range.is_some(),
+        _ => false,
+    }
+}
+
 /// Returns the mean `|d[t] - 30 (x[t+1] - x[t])|` over frames and axes, of a channel x and the one that says
 /// it is its derivative; 0 where there are no two frames.
 pub fn derivative_error(frames: ArrayView2<f32>, of: Channel, derivative: Channel) -> f64 {
@@ -336,6 +355,18 @@ mod tests {
         assert_eq!(with(&|f| f.column_mut(14).fill(0.0)), ["angular_velocity"]);
         assert_eq!(with(&|f| f[[40, 14]] = 25.0), ["ranges", "angular_velocity"]);
         assert!(with(&|f| f.slice_mut(ndarray::s![.., 9..13]).fill(0.0)).contains(&"quaternion"));
+    }
+
+    #[test]
+    fn what_post_processing_makes_true_is_known() {
+        let config = PostProcessConfig::default();
+        let holds = |check: &str| holds_by_construction(check, &config, true);
+        let found = ["velocity", "quaternion", "phase_monotonic", "speed", "jerk_of_capture"];
+        assert_eq!(found.map(holds), [true, true, true, false, false]);
+        assert!(!holds_by_construction("phase_monotonic", &config, false));
+        let nothing = PostProcessConfig::nothing();
+        let all = checks(walk(31).view(), ChannelLimits::Wide);
+        assert!(all.iter().all(|check| !holds_by_construction(check.name, &nothing, true)));
     }
 
     #[test]

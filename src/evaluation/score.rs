@@ -39,7 +39,9 @@ pub fn score(
 ) -> Score {
     let checks = checks(frames, limits);
     let n_passed = checks.iter().filter(|check| check.passed).count();
-    let locking = phase.map(|phase| locking(frames, phase));
+    let vertical: Vec<f64> =
+        frames.column(Channel::Velocity.range().start + 1).iter().map(|&x| f64::from(x)).collect();
+    let locking = phase.map(|phase| locking_above_chance(&vertical, phase));
     let sound = n_passed as f64 / checks.len() as f64;
     let coherent = 1.0 / (1.0 + velocity_error_m_s / HALF_COHERENT_M_S);
     let parts = [Some(sound), Some(coherent), locking.map(|x| x.max(0.0))];
@@ -49,14 +51,14 @@ pub fn score(
     Score { total: is_finite.then_some(total), n_passed, n_checks: checks.len(), locking }
 }
 
-/// R² of the vertical velocity with the bar, less its mean at wrong tempi.
-fn locking(frames: ArrayView2<f32>, phase: &[f64]) -> f64 {
-    let vertical: Vec<f64> =
-        frames.column(Channel::Velocity.range().start + 1).iter().map(|&x| f64::from(x)).collect();
+/// Returns R² of a vertical velocity with the bar, less its mean at wrong tempi.
+///
+/// Harmonics are free, so that motion which is chosen by this says nothing of where in the bar it rises.
+pub fn locking_above_chance(vertical_m_s: &[f64], phase: &[f64]) -> f64 {
     let bars = unwrapped(phase);
     let at = |tempo: f64| {
         let phase: Vec<f64> = bars.iter().map(|x| (x * tempo).rem_euclid(1.0)).collect();
-        bar_locking(&vertical, &phase)
+        bar_locking(vertical_m_s, &phase)
     };
     let tempi = wrong_tempi(N_WRONG_TEMPI);
     let wrong = tempi.iter().map(|&tempo| at(tempo)).sum::<f64>() / tempi.len() as f64;

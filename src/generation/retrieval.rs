@@ -74,6 +74,15 @@ impl Retrieval {
     /// over a block and s the standard deviation over the library. None for no frames, and where a feature is
     /// not finite.
     pub fn nearest(&self, features: ArrayView2<f32>) -> Option<(usize, f64)> {
+        self.nearest_among(features, |_| true)
+    }
+
+    /// Returns the same among the phrases that `is_among` takes; none where there is no such phrase.
+    pub fn nearest_among(
+        &self,
+        features: ArrayView2<f32>,
+        is_among: impl Fn(usize) -> bool,
+    ) -> Option<(usize, f64)> {
         let n = features.nrows().min(self.window_frames);
         let own = Array1::from(blocks(features.slice(s![..n, ..])));
         let own = standardised(own.view(), &self.mean, &self.weight);
@@ -87,8 +96,9 @@ impl Retrieval {
         let nearest = self
             .keys
             .axis_iter(Axis(0))
-            .map(distance)
             .enumerate()
+            .filter(|(i, _)| is_among(*i))
+            .map(|(i, key)| (i, distance(key)))
             .reduce(|best, next| if next.1 < best.1 { next } else { best })?;
         Some((nearest.0, (nearest.1 / own.len() as f64).sqrt()))
     }

@@ -120,6 +120,7 @@ mod tests {
         let against = Against {
             run: "<old>".to_owned(),
             metrics: vec![of(2.5), jerk(Some(3.0))],
+            paired: Vec::new(),
             settings: vec![("steps".to_owned(), "20".to_owned(), "<50>".to_owned())],
         };
         let told = told(vec![of(1.5), jerk(None)], &against);

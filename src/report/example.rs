@@ -49,6 +49,8 @@ pub(super) fn example() -> Report {
     Report {
         title: "Evaluation of demo".to_owned(),
         facts: vec![("motions".to_owned(), "120".to_owned())],
+        verdicts: Vec::new(),
+        notes: Vec::new(),
         checks: vec![
             check("reference", "phase", 120, 118),
             CheckLine {
@@ -85,6 +87,7 @@ pub(super) fn example() -> Report {
                 with_interval(fid_k("generated", 3.5), 3.25, 3.75),
                 locked("generated", "locking_p", 0.25),
             ],
+            paired: Vec::new(),
             settings: vec![("steps".to_owned(), "20".to_owned(), "50".to_owned())],
         }),
     }

@@ -73,11 +73,72 @@ impl Metric {
     }
 }
 
+/// How a verdict or one of its tests ended.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Outcome {
+    Won,
+    Lost,
+    /// Not enough was measured to tell.
+    #[default]
+    Open,
+}
+
+impl Outcome {
+    /// Returns the name of the outcome in tables.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Won => "won",
+            Self::Lost => "lost",
+            Self::Open => "open",
+        }
+    }
+}
+
+/// One test that a verdict rests on.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct VerdictTest {
+    pub test: String,
+    pub outcome: Outcome,
+    pub statistic: String,
+    pub value: Option<f64>,
+    pub ci_low: Option<f64>,
+    pub ci_high: Option<f64>,
+    pub unit: String,
+    pub rule: String,
+    pub limit: Option<f64>,
+    pub against: String,
+    pub message: String,
+}
+
+/// A verdict on a run.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Verdict {
+    pub verdict: String,
+    pub split: String,
+    pub outcome: Outcome,
+    pub tests: Vec<VerdictTest>,
+}
+
+/// A difference between two runs, song by song.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Paired {
+    pub metric: String,
+    pub variant: String,
+    pub split: String,
+    pub difference: f64,
+    pub ci_low: Option<f64>,
+    pub ci_high: Option<f64>,
+    pub p_holm: Option<f64>,
+    pub n_songs: usize,
+}
+
 /// How many motions passed one sanity check.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct CheckLine {
     /// `reference` or `strict`; the two are never mixed.
     pub set: String,
+    pub stage: String,
+    pub by_construction: bool,
     pub check: String,
     pub threshold: f64,
     pub n: usize,
@@ -104,6 +165,7 @@ pub struct Worst {
 pub struct Against {
     pub run: String,
     pub metrics: Vec<Metric>,
+    pub paired: Vec<Paired>,
     /// Settings that differ: name, there, here.
     pub settings: Vec<(String, String, String)>,
 }
@@ -114,6 +176,8 @@ pub struct Report {
     pub title: String,
     /// Names and values, in the order in which they are listed.
     pub facts: Vec<(String, String)>,
+    pub verdicts: Vec<Verdict>,
+    pub notes: Vec<String>,
     pub checks: Vec<CheckLine>,
     pub metrics: Vec<Metric>,
     pub worst: Vec<Worst>,

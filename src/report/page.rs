@@ -204,6 +204,8 @@ mod tests {
         Report {
             title: own(),
             facts: vec![(own(), own())],
+            verdicts: Vec::new(),
+            notes: Vec::new(),
             checks: vec![CheckLine {
                 set: own(),
                 check: own(),
@@ -217,7 +219,7 @@ mod tests {
                 failed: vec![own()],
                 svg: own(),
             }],
-            against: Some(Against { run: own(), metrics, settings: vec![(own(), own(), own())] }),
+            against: Some(Against { run: own(), metrics, paired: Vec::new(), settings: vec![(own(), own(), own())] }),
         }
     }
 

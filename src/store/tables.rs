@@ -196,17 +196,19 @@ rows! {
 
 rows! {
     "One row per sanity check of a motion that evaluate looked at."
-    SanityCheckRow in "sanity_checks" version 1 sorted by [run, phrase_id, sample]
+    SanityCheckRow in "sanity_checks" version 2 reads 1 sorted by [run, phrase_id, sample]
     {
-        run: String, "", "The run of generate that was evaluated; evaluating it again replaces its rows.";
+        run: String, "", "The run of generate that was evaluated, or the name of motions of another program; evaluating it again replaces its rows.";
         model: String, "", "Name of the model.";
         phrase_id: String, "", "The phrase, as in `phrases`.";
         sample: i32, "samples", "Number of the motion among those of the phrase.";
+        stage: Option<String>, "", "`raw` (as decoded, before post-processing) or `final` (after it); of motions of another program `final`.";
         check_set: String, "", "`reference` (the five checks of the reference design) or `strict` (what captured motion keeps).";
         check_name: String, "", "Name of the check: see docs/evaluate.md.";
-        value: Option<f64>, "", "What was measured; none where it is not finite.";
+        by_construction: Option<bool>, "", "Whether post-processing makes the check pass whatever was decoded; such a check counts in no pass rate.";
+        value: Option<f64>, "", "What was measured, of checks of windows the worst; none where it is not finite.";
         threshold: f64, "", "What the value is held against.";
-        passed: bool, "", "Whether the motion passes.";
+        passed: bool, "", "Whether the motion passes; a check of windows is passed where nine in ten windows pass.";
         message: String, "", "Both in a few words, with their unit.";
     }
 }
@@ -215,19 +217,58 @@ rows! {
     "One row per number of a run that evaluate measured, and of what it is compared with."
     MetricRow in "metrics" version 1 sorted by [run, metric, variant, split, subject]
     {
-        run: String, "", "The run of generate that was evaluated; evaluating it again replaces its rows.";
-        model: String, "", "Name of the model.";
-        subject: String, "", "Whose number it is: `generated`, or a baseline: `shuffled` (the same motions with the music of other songs), `retrieval` (the library's phrase with the nearest features), `mean_motion`, `held_out_truth`, `ground_truth`.";
-        split: String, "", "Which music: `all`, or `held_out` (songs that the model did not learn from).";
+        run: String, "", "The run of generate that was evaluated, or the name of motions of another program; evaluating it again replaces its rows.";
+        model: String, "", "Name of the model; empty for motions of another program.";
+        subject: String, "", "Whose number it is: `generated`, or a baseline: `shuffled` (the same motions with the music of other songs), `shifted` (with the bars shifted by beats), `untrained` (motion of the same network with its first weights), `no_music` (of the trained network, its music withheld), `retrieval` (the library's phrase with the nearest features), `mean_motion`, `held_out_truth`, `training_truth`.";
+        split: String, "", "Which music: `held_out` (the model met none of it), `validation` (its checkpoints were chosen by it), `trained_on`, `unknown` (nobody knows), or `all` of these.";
         metric: String, "", "Name of the number: see docs/evaluate.md.";
-        variant: String, "", "Which of several ways to measure it; empty where there is one.";
+        variant: String, "", "Which of several ways to measure it; empty where there is one. `raw` is of motion as it was decoded.";
         unit: String, "", "Unit of the value; empty where it has none.";
         value: Option<f64>, "", "The number; none where there is too little to tell.";
         ci_low: Option<f64>, "", "Lower end of its 95 % interval.";
         ci_high: Option<f64>, "", "Upper end of its 95 % interval.";
-        n: i64, "", "What was counted: motions, chunks, fits or frames, as the protocol says.";
+        n: i64, "", "What was counted: windows, chunks, songs or frames, as the protocol says.";
         protocol: String, "", "How it was measured.";
         time: TimestampUs, "", "When it was measured.";
+    }
+}
+
+rows! {
+    "One row per test that a verdict on a run rests on."
+    VerdictRow in "verdicts" version 1 sorted by [run, split, verdict, test]
+    {
+        run: String, "", "The run of generate that was evaluated, or the name of motions of another program; evaluating it again replaces its rows.";
+        model: String, "", "Name of the model; empty for motions of another program.";
+        split: String, "", "Which music, as in `metrics`.";
+        verdict: String, "", "`sound`, `like_real`, `follows_music` or `varied`.";
+        verdict_outcome: String, "", "`won` (every test is won), `lost` (one is lost) or `open` (too little was measured).";
+        test: String, "", "Name of the test: see docs/evaluate.md.";
+        outcome: String, "", "`won`, `lost` or `open`.";
+        statistic: String, "", "What was measured, in words.";
+        value: Option<f64>, "", "The statistic; none where it was not measured.";
+        ci_low: Option<f64>, "", "Lower end of its 95 % interval.";
+        ci_high: Option<f64>, "", "Upper end of its 95 % interval.";
+        unit: String, "", "Unit of the value; empty where it has none.";
+        rule: String, "", "`at least`, `at most`, `above`, `below`, or a range.";
+        limit: f64, "", "The limit of the rule; of a range the upper one.";
+        against: String, "", "What the value is held against.";
+        p: Option<f64>, "", "Probability by chance, of tests that have one.";
+        p_holm: Option<f64>, "", "The same, adjusted for the tests of the verdict (Holm).";
+        message: String, "", "All of it in a sentence.";
+        time: TimestampUs, "", "When it was measured.";
+    }
+}
+
+rows! {
+    "One row per song and number of what was generated: what comparisons between runs are paired by."
+    SongMetricRow in "song_metrics" version 1 sorted by [run, song, metric, variant, split]
+    {
+        run: String, "", "The run of generate that was evaluated, or the name of motions of another program; evaluating it again replaces its rows.";
+        song: String, "", "The song: digest of its music, or its file where that is not known.";
+        split: String, "", "Which music, as in `metrics`.";
+        metric: String, "", "Name of the number, as in `metrics`.";
+        variant: String, "", "Which of several ways to measure it, as in `metrics`.";
+        value: f64, "", "The number of the song.";
     }
 }
 
@@ -339,6 +380,8 @@ pub fn all() -> Vec<TableSchema> {
         generated(),
         SanityCheckRow::schema(),
         MetricRow::schema(),
+        VerdictRow::schema(),
+        SongMetricRow::schema(),
     ]
 }
 

@@ -1,52 +1,75 @@
-//! How motions compare with real motion, and whether they are sound.
+//! How windows compare with real motion, and whether they are sound.
 
 use std::collections::BTreeMap;
 
-use ndarray::{Array2, ArrayView2, Axis, concatenate};
+use ndarray::{Array2, ArrayView1, ArrayView2, Axis, concatenate};
 
 use super::super::consistency::Consistency;
 use super::super::control::{POSITION_THRESHOLDS_MM, ROTATION_THRESHOLDS_DEG, control_errors};
 use super::super::distribution::channel_distances;
-use super::super::diversity::{
-    DIVERSITY_PAIRS, MULTIMODALITY_PAIRS, diversity, mean_distance, multimodality,
-};
 use super::super::frechet::{Gaussian, frechet_distance};
 use super::super::interval::{
-    Estimate, bootstrap_estimate, clustered_mean_estimate, mean_estimate, share_estimate,
+    Estimate, clustered_mean_estimate, clustered_share_estimate, jackknife_estimate,
+    share_estimate,
 };
 use super::super::kinetic::CHUNK_FRAMES;
 use super::super::measured::Measured;
 use super::super::reference_statistics::{FeatureSet, ReferenceStatistics};
 use super::super::sanity::CheckSet;
-use super::{Danced, Number, SEED, mean_over};
+use super::super::window_range::Posture;
+use super::{Danced, Number, mean_over};
 use crate::motion::CHANNEL_NAMES;
 
-/// Resamples of an interval of a number of a whole set.
-const N_RESAMPLES: usize = 100;
-/// Features, evenly among all, whose pairs are compared: every one with every other.
-const MAX_COMPARED: usize = 400;
-/// Replications of numbers that draw pairs, as for HumanML3D.
-const N_DIVERSITY: u64 = 20;
-const N_MULTIMODALITY: u64 = 5;
+/// Windows of a song, evenly among all, whose features are compared with those of other songs.
+const MAX_COMPARED_PER_SONG: usize = 24;
+/// Songs, evenly among all, that are compared with each other.
+const MAX_COMPARED_SONGS: usize = 48;
 
-/// Measures how sound motions are and, with reference statistics, how they compare with the ground truth.
-pub fn of_motion(danced: &[Danced], reference: Option<&ReferenceStatistics>) -> Vec<Number> {
-    let mut numbers = soundness(danced);
+/// What windows are held against.
+#[derive(Clone, Copy, Debug)]
+pub struct MotionContext<'a> {
+    pub reference: Option<&'a ReferenceStatistics>,
+    /// Windows that a Fréchet distance is made of, evenly among all: the same number for all subjects.
+    pub n_frechet: usize,
+}
+
+/// Measures how windows compare with the training split, and how different they are.
+pub fn motion_numbers(danced: &[Danced], context: &MotionContext) -> Vec<Number> {
+    let mut numbers = posture_numbers(danced);
     for set in FeatureSet::ALL {
-        numbers.push(frechet(danced, set, reference));
+        numbers.push(frechet_number(danced, set, context));
     }
-    numbers.extend(variety(danced));
+    numbers.push(shift_number(danced));
+    numbers.extend(variety_numbers(danced));
     numbers
 }
 
-/// Pass rates, and means of what the checks look at.
-fn soundness(danced: &[Danced]) -> Vec<Number> {
+/// Measures the share of windows that pass all checks of a set, and means of what the checks look at.
+///
+/// `holds` tells the checks that post-processing makes true, which do not count. `stage` is added to the variants,
+/// where it is not empty.
+pub fn soundness_numbers(
+    danced: &[Danced],
+    holds: &dyn Fn(&str) -> bool,
+    stage: &str,
+) -> Vec<Number> {
     let passed = |set: CheckSet| {
-        let n = danced.iter().filter(|item| item.motion.passes(set)).count();
-        share_estimate(n, danced.len())
+        let (is_true, songs): (Vec<bool>, Vec<usize>) =
+            danced.iter().map(|item| (item.motion.passes(set, holds), item.song)).unzip();
+        clustered_share_estimate(&is_true, &songs)
     };
-    type Of = fn(&Consistency) -> Option<f64>;
-    let parts: [(&'static str, &'static str, Of); 8] = [
+    let variant = |name: &str| format!("{name} {stage}").trim().to_owned();
+    let checks = "share of windows that pass every check of the set that post-processing does not make true";
+    let mut numbers = Vec::new();
+    for (name, set) in [("reference", CheckSet::Reference), ("strict", CheckSet::Strict)] {
+        let share = passed(set);
+        let (_, by_song) =
+            mean_over(danced, |item| Some(f64::from(u8::from(item.motion.passes(set, holds)))));
+        numbers
+            .push(Number::new("pass_rate", variant(name), "", share, checks).with_songs(by_song));
+    }
+    type Part = fn(&Consistency) -> Option<f64>;
+    let parts: [(&'static str, &'static str, Part); 8] = [
         ("velocity_error", "m/s", |c| Some(c.velocity_error_m_s)),
         ("acceleration_error", "m/s²", |c| Some(c.acceleration_error_m_s2)),
         ("turn_error", "rad/s", |c| Some(c.turn_error_rad_s)),
@@ -56,37 +79,74 @@ fn soundness(danced: &[Danced]) -> Vec<Number> {
         ("log_dimensionless_jerk", "", |c| c.log_dimensionless_jerk),
         ("share_over_limits", "", |c| Some(c.share_over_limits)),
     ];
-    let checks = "share of motions that pass every check of the set";
-    let mut numbers = vec![
-        Number::new("pass_rate", "reference", "", passed(CheckSet::Reference), checks),
-        Number::new("pass_rate", "strict", "", passed(CheckSet::Strict), checks),
-        Number::new(
-            "mean_speed",
-            "",
-            "m/s",
-            mean_over(danced, |item| item.motion.mean_speed_m_s),
-            "of positions",
-        ),
-    ];
-    for (metric, unit, of) in parts {
-        let mean = mean_over(danced, |item| item.motion.consistency.as_ref().and_then(of));
-        numbers.push(Number::new(metric, "", unit, mean, "mean over motions"));
+    for (metric, unit, part) in parts {
+        let (mean, by_song) =
+            mean_over(danced, |item| item.motion.consistency.as_ref().and_then(part));
+        let mean = if metric == "log_dimensionless_jerk" { mean } else { mean.non_negative() };
+        let number = Number::new(metric, variant(""), unit, mean, "mean over windows");
+        numbers.push(number.with_songs(by_song));
+    }
+    let windows = "share of windows within the training split's bounds";
+    for (metric, check) in [
+        ("share_upright", "upright"),
+        ("share_height", "height"),
+        ("share_turning", "turning"),
+        ("share_jerk", "jerk_range"),
+    ] {
+        let (is_true, songs): (Vec<bool>, Vec<usize>) = danced
+            .iter()
+            .filter_map(|item| Some((item.motion.passed(check)?, item.song)))
+            .unzip();
+        let share = clustered_share_estimate(&is_true, &songs);
+        let share = if is_true.is_empty() { Estimate::plain(None, 0) } else { share };
+        numbers.push(Number::new(metric, variant(""), "", share, windows));
     }
     numbers
 }
 
-/// Rows of features by song.
-fn by_song(
+/// Speeds and jerk, as positions say them.
+fn posture_numbers(danced: &[Danced]) -> Vec<Number> {
+    type Part = fn(&Posture) -> f64;
+    let parts: [(&'static str, &str, &'static str, Part); 6] = [
+        ("axis_speed", "x", "m/s", |p| p.axis_speed_m_s[0]),
+        ("axis_speed", "y", "m/s", |p| p.axis_speed_m_s[1]),
+        ("axis_speed", "z", "m/s", |p| p.axis_speed_m_s[2]),
+        ("position_jerk", "", "m/s³", |p| p.jerk_m_s3),
+        ("tilt", "", "°", |p| p.tilt_rad.to_degrees()),
+        ("turn_rate", "", "rad/s", |p| p.turning_rad_s),
+    ];
+    let (speed, by_song) = mean_over(danced, |item| item.motion.mean_speed_m_s);
+    let mut numbers =
+        vec![Number::new("mean_speed", "", "m/s", speed.non_negative(), "of positions")
+            .with_songs(by_song)];
+    for (metric, variant, unit, part) in parts {
+        let (mean, by_song) = mean_over(danced, |item| item.motion.posture.as_ref().map(part));
+        let protocol = "of positions and orientations, mean over windows";
+        let number = Number::new(metric, variant, unit, mean.non_negative(), protocol);
+        numbers.push(number.with_songs(by_song));
+    }
+    numbers
+}
+
+/// Groups of songs, at most 40, that the jackknife leaves out one at a time.
+const MAX_GROUPS: usize = 40;
+
+/// Rows of features by group of songs: each song is one, where there are few.
+fn rows_by_song(
     danced: &[Danced],
-    of: impl Fn(&Measured) -> Option<Array2<f64>>,
+    rows: impl Fn(&Measured) -> Option<Array2<f64>>,
 ) -> Vec<Vec<Array2<f64>>> {
     let mut songs: BTreeMap<usize, Vec<Array2<f64>>> = BTreeMap::new();
     for item in danced {
-        if let Some(rows) = of(item.motion) {
+        if let Some(rows) = rows(item.motion) {
             songs.entry(item.song).or_default().push(rows);
         }
     }
-    songs.into_values().collect()
+    let mut groups: Vec<Vec<Array2<f64>>> = vec![Vec::new(); songs.len().min(MAX_GROUPS)];
+    for (i, rows) in songs.into_values().enumerate() {
+        groups[i % MAX_GROUPS].extend(rows);
+    }
+    groups
 }
 
 fn stacked<'a>(rows: impl IntoIterator<Item = &'a Array2<f64>>) -> Option<Array2<f64>> {
@@ -94,87 +154,142 @@ fn stacked<'a>(rows: impl IntoIterator<Item = &'a Array2<f64>>) -> Option<Array2
     concatenate(Axis(0), &views).ok()
 }
 
-/// The Fréchet distance from the ground truth; its interval resamples songs.
-fn frechet(danced: &[Danced], set: FeatureSet, reference: Option<&ReferenceStatistics>) -> Number {
+/// Returns `n` of `len` places, evenly.
+fn evenly(len: usize, n: usize) -> impl Iterator<Item = usize> {
+    let n = n.min(len);
+    (0..n).map(move |i| i * len / n)
+}
+
+/// The Fréchet distance from the training split, without the bias of few songs.
+fn frechet_number(danced: &[Danced], set: FeatureSet, context: &MotionContext) -> Number {
     let (metric, variant) = match set {
         FeatureSet::Geometric => ("fid_g", ""),
         kinetic => ("fid_k", kinetic.name()),
     };
-    let songs = by_song(danced, |motion| motion.features(set).map(|rows| rows.to_owned()));
+    let chosen: Vec<Danced> =
+        evenly(danced.len(), context.n_frechet).map(|i| danced[i].clone()).collect();
+    let songs = rows_by_song(&chosen, |motion| motion.features(set).map(|rows| rows.to_owned()));
     let n_chunks: usize = songs.iter().flatten().map(Array2::nrows).sum();
-    let distance = |picked: &[usize]| {
-        let rows = stacked(picked.iter().flat_map(|&song| &songs[song]))?;
+    let distance = |left_out: Option<usize>| {
+        let kept = songs.iter().enumerate().filter(|(song, _)| Some(*song) != left_out);
+        let rows = stacked(kept.flat_map(|(_, rows)| rows))?;
         let found = Gaussian::fit(rows.view())?;
-        frechet_distance(&found, &reference?.statistics(set).gaussian)
+        frechet_distance(&found, &context.reference?.statistics(set).gaussian)
     };
-    let estimate = bootstrap_estimate(songs.len(), N_RESAMPLES, SEED, distance);
-    let of = reference.map_or("no ground truth".to_owned(), |reference| {
-        format!("{} of ground truth", reference.n_chunks)
+    let estimate = jackknife_estimate(songs.len(), n_chunks, distance).non_negative();
+    let truth = context.reference.map_or("no real motion".to_owned(), |reference| {
+        format!("{} of the training split", reference.n_chunks)
     });
-    let protocol = format!("chunks of {CHUNK_FRAMES} frames against {of}, songs resampled");
-    Number::new(metric, variant, "", Estimate { n: n_chunks, ..estimate }, protocol)
+    let protocol = format!(
+        "{n_chunks} chunks of {CHUNK_FRAMES} frames against {truth}, bias of few songs taken out (jackknife)"
+    );
+    Number::new(metric, variant, "", estimate, protocol)
 }
 
-/// How different motions are from each other, and those for one phrase.
-fn variety(danced: &[Danced]) -> Vec<Number> {
-    let mut numbers = Vec::new();
-    for set in [FeatureSet::Axes, FeatureSet::Markers, FeatureSet::Geometric] {
-        let songs = by_song(danced, |motion| motion.features(set).map(|rows| rows.to_owned()));
-        let rows = stacked(songs.iter().flatten()).unwrap_or_default();
-        let protocol = format!("every pair of up to {MAX_COMPARED} chunks");
-        let estimate = spread(rows.view());
-        numbers.push(Number::new("mean_distance", set.name(), "", estimate, protocol));
-    }
-    for kinetic in [FeatureSet::Axes, FeatureSet::Markers] {
-        let joined = |motion: &Measured| {
-            let (a, b) = (motion.features(kinetic)?, motion.features(FeatureSet::Geometric)?);
-            concatenate(Axis(1), &[a, b]).ok()
-        };
-        let rows = stacked(by_song(danced, joined).iter().flatten()).unwrap_or_default();
-        let seeds = SEED..SEED + N_DIVERSITY;
-        let values: Option<Vec<f64>> =
-            seeds.map(|seed| diversity(rows.view(), DIVERSITY_PAIRS, seed)).collect();
-        let estimate = Estimate { n: rows.nrows(), ..mean_estimate(&values.unwrap_or_default()) };
-        let protocol = format!("{DIVERSITY_PAIRS} pairs of chunks, {N_DIVERSITY} replications");
-        numbers.push(Number::new("diversity", kinetic.name(), "", estimate, protocol));
+/// `√⟨μ_j²⟩` over the mean features of windows, in deviations of the training split.
+fn shift_number(danced: &[Danced]) -> Number {
+    let songs = rows_by_song(danced, joined);
+    let shift = |left_out: Option<usize>| {
+        let kept = songs.iter().enumerate().filter(|(song, _)| Some(*song) != left_out);
+        let mean = stacked(kept.flat_map(|(_, rows)| rows))?.mean_axis(Axis(0))?;
+        Some((mean.iter().map(|x| x * x).sum::<f64>() / mean.len() as f64).sqrt())
+    };
+    let n = songs.iter().map(Vec::len).sum();
+    let estimate = jackknife_estimate(songs.len(), n, shift).non_negative();
+    let protocol = "root mean square over 24 features of how far their mean is from the training split's";
+    Number::new("feature_shift", "", "deviations", estimate, protocol)
+}
 
-        let mut phrases: BTreeMap<usize, Vec<Array2<f64>>> = BTreeMap::new();
-        for item in danced {
-            // One chunk of each motion: later ones dance to other music.
-            if let Some(rows) = joined(item.motion).filter(|rows| rows.nrows() > 0) {
-                let first = rows.slice(ndarray::s![..1, ..]).to_owned();
-                phrases.entry(item.phrase).or_default().push(first);
+/// Kinetic features of the axes and geometric ones side by side, `[n, 24]`.
+fn joined(motion: &Measured) -> Option<Array2<f64>> {
+    let (a, b) = (motion.features(FeatureSet::Axes)?, motion.features(FeatureSet::Geometric)?);
+    concatenate(Axis(1), &[a, b]).ok()
+}
+
+fn distance(a: ArrayView1<f64>, b: ArrayView1<f64>) -> f64 {
+    a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt()
+}
+
+/// How different windows are: of different songs anywhere, of different songs at the same place, and of one place of
+/// one phrase.
+fn variety_numbers(danced: &[Danced]) -> Vec<Number> {
+    let mut songs: BTreeMap<usize, Vec<(usize, Array2<f64>)>> = BTreeMap::new();
+    for item in danced {
+        if let Some(rows) = joined(item.motion).filter(|rows| rows.nrows() > 0) {
+            songs.entry(item.song).or_default().push((item.first_frame, rows));
+        }
+    }
+    let songs: Vec<Vec<(usize, Array2<f64>)>> = songs.into_values().collect();
+    let songs: Vec<Vec<&(usize, Array2<f64>)>> = evenly(songs.len(), MAX_COMPARED_SONGS)
+        .map(|i| evenly(songs[i].len(), MAX_COMPARED_PER_SONG).map(|j| &songs[i][j]).collect())
+        .collect();
+    // Sums of pairs of songs are made once: the jackknife only adds them up.
+    let pair = |i: usize, j: usize, is_same_place: bool| -> (f64, f64) {
+        let (mut sum, mut n) = (0.0, 0.0);
+        for (first, rows) in &songs[i] {
+            for (other_first, other) in &songs[j] {
+                if !is_same_place || first == other_first {
+                    sum += distance(rows.row(0), other.row(0));
+                    n += 1.0;
+                }
             }
         }
-        let conditions: Vec<Array2<f64>> =
-            phrases.values().filter(|rows| rows.len() > 1).filter_map(stacked).collect();
-        let views: Vec<ArrayView2<f64>> = conditions.iter().map(|rows| rows.view()).collect();
-        let seeds = SEED..SEED + N_MULTIMODALITY;
-        let values: Option<Vec<f64>> =
-            seeds.map(|seed| multimodality(&views, MULTIMODALITY_PAIRS, seed)).collect();
-        let estimate = Estimate { n: views.len(), ..mean_estimate(&values.unwrap_or_default()) };
-        let protocol = format!(
-            "first chunks of the motions for a phrase, {MULTIMODALITY_PAIRS} pairs, {N_MULTIMODALITY} \
-             replications"
-        );
-        numbers.push(Number::new("multimodality", kinetic.name(), "", estimate, protocol));
+        (sum, n)
+    };
+    let n_windows = songs.iter().map(Vec::len).sum();
+    let between = |metric: &'static str, is_same_place: bool, protocol: &str| {
+        let pairs: Vec<Vec<(f64, f64)>> = (0..songs.len())
+            .map(|i| (0..i).map(|j| pair(i, j, is_same_place)).collect())
+            .collect();
+        let mean = |left_out: Option<usize>| {
+            let (mut sum, mut n) = (0.0, 0.0);
+            for (i, row) in pairs.iter().enumerate() {
+                for (j, (of_pair, n_pairs)) in row.iter().enumerate() {
+                    if ![Some(i), Some(j)].contains(&left_out) {
+                        sum += of_pair;
+                        n += n_pairs;
+                    }
+                }
+            }
+            (n > 0.0).then(|| sum / n)
+        };
+        let estimate = jackknife_estimate(songs.len(), n_windows, mean).non_negative();
+        Number::new(metric, "axes", "", estimate, protocol)
+    };
+    let mut places: BTreeMap<(usize, usize), (usize, Vec<Array2<f64>>)> = BTreeMap::new();
+    for item in danced {
+        if let Some(rows) = joined(item.motion).filter(|rows| rows.nrows() > 0) {
+            let place = places.entry((item.phrase, item.first_frame)).or_default();
+            place.0 = item.song;
+            place.1.push(rows);
+        }
     }
-    numbers
+    let several = places.values().filter(|(_, rows)| rows.len() > 1);
+    let (values, of_songs): (Vec<f64>, Vec<usize>) = several
+        .map(|(song, rows)| {
+            // Neighbours in order, so that every motion counts and none twice more than another.
+            let steps = rows.windows(2).map(|pair| distance(pair[0].row(0), pair[1].row(0)));
+            (steps.sum::<f64>() / (rows.len() - 1) as f64, *song)
+        })
+        .unzip();
+    let multimodality = clustered_mean_estimate(&values, &of_songs).non_negative();
+    vec![
+        between("mean_distance", false, "windows of different songs"),
+        between("song_distance", true, "windows of different songs at the same place"),
+        Number::new(
+            "multimodality",
+            "axes",
+            "",
+            multimodality,
+            "windows of different motions at one place of one phrase",
+        ),
+    ]
 }
 
-/// The mean distance of all pairs of rows, evenly picked where there are many.
-fn spread(rows: ArrayView2<f64>) -> Estimate {
-    let stride = rows.nrows().div_ceil(MAX_COMPARED).max(1);
-    let picked: Vec<usize> = (0..rows.nrows()).step_by(stride).collect();
-    let rows = rows.select(Axis(0), &picked);
-    bootstrap_estimate(rows.nrows(), N_RESAMPLES, SEED, |of| {
-        mean_distance(rows.select(Axis(0), of).view())
-    })
-}
-
-/// Compares the values of each channel, of frames `[n, 25]`, with those of the ground truth.
-pub fn of_channels(motion: ArrayView2<f32>, truth: ArrayView2<f32>) -> Vec<Number> {
-    let protocol = format!("{} frames against {} of ground truth", motion.nrows(), truth.nrows());
+/// Compares the values of each channel, of frames `[n, 25]`, with those of the training split.
+pub fn channel_numbers(motion: ArrayView2<f32>, truth: ArrayView2<f32>) -> Vec<Number> {
+    let protocol =
+        format!("{} frames against {} of the training split", motion.nrows(), truth.nrows());
     CHANNEL_NAMES
         .iter()
         .zip(channel_distances(motion, truth))
@@ -188,7 +303,7 @@ pub fn of_channels(motion: ArrayView2<f32>, truth: ArrayView2<f32>) -> Vec<Numbe
 /// Sums up the largest misses of motions that had constraints: of positions, mm, and of orientations, °.
 ///
 /// `songs` names the song of each.
-pub fn of_control(misses: [&[f64]; 2], songs: [&[usize]; 2]) -> Vec<Number> {
+pub fn control_numbers(misses: [&[f64]; 2], songs: [&[usize]; 2]) -> Vec<Number> {
     let kinds = [
         ("control_position", "mm", POSITION_THRESHOLDS_MM[1]),
         ("control_orientation", "°", ROTATION_THRESHOLDS_DEG[1]),
@@ -198,7 +313,7 @@ pub fn of_control(misses: [&[f64]; 2], songs: [&[usize]; 2]) -> Vec<Number> {
         if misses[i].is_empty() {
             continue;
         }
-        let mean = clustered_mean_estimate(misses[i], songs[i]);
+        let mean = clustered_mean_estimate(misses[i], songs[i]).non_negative();
         let protocol = "largest miss of a motion, mean over motions";
         numbers.push(Number::new(metric, "largest", unit, mean, protocol));
         let samples: Vec<[f64; 1]> = misses[i].iter().map(|miss| [*miss]).collect();

@@ -26,7 +26,7 @@ fn fitted() -> (Vec<Array2<f32>>, ReferenceStatistics) {
 #[test]
 fn normalised_ground_truth_has_mean_zero_and_deviation_one() {
     let (motions, found) = fitted();
-    assert_eq!((found.n_motions, found.n_chunks, found.chunk_frames), (21, 42, 75));
+    assert_eq!((found.n_windows, found.n_chunks, found.window_frames), (21, 42, 160));
     let rows: Vec<Array2<f64>> = motions
         .iter()
         .map(|motion| found.features(FeatureSet::Axes, motion.view()).expect("finite"))
@@ -60,7 +60,7 @@ fn the_artefact_is_read_as_it_was_written() {
     let (_, found) = fitted();
     let text = serde_json::to_string(&found).expect("numbers");
     let read = ReferenceStatistics::from_json(&text).expect("sound");
-    assert_eq!((read.version, &read.data_hash, read.n_chunks), (1, &found.data_hash, 42));
+    assert_eq!((read.version, &read.data_hash, read.n_chunks), (2, &found.data_hash, 42));
     // Reading a number may miss its last bit.
     let distance = frechet_distance(&read.geometric.gaussian, &found.geometric.gaussian);
     assert_eq!(distance, None, "42 chunks are too few for 16 features");
@@ -87,10 +87,17 @@ fn what_cannot_be_read_is_refused_by_name() {
         "reference statistics of the features markers are not of 12 finite numbers each; measure the ground \
          truth again"
     );
+    let (_, mut unbounded) = fitted();
+    unbounded.window_range.height_m = [1.0, 0.5];
+    assert_eq!(
+        refusal(&unbounded),
+        "reference statistics have bounds of windows that are no numbers or not in order; measure the ground \
+         truth again"
+    );
     found.version = 7;
     assert_eq!(
         refusal(&found),
-        "reference statistics have version 7, this program reads version 1; measure the ground truth again \
+        "reference statistics have version 7, this program reads version 2; measure the ground truth again \
          with this program"
     );
     let error = ReferenceStatistics::from_json("{}").expect_err("refused");

@@ -166,17 +166,23 @@ fn freedom(position_m: f64, step_m: f64) -> f64 {
 /// 4 of the bar (3 for bars of up to three beats), `a` the activity, and `g(f) = min(1, (2 Hz / f)²)`,
 /// 0 above 6 Hz; `T` is the length of a bar. So every downbeat is low.
 pub fn rise_m(phase: f64, activity: f64, bar_s: f64, beats_per_bar: u32) -> f64 {
+    let wave = |(harmonic, amplitude_m): (f64, f64)| amplitude_m * (TAU * harmonic * phase).cos();
+    let waves = rise_amplitudes_m(bar_s, beats_per_bar).into_iter().map(wave);
+    -(0.5 + activity) * waves.sum::<f64>()
+}
+
+/// Returns the harmonics of the bar that [`rise_m`] has, and the amplitude `A g(n / T)` of each, m.
+pub fn rise_amplitudes_m(bar_s: f64, beats_per_bar: u32) -> [(f64, f64); 3] {
     let harmonics = [1.0, 2.0, f64::from(beats_per_bar.clamp(3, 4))];
-    let wave = |(amplitude_m, h): (f64, f64)| {
-        let frequency_hz = h / bar_s;
+    std::array::from_fn(|i| {
+        let frequency_hz = harmonics[i] / bar_s;
         let gain = if frequency_hz > MAX_RISE_HZ {
             0.0
         } else {
             (FULL_RISE_HZ / frequency_hz).powi(2).min(1.0)
         };
-        amplitude_m * gain * (TAU * h * phase).cos()
-    };
-    -(0.5 + activity) * RISE_M.into_iter().zip(harmonics).map(wave).sum::<f64>()
+        (harmonics[i], RISE_M[i] * gain)
+    })
 }
 
 #[cfg(test)]

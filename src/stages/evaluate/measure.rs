@@ -4,15 +4,20 @@ use std::num::NonZeroUsize;
 use std::sync::Mutex;
 use std::sync::mpsc::{Receiver, sync_channel};
 
-use ndarray::{Array2, s};
+use ndarray::{Array2, ArrayView2, Axis, s};
 
-use crate::evaluation::Measured;
 use crate::evaluation::reference_statistics::ReferenceStatistics;
+use crate::evaluation::window::{WINDOW_FRAMES, window, window_starts};
+use crate::evaluation::window_range::RANGE_CHECKS;
+use crate::evaluation::{Check, Measured, checks};
 use crate::motion::{ChannelLimits, MOTION_DIM};
 use crate::stages::extract::pool::lock;
 
 /// Frames that are kept of all motions together, to compare the values of channels.
 pub const MAX_KEPT_FRAMES: usize = 60_000;
+
+/// Least share of the windows of a motion within the training split's bounds for the motion to pass.
+const MIN_WINDOW_SHARE: f64 = 0.9;
 
 /// How motions are measured.
 pub struct Measurer<'a> {
@@ -25,10 +30,15 @@ pub struct Measurer<'a> {
     pub threads: NonZeroUsize,
 }
 
-/// A motion that was measured.
-pub struct Seen {
-    pub measured: Measured,
-    /// Every so manieth of its frames, [_, 25].
+/// A motion that was measured, at one stage of its making.
+#[derive(Debug)]
+pub struct MeasuredMotion {
+    pub n_frames: usize,
+    /// Checks of the whole motion; those of windows are passed where nine in ten windows pass.
+    pub checks: Vec<Check>,
+    /// Its windows, one behind the other, without messages.
+    pub windows: Vec<Measured>,
+    /// Every `stride`th frame of each window, \[_, 25\].
     pub kept: Array2<f32>,
 }
 
@@ -42,8 +52,9 @@ impl Measurer<'_> {
         &self,
         n: usize,
         feed: impl FnOnce(&mut dyn FnMut(usize, Array2<f32>)) -> Result<(), E>,
-    ) -> Result<Vec<Option<Seen>>, E> {
-        let seen: Mutex<Vec<Option<Seen>>> = Mutex::new((0..n).map(|_| None).collect());
+    ) -> Result<Vec<Option<MeasuredMotion>>, E> {
+        let measured: Mutex<Vec<Option<MeasuredMotion>>> =
+            Mutex::new((0..n).map(|_| None).collect());
         let (sender, receiver) = sync_channel::<(usize, Array2<f32>)>(4 * self.threads.get());
         let receiver: Mutex<Receiver<_>> = Mutex::new(receiver);
         std::thread::scope(|scope| {
@@ -53,8 +64,8 @@ impl Measurer<'_> {
                         // The lock must not be held while the motion is measured.
                         let next = lock(&receiver).recv();
                         let Ok((i, frames)) = next else { return };
-                        let found = self.look(&frames);
-                        lock(&seen)[i] = Some(found);
+                        let found = self.measure(frames.view());
+                        lock(&measured)[i] = Some(found);
                     }
                 });
             }
@@ -64,25 +75,63 @@ impl Measurer<'_> {
             drop(sender);
             fed
         })?;
-        Ok(seen.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner))
+        Ok(measured.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner))
     }
 
-    /// Measures one motion.
-    pub fn look(&self, frames: &Array2<f32>) -> Seen {
+    /// Returns the frames of a window.
+    pub fn window_frames(&self) -> usize {
+        self.reference.map_or(WINDOW_FRAMES, |reference| reference.window_frames)
+    }
+
+    /// Measures one motion, `[T, 25]`.
+    pub fn measure(&self, frames: ArrayView2<f32>) -> MeasuredMotion {
         let n = self.num_frames.unwrap_or(usize::MAX).min(frames.nrows());
         let frames = frames.slice(s![..n, ..]);
-        Seen {
-            measured: Measured::of(frames, self.limits, self.reference),
-            kept: frames.slice(s![..;self.stride, ..]).to_owned(),
+        let length = self.window_frames();
+        let (mut windows, mut kept) = (Vec::new(), Array2::zeros((0, MOTION_DIM)));
+        for first in window_starts(n, length) {
+            let placed = window(frames, first, length);
+            windows.push(Measured::new(placed.view(), self.limits, self.reference));
+            // Windows and kept frames have 25 channels each.
+            let _ = kept.append(Axis(0), placed.slice(s![..;self.stride, ..]));
         }
+        let mut checks = checks(frames, self.limits);
+        checks.extend(RANGE_CHECKS.iter().filter_map(|name| over_windows(name, &windows)));
+        for check in windows.iter_mut().flat_map(|window| &mut window.checks) {
+            check.message = String::new();
+        }
+        MeasuredMotion { n_frames: n, checks, windows, kept }
     }
 }
 
+/// Returns a check of all windows of a motion, with the answer that is worst; none where it was not made.
+fn over_windows(name: &str, windows: &[Measured]) -> Option<Check> {
+    let all: Vec<&Check> = windows
+        .iter()
+        .filter_map(|window| window.checks.iter().find(|check| check.name == name))
+        .collect();
+    let distance = |check: &Check| (check.value - check.threshold).abs();
+    let worst = all.iter().copied().reduce(|a, b| {
+        let is_worse = match (a.passed, b.passed) {
+            (true, false) => true,
+            (false, true) => false,
+            (false, false) => distance(b) > distance(a) || b.value.is_nan(),
+            (true, true) => distance(b) < distance(a),
+        };
+        if is_worse { b } else { a }
+    })?;
+    let n_passed = all.iter().filter(|check| check.passed).count();
+    let message = format!("{}; {n_passed} of {} windows pass", worst.message, all.len());
+    let passed = n_passed as f64 >= MIN_WINDOW_SHARE * all.len() as f64;
+    Some(Check { passed, message, ..worst.clone() })
+}
+
 /// Returns the kept frames of motions one behind the other, \[n, 25\].
-pub fn kept_of<'a>(seen: impl IntoIterator<Item = &'a Seen>) -> Array2<f32> {
+pub fn kept_frames<'a>(kept: impl IntoIterator<Item = &'a Array2<f32>>) -> Array2<f32> {
     let mut frames = Array2::zeros((0, MOTION_DIM));
-    for seen in seen {
-        frames.append(ndarray::Axis(0), seen.kept.view()).expect("25 channels each");
+    for kept in kept {
+        // All have 25 channels.
+        let _ = frames.append(Axis(0), kept.view());
     }
     frames
 }

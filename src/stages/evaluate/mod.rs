@@ -1,15 +1,16 @@
-//! `evaluate`: generated motion becomes numbers that can be queried, beside those of what it is compared
-//! with.
+//! `evaluate`: motion becomes numbers and verdicts that can be queried, beside those of what it is compared with.
 
+mod job;
 mod measure;
 mod motions;
 mod page;
 mod params;
 mod rows;
+mod splits;
 mod subjects;
 mod truth;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, Write};
 use std::path::PathBuf;
 use std::time::Instant;
@@ -17,19 +18,24 @@ use std::time::Instant;
 use anyhow::{Context as _, bail};
 use ndarray::Array2;
 
+use super::motion_source::generated_frames;
 use super::{Contract, Progress, Stage, Summary};
+use crate::evaluation::holds_by_construction;
+use crate::evaluation::metrics::PhaseOrigin;
+use crate::motion::postprocess::PostProcessConfig;
 use crate::report::{self, Report};
-use crate::store::tables::{self, GenerationRow, MetricRow, SanityCheckRow};
+use crate::store::tables::{self, GenerationRow, SanityCheckRow};
 use crate::store::{self, Location, Snapshot, StoreError, digest};
 use crate::units::frames_to_s;
 
-use measure::{MAX_KEPT_FRAMES, Measurer, Seen, kept_of, stride_for};
+use job::{Evaluated, Job, Motion, Stage as MadeAt};
+use measure::{MAX_KEPT_FRAMES, MeasuredMotion, stride_for};
 use motions::Phrases;
-pub use params::Params;
-use rows::Known;
-use subjects::{ALL, Finding, HELD_OUT, Item, MAX_RETRIEVED, Subject, Subjects};
+pub use params::{Params, RequiredVerdict};
+use rows::{Known, Rows, RunName};
+use splits::MusicSplit;
 
-/// The name under which sanity checks are committed; metrics have the stage's.
+/// The name under which sanity checks are committed; numbers and verdicts have the stage's.
 const CHECKS: &str = "evaluate-checks";
 
 /// The stage.
@@ -37,10 +43,11 @@ pub struct Evaluate;
 
 impl Stage for Evaluate {
     const NAME: &'static str = "evaluate";
-    const ABOUT: &'static str = "measure generated motion beside its baselines";
+    const ABOUT: &'static str = "tell good motion from bad, beside its baselines";
     const CONTRACT: Contract = Contract {
-        reads: "generations, generated, phrases, beats, features, motion",
-        writes: "sanity_checks, metrics, reference/, an HTML file with --report",
+        reads: "generations, generated, decoded, phrases, beats, features, motion, models/MODEL",
+        writes: "sanity_checks, metrics, verdicts, song_metrics, reference/, baselines/, an HTML file with \
+                 --report",
     };
     type Params = Params;
 
@@ -48,69 +55,55 @@ impl Stage for Evaluate {
         let started = Instant::now();
         params.check()?;
         let store = Location::open(&params.store, &params.client.options())?;
-        let against = params.against.as_deref().map(|run| evaluated(&store, run)).transpose()?;
-        let generations = motions::of_run(&store, &params.run, params.num_samples.map(Into::into))?;
-        let phrases = Phrases::read(&store, |rows| {
-            let with_motion = rows.values().filter(|row| row.has_motion);
-            let truth = with_motion.map(|row| row.phrase_id.clone());
-            generations.iter().map(|row| row.phrase_id.clone()).chain(truth).collect()
-        })?;
-        let data_hash = phrases.truth_digest();
+        let against = params.against.as_deref().map(|run| page::Other::read(&store, run));
+        let against = against.transpose()?;
+        let subject = Evaluand::read(&store, &params)?;
+        let data_hash = subject.phrases.truth_digest();
         let known = Known {
             store: &store,
-            run: &params.run,
+            run: &subject.run,
             params_hash: &params.digest(params.quick),
             whole_hash: &params.digest(false),
-            input_hash: &input_hash(&generations, &data_hash),
+            input_hash: &subject.input_hash(&data_hash),
         };
         let n_wanted = if params.quick { 1 } else { rows::STAGES.len() };
         let mut is_up_to_date = !params.force;
         for stage in &rows::STAGES[..n_wanted] {
             is_up_to_date = is_up_to_date && known.is_up_to_date(stage)?;
         }
-        let (checks, metrics) = if is_up_to_date {
-            let metrics =
-                if params.quick { Vec::new() } else { rows::metrics_of(&store, &params.run)? };
-            (rows::checks_of(&store, &params.run)?, metrics)
+        let found = if is_up_to_date {
+            Rows::read(&store, &subject.run, params.quick)?
         } else {
             store.sweep()?;
-            let job = Job {
-                params: &params,
-                store: &store,
-                generations: &generations,
-                phrases: &phrases,
-            };
-            let (checks, metrics) = job.measure(&data_hash, progress)?;
-            known.commit(CHECKS, &checks)?;
+            let found = subject.evaluate(&store, &params, &data_hash, progress)?;
+            known.commit_checks(&found)?;
             if !params.quick {
-                known.commit(Evaluate::NAME, &metrics)?;
+                known.commit_numbers(&found)?;
             }
-            (checks, metrics)
+            found
         };
-        let n_frames: i64 = generations.iter().map(|row| row.n_frames).sum();
-        let evaluated = page::Evaluated {
+        let report = page::Page {
             store: &store,
-            run: &params.run,
-            generations: &generations,
-            checks: &checks,
-            metrics: &metrics,
-            against,
+            subject: &subject,
+            found: &found,
+            against: against.as_ref(),
             data_hash: &data_hash,
         };
-        let report = evaluated.report(if params.report.is_some() { params.worst } else { 0 })?;
+        let report = report.report(if params.report.is_some() { params.worst } else { 0 })?;
         if let Some(path) = &params.report {
             let text = report::page(&report);
             store::write_file(path, |out| out.write_all(text.as_bytes()))
                 .with_context(|| format!("while writing {}", path.display()))?;
         }
-        Ok(Box::new(Told {
-            missed: missed(&params, &checks),
+        Ok(Box::new(EvaluateSummary {
+            missed: missed(&params, &found.checks),
+            not_won: not_won(&params, &report),
             store: store.to_string(),
-            run: params.run,
-            n_motions: generations.len(),
-            length_s: frames_to_s(usize::try_from(n_frames).unwrap_or(0)),
+            n_motions: subject.motions.len(),
+            length_s: subject.length_s(),
+            run: subject.run,
             is_up_to_date,
-            has_metrics: !metrics.is_empty(),
+            has_metrics: !found.metrics.is_empty(),
             page: params.report,
             report,
             took_s: started.elapsed().as_secs_f64(),
@@ -118,28 +111,185 @@ impl Stage for Evaluate {
     }
 }
 
-/// Returns the metrics of another run that was evaluated, with what made its motions.
-fn evaluated(store: &Location, run: &str) -> anyhow::Result<(Vec<MetricRow>, GenerationRow)> {
-    let metrics = rows::metrics_of(store, run)?;
-    if metrics.is_empty() {
-        bail!(
-            "run \"{run}\" has no metrics to compare with; run first: motiongen evaluate --store {store} \
-             --run {run}"
-        );
-    }
-    Ok((metrics, motions::of_run(store, run, Some(1))?.swap_remove(0)))
+/// What is evaluated.
+struct Evaluand {
+    run: String,
+    model: String,
+    phrases: Phrases,
+    motions: Vec<Motion>,
+    /// What generate said of them, in the same order.
+    generations: Vec<GenerationRow>,
+    /// How they were processed; of 0.1 what was the default.
+    postprocess: PostProcessConfig,
+    /// Candidates that each motion was chosen from, at most.
+    n_candidates: usize,
+    /// What is to be known beside the numbers.
+    notes: Vec<String>,
 }
 
-/// Returns a digest of the motions and of the ground truth.
-fn input_hash(generations: &[GenerationRow], data_hash: &str) -> String {
-    let mut text = data_hash.to_owned();
-    for row in generations {
-        text.push_str(&format!(
-            "\n{} {} {} {}",
-            row.generation, row.candidate, row.weights, row.time.0
-        ));
+impl Evaluand {
+    /// Reads what the user wants to be evaluated.
+    fn read(store: &Location, params: &Params) -> anyhow::Result<Self> {
+        let Some(run) = &params.run else { bail!("give --run NAME or --motions DIR") };
+        let generations = motions::of_run(store, run, params.num_samples.map(Into::into))?;
+        let phrases = Phrases::read(store, |rows| {
+            let with_motion = rows.values().filter(|row| row.has_motion);
+            let truth = with_motion.map(|row| row.phrase_id.clone());
+            generations.iter().map(|row| row.phrase_id.clone()).chain(truth).collect()
+        })?;
+        let motions = generations
+            .iter()
+            .map(|row| Motion {
+                phrase_id: row.phrase_id.clone(),
+                sample: row.sample,
+                split: MusicSplit::Unknown,
+                misses: [row.control_error_mm, row.control_error_deg],
+            })
+            .collect();
+        Ok(Self {
+            run: run.clone(),
+            model: generations[0].model.clone(),
+            phrases,
+            motions,
+            generations,
+            postprocess: PostProcessConfig::default(),
+            n_candidates: 1,
+            notes: Vec::new(),
+        })
     }
-    digest(text.as_bytes())
+
+    /// Reads the frames of a motion.
+    fn frames(&self, store: &Location, i: usize) -> anyhow::Result<Array2<f32>> {
+        let motion = &self.motions[i];
+        let sample = usize::try_from(motion.sample).unwrap_or(0);
+        generated_frames(store, &self.run, &motion.phrase_id, sample)
+    }
+
+    fn length_s(&self) -> f64 {
+        let n_frames: i64 = self.generations.iter().map(|row| row.n_frames).sum();
+        frames_to_s(usize::try_from(n_frames).unwrap_or(0))
+    }
+
+    /// Returns a digest of the motions, of the splits that they are in, and of real motion.
+    fn input_hash(&self, data_hash: &str) -> String {
+        let mut text = data_hash.to_owned();
+        for (row, motion) in self.generations.iter().zip(&self.motions) {
+            text.push_str(&format!(
+                "\n{} {} {} {} {}",
+                row.generation,
+                row.candidate,
+                row.weights,
+                row.time.0,
+                motion.split.name()
+            ));
+        }
+        digest(text.as_bytes())
+    }
+
+    /// Measures the motions, and all that they are compared with.
+    fn evaluate(
+        &self,
+        store: &Location,
+        params: &Params,
+        data_hash: &str,
+        progress: &dyn Progress,
+    ) -> anyhow::Result<Rows> {
+        let truth = match params.quick {
+            true => None,
+            false => truth::read(store, data_hash, params.threads, progress)?,
+        };
+        let has_phase = self.phrases.has_beats();
+        let holds = |check: &str| holds_by_construction(check, &self.postprocess, has_phase);
+        let job = Job {
+            params,
+            store,
+            motions: &self.motions,
+            phrases: &self.phrases,
+            truth: truth.as_ref(),
+            holds: &holds,
+            phase: if self.postprocess.relock_phase {
+                PhaseOrigin::Relocked
+            } else {
+                PhaseOrigin::Own
+            },
+            has_raw: true,
+            has_network: params.baseline_windows > 0,
+            sampled_split: None,
+        };
+        let evaluated = self.measured(store, &job, progress)?;
+        let name = RunName { run: &self.run, model: &self.model };
+        let mut rows = Rows::default();
+        for (motion, found) in self.motions.iter().zip(&evaluated) {
+            let (id, sample) = (motion.phrase_id.as_str(), motion.sample);
+            if let Some(decoded) = &found.decoded {
+                let none = |_: &str| false;
+                let raw = rows::checks(name, id, sample, MadeAt::Raw, &decoded.checks, &none);
+                rows.checks.extend(raw);
+            }
+            let is = rows::checks(name, id, sample, MadeAt::Final, &found.is.checks, &holds);
+            rows.checks.extend(is);
+        }
+        if !params.quick {
+            let found = job.numbers(&evaluated, &[], progress)?;
+            rows.add(name, found, &|song| self.phrases.song_name(song));
+        }
+        Ok(rows)
+    }
+
+    /// Reads and measures the motions of a run.
+    fn measured(
+        &self,
+        store: &Location,
+        job: &Job,
+        progress: &dyn Progress,
+    ) -> anyhow::Result<Vec<Evaluated>> {
+        let n_frames: i64 = self.generations.iter().map(|row| row.n_frames).sum();
+        let stride = stride_for(usize::try_from(n_frames).unwrap_or(MAX_KEPT_FRAMES));
+        let measurer = job.measurer(stride);
+        let places: BTreeMap<&str, usize> =
+            self.generations.iter().map(|row| row.generation.as_str()).zip(0..).collect();
+        let names: BTreeSet<String> =
+            self.generations.iter().map(|row| row.generation.clone()).collect();
+        progress.start("evaluate", "motions", self.motions.len() as u64);
+        let read = |schema| -> Result<Vec<Option<MeasuredMotion>>, StoreError> {
+            let table = Snapshot::take(store, schema)?;
+            measurer.run(self.motions.len(), |give| {
+                table.visit_items(&names, |name, frames: Array2<f32>| {
+                    if let Some(&i) = places.get(name) {
+                        give(i, frames);
+                        progress.advance(1);
+                    }
+                    Ok::<_, StoreError>(())
+                })
+            })
+        };
+        let is = read(tables::generated())?;
+        progress.finish();
+        let missing = self.generations.iter().zip(&is).find(|(_, found)| found.is_none());
+        if let Some((row, _)) = missing {
+            bail!(
+                "store {store} has no frames of {}, though it lists the motion; run motiongen generate \
+                 again with --force",
+                row.generation
+            );
+        }
+        let evaluated =
+            is.into_iter().flatten().map(|is| Evaluated { is, decoded: None }).collect();
+        Ok(evaluated)
+    }
+}
+
+/// A required verdict that was not won, and how it ended.
+type NotWon = (String, report::Outcome);
+
+fn not_won(params: &Params, report: &Report) -> Vec<NotWon> {
+    report
+        .verdicts
+        .iter()
+        .filter(|verdict| params.require.iter().any(|asked| asked.asks_for(&verdict.verdict)))
+        .filter(|verdict| verdict.outcome != report::Outcome::Won)
+        .map(|verdict| (verdict.verdict.clone(), verdict.outcome))
+        .collect()
 }
 
 /// A check set of which too few motions pass all: its name, the share, the share that was asked for, and how
@@ -150,7 +300,10 @@ fn missed(params: &Params, checks: &[SanityCheckRow]) -> Vec<Missed> {
     let wanted = [("reference", params.min_pass_rate), ("strict", params.min_strict_pass_rate)];
     let of = |(set, least): (&'static str, Option<f64>)| {
         let least = least?;
-        let of_set = || checks.iter().filter(|row| row.check_set == set);
+        let is_of_set = |row: &&SanityCheckRow| {
+            row.check_set == set && row.stage.as_deref() != Some(MadeAt::Raw.name())
+        };
+        let of_set = || checks.iter().filter(is_of_set);
         let motion = |row: &SanityCheckRow| (row.phrase_id.clone(), row.sample);
         let all: BTreeSet<_> = of_set().map(motion).collect();
         let failed: BTreeSet<_> = of_set().filter(|row| !row.passed).map(motion).collect();
@@ -160,166 +313,8 @@ fn missed(params: &Params, checks: &[SanityCheckRow]) -> Vec<Missed> {
     wanted.into_iter().filter_map(of).collect()
 }
 
-/// The work.
-struct Job<'a> {
-    params: &'a Params,
-    store: &'a Location,
-    generations: &'a [GenerationRow],
-    phrases: &'a Phrases,
-}
-
-impl Job<'_> {
-    fn measure(
-        &self,
-        data_hash: &str,
-        progress: &dyn Progress,
-    ) -> anyhow::Result<(Vec<SanityCheckRow>, Vec<MetricRow>)> {
-        let Self { params, store, generations, phrases } = self;
-        let truth = match params.quick {
-            true => None,
-            false => truth::read(store, data_hash, params.threads, progress)?,
-        };
-        let n_frames: i64 = generations.iter().map(|row| row.n_frames).sum();
-        let measurer = Measurer {
-            limits: params.limits,
-            reference: truth.as_ref().map(|truth| &truth.statistics),
-            num_frames: params.num_frames.map(Into::into),
-            stride: stride_for(usize::try_from(n_frames).unwrap_or(MAX_KEPT_FRAMES)),
-            threads: params.threads,
-        };
-        let subjects = Subjects {
-            phrases,
-            truth: truth.as_ref(),
-            measurer: &measurer,
-            threads: params.threads,
-        };
-        progress.start("evaluate", "motions", generations.len() as u64);
-        let seen = self.generated(&measurer, progress)?;
-        progress.finish();
-        let missing = generations.iter().zip(&seen).find(|(_, seen)| seen.is_none());
-        if let Some((row, _)) = missing {
-            bail!(
-                "store {store} has no frames of {}, though it lists the motion; run motiongen generate \
-                 again with --force",
-                row.generation
-            );
-        }
-        let generated = subjects.generated(generations, seen);
-        let checks = rows::checks(generations, &generated);
-        if params.quick {
-            return Ok((checks, Vec::new()));
-        }
-        progress.say("measuring what it is compared with");
-        let retrieved = self.retrieved(&subjects, &generated)?;
-        let constant = subjects.mean_motion(&generated);
-        let truth = subjects.truth();
-        progress.say("resampling");
-        let findings = self.findings(&subjects, &generated, &retrieved, &constant, &truth);
-        let model = &generations[0].model;
-        Ok((checks, rows::metrics(&params.run, model, findings)))
-    }
-
-    fn generated(
-        &self,
-        measurer: &Measurer,
-        progress: &dyn Progress,
-    ) -> Result<Vec<Option<Seen>>, StoreError> {
-        let names: BTreeSet<String> =
-            self.generations.iter().map(|row| row.generation.clone()).collect();
-        let table = Snapshot::take(self.store, tables::generated())?;
-        measurer.run(self.generations.len(), |give| {
-            table.visit_items(&names, |name, frames| {
-                let place =
-                    self.generations.binary_search_by(|row| row.generation.as_str().cmp(name));
-                if let Ok(i) = place {
-                    give(i, frames);
-                    progress.advance(1);
-                }
-                Ok::<_, StoreError>(())
-            })
-        })
-    }
-
-    /// Asks the library for the nearest phrases, of one motion for each phrase.
-    fn retrieved(&self, subjects: &Subjects, generated: &[Item]) -> Result<Vec<Item>, StoreError> {
-        let mut wanted: Vec<&Item> = Vec::new();
-        let mut names = BTreeSet::new();
-        for item in generated {
-            if names.insert(item.phrase_id.clone()) {
-                wanted.push(item);
-            }
-        }
-        // A song here and there, where there are more than are asked for.
-        wanted.sort_by_cached_key(|item| digest(item.phrase_id.as_bytes()));
-        wanted.truncate(MAX_RETRIEVED);
-        let names: BTreeSet<String> = wanted.iter().map(|item| item.phrase_id.clone()).collect();
-        let most = MAX_RETRIEVED.div_ceil(wanted.len().max(1));
-        let mut found: Vec<(String, Vec<Item>)> = Vec::new();
-        Snapshot::take(self.store, tables::features())?.visit_items(
-            &names,
-            |id, features: Array2<f32>| {
-                if let Some(item) = wanted.iter().find(|item| item.phrase_id == id) {
-                    found.push((id.to_owned(), subjects.retrieved(item, features.view(), most)));
-                }
-                Ok::<_, StoreError>(())
-            },
-        )?;
-        found.sort_by(|a, b| a.0.cmp(&b.0));
-        Ok(found.into_iter().flat_map(|(_, items)| items).collect())
-    }
-
-    fn findings(
-        &self,
-        subjects: &Subjects,
-        generated: &[Item],
-        retrieved: &[Item],
-        constant: &[Item],
-        truth: &[Item],
-    ) -> Vec<Finding> {
-        let kept_truth = kept_of(truth.iter().map(|item| &item.seen));
-        let n_held_out = generated.iter().filter(|item| item.is_held_out).count();
-        let mut findings = Vec::new();
-        for split in [ALL, HELD_OUT] {
-            // Where nothing was held out, or everything, there is one split.
-            let is_told = match split {
-                HELD_OUT => n_held_out > 0,
-                _ => n_held_out < generated.len(),
-            };
-            let of = |items: &'_ [Item]| -> Vec<usize> {
-                let is_of = |i: &usize| split == ALL || items[*i].is_held_out;
-                (0..items.len()).filter(is_of).collect()
-            };
-            let true_subject =
-                if split == ALL { Subject::GroundTruth } else { Subject::HeldOutTruth };
-            let sets = [
-                (Subject::Generated, generated, is_told),
-                (Subject::Retrieval, retrieved, is_told),
-                (Subject::MeanMotion, constant, is_told),
-                (true_subject, truth, true),
-            ];
-            for (subject, items, is_told) in sets {
-                let chosen: Vec<&Item> = of(items).into_iter().map(|i| &items[i]).collect();
-                if !is_told || chosen.is_empty() {
-                    continue;
-                }
-                findings.extend(subjects.numbers(subject, split, &chosen));
-                if subject == Subject::Generated {
-                    findings.extend(subjects.shuffled(split, &chosen));
-                    let rows: Vec<&GenerationRow> =
-                        of(items).into_iter().map(|i| &self.generations[i]).collect();
-                    findings.extend(subjects::control(split, &rows, self.phrases));
-                }
-                if subject != Subject::GroundTruth && kept_truth.nrows() > 0 {
-                    findings.extend(subjects::channels(subject, split, &chosen, &kept_truth));
-                }
-            }
-        }
-        findings
-    }
-}
-
 /// What was measured.
-struct Told {
+struct EvaluateSummary {
     store: String,
     run: String,
     n_motions: usize,
@@ -327,12 +322,13 @@ struct Told {
     is_up_to_date: bool,
     has_metrics: bool,
     missed: Vec<Missed>,
+    not_won: Vec<NotWon>,
     report: Report,
     page: Option<PathBuf>,
     took_s: f64,
 }
 
-impl Summary for Told {
+impl Summary for EvaluateSummary {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
         let Self { store, run, n_motions, length_s, took_s, .. } = self;
         writeln!(out, "evaluate {run} → {store}")?;
@@ -344,6 +340,9 @@ impl Summary for Told {
         writeln!(out)?;
         out.write_all(report::terminal(&self.report).as_bytes())?;
         writeln!(out)?;
+        for (verdict, outcome) in &self.not_won {
+            writeln!(out, "  required verdict {verdict} is {}", outcome.name())?;
+        }
         for (set, share, least, _) in &self.missed {
             writeln!(out, "  {set} checks: {share:.3} of the motions pass all, below {least}")?;
         }
@@ -351,6 +350,11 @@ impl Summary for Told {
             writeln!(out, "  report {}", page.display())?;
         }
         if self.has_metrics {
+            writeln!(
+                out,
+                "  motiongen query --store {store} \"select verdict, test, outcome, message from verdicts where \
+                 run = '{run}'\""
+            )?;
             writeln!(
                 out,
                 "  motiongen query --store {store} \"select model, subject, metric, variant, value, ci_low, \
@@ -361,6 +365,6 @@ impl Summary for Told {
     }
 
     fn n_failed(&self) -> u64 {
-        self.missed.iter().map(|(.., n)| *n as u64).sum()
+        self.missed.iter().map(|(.., n)| *n as u64).sum::<u64>() + self.not_won.len() as u64
     }
 }

@@ -4,9 +4,13 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use anyhow::bail;
 
+use ndarray::ArrayView2;
+
+use crate::audio::BLOCKS;
 use crate::evaluation::locking::since_start;
 use crate::evaluation::metrics::Music;
 use crate::motion::bar_phase;
+use crate::motion::choreography::activity;
 use crate::motion::phase::unwrapped;
 use crate::stages::generate::{beats_in_bars, beats_of, url_of};
 use crate::stages::plot::nearest::nearest;
@@ -47,14 +51,14 @@ pub fn of_run(store: &Location, run: &str, n: Option<usize>) -> anyhow::Result<V
     Ok(rows)
 }
 
-/// What the store says of phrases: their songs, splits and beats.
+/// What the store says of phrases: their songs and beats.
 pub struct Phrases {
     rows: HashMap<String, PhraseRow>,
-    /// Number of each song, by the file that it is.
+    /// Number of each song.
     songs: BTreeMap<String, usize>,
-    /// Songs that something was learned from.
-    learned: BTreeSet<String>,
     beats: HashMap<String, Vec<f64>>,
+    /// Activity of the frames of songs, by their file.
+    activities: HashMap<String, Vec<f64>>,
 }
 
 impl Phrases {
@@ -68,16 +72,20 @@ impl Phrases {
     ) -> Result<Self, StoreError> {
         let rows: Vec<PhraseRow> = Snapshot::take(store, PhraseRow::schema())?.rows()?;
         let songs: BTreeSet<String> = rows.iter().map(song_of).map(str::to_owned).collect();
-        let is_learned = |row: &&PhraseRow| {
-            row.has_motion
-                && (row.has_features || row.has_audio)
-                && row.split == Split::Train.name()
-        };
-        let learned = rows.iter().filter(is_learned).map(song_of).map(str::to_owned).collect();
         let rows = rows.into_iter().map(|row| (row.phrase_id.clone(), row)).collect();
         let beats = beats_of(store, &wanted(&rows))?;
         let songs = songs.into_iter().zip(0..).collect();
-        Ok(Self { rows, songs, learned, beats })
+        Ok(Self { rows, songs, beats, activities: HashMap::new() })
+    }
+
+    /// Returns what the table says of a phrase.
+    pub fn row(&self, phrase_id: &str) -> Option<&PhraseRow> {
+        self.rows.get(phrase_id)
+    }
+
+    /// Whether some phrase has beats.
+    pub fn has_beats(&self) -> bool {
+        !self.beats.is_empty()
     }
 
     /// Returns the number of a phrase's song; phrases of one song have the same.
@@ -90,12 +98,43 @@ impl Phrases {
         })
     }
 
-    /// Whether nothing was learned from a phrase's song.
-    pub fn is_held_out(&self, phrase_id: &str) -> bool {
-        self.rows.get(phrase_id).is_none_or(|row| !self.learned.contains(song_of(row)))
+    /// Returns the name of a song, which is the same in every run.
+    pub fn song_name(&self, song: usize) -> String {
+        let found = self.songs.iter().find(|(_, number)| **number == song);
+        found.map_or_else(|| format!("song {song}"), |(name, _)| name.clone())
     }
 
-    /// Returns the music of the frames of a phrase, from its beats; none for too few of them.
+    /// Returns the phrases that are whole songs of `phrase_ids`: those whose features tell the activity of a song.
+    pub fn songs_of<'a>(&self, phrase_ids: impl IntoIterator<Item = &'a str>) -> BTreeSet<String> {
+        let wanted: BTreeSet<&str> =
+            phrase_ids.into_iter().filter_map(|id| self.rows.get(id)).map(song_of).collect();
+        let is_song = |row: &&PhraseRow| !row.is_constructed() && wanted.contains(song_of(row));
+        // A set, so that the order of the map does not matter.
+        #[expect(clippy::iter_over_hash_type, reason = "collected into a set")]
+        let found = {
+            let mut found = BTreeSet::new();
+            for row in self.rows.values().filter(is_song) {
+                found.insert(row.phrase_id.clone());
+            }
+            found
+        };
+        found
+    }
+
+    /// Takes in the features of a whole song, `[T, 163]`.
+    pub fn add_features(&mut self, phrase_id: &str, features: ArrayView2<f32>) {
+        let Some(row) = self.rows.get(phrase_id).filter(|row| !row.is_constructed()) else {
+            return;
+        };
+        let column = |name: &str| {
+            let first: usize = BLOCKS.iter().take_while(|b| b.name != name).map(|b| b.len).sum();
+            features.column(first).to_vec()
+        };
+        let found = activity(&column("rms"), &column("onset_strength"));
+        self.activities.insert(song_of(row).to_owned(), found);
+    }
+
+    /// Returns the music of `n_frames` frames of a phrase, from its beats; none for too few of them.
     pub fn music(&self, phrase_id: &str, n_frames: usize) -> Option<Music> {
         let row = self.rows.get(phrase_id)?;
         let numbered = self.beats.get(phrase_id).map(Vec::as_slice).unwrap_or_default();
@@ -106,14 +145,28 @@ impl Phrases {
             beats_s: beats.times_s().to_vec(),
             bars: since_start(&bars, self.start_frames(phrase_id)),
             beats_per_bar: beats.beats_per_bar(),
+            activity: self.activity(row, n_frames),
+            is_of_motion: false,
         })
     }
 
-    /// Returns the music of a constructed or captured phrase, of which the bars are known by its phase.
-    pub fn music_of_phase(&self, phrase_id: &str, phase: &[f64]) -> Option<Music> {
-        let of_beats = self.music(phrase_id, phase.len())?;
+    /// Whether a phrase is a whole song.
+    pub fn is_song(&self, phrase_id: &str) -> bool {
+        self.rows.get(phrase_id).is_some_and(|row| !row.is_constructed())
+    }
+
+    /// Returns the music of a phrase with real motion; where its beats are not numbered, its bars are known by the
+    /// motion's own phase alone.
+    pub fn music_of_real(&self, phrase_id: &str, phase: &[f64]) -> Option<Music> {
+        let from_beats = self.music(phrase_id, phase.len())?;
         let bars = since_start(&unwrapped(phase), self.start_frames(phrase_id));
-        Some(Music { bars, ..of_beats })
+        Some(Music { bars, is_of_motion: true, ..from_beats })
+    }
+
+    fn activity(&self, row: &PhraseRow, n_frames: usize) -> Option<Vec<f64>> {
+        let of_song = self.activities.get(song_of(row))?;
+        let first = (row.start_s.unwrap_or(0.0) * FPS).round() as usize;
+        of_song.get(first..first + n_frames).map(<[f64]>::to_vec)
     }
 
     /// Where in its song a phrase begins.
@@ -121,12 +174,18 @@ impl Phrases {
         self.rows.get(phrase_id).and_then(|row| row.start_s).unwrap_or(0.0) * FPS
     }
 
-    /// Returns a digest of the ground truth: of all phrases with motion and music.
+    /// Whether all phrases with real motion were constructed, so that their coupling to the bar is known.
+    pub fn is_constructed(&self) -> bool {
+        let mut with_music = self.rows.values().filter(|row| has_truth(row)).peekable();
+        with_music.peek().is_some() && with_music.all(PhraseRow::is_constructed)
+    }
+
+    /// Returns a digest of real motion: of all phrases with motion and music.
     pub fn truth_digest(&self) -> String {
         let mut lines: Vec<String> = self
             .rows
             .values()
-            .filter(|row| row.has_motion && (row.has_features || row.has_audio))
+            .filter(|row| has_truth(row))
             .map(|row| format!("{}\n{}\n{}", row.phrase_id, row.split, row.content_hash))
             .collect();
         lines.sort_unstable();
@@ -134,18 +193,17 @@ impl Phrases {
     }
 }
 
-/// The file that a phrase's song is.
-fn song_of(row: &PhraseRow) -> &str {
-    if row.is_constructed() { &row.source } else { url_of(row) }
+fn has_truth(row: &PhraseRow) -> bool {
+    row.has_motion && (row.has_features || row.has_audio)
 }
 
-/// Returns the part of some music that begins at a frame.
-pub fn excerpt(music: &Music, first: usize, n_frames: usize) -> Music {
-    let start_s = frames_to_s(first);
-    let end = (first + n_frames).min(music.bars.len());
-    Music {
-        beats_s: music.beats_s.iter().map(|t| t - start_s).collect(),
-        bars: music.bars.get(first..end).unwrap_or_default().to_vec(),
-        beats_per_bar: music.beats_per_bar,
-    }
+/// What tells a phrase's song from others: the digest of its music, or its file where that is not known.
+fn song_of(row: &PhraseRow) -> &str {
+    let file = || if row.is_constructed() { &row.source } else { url_of(row) };
+    row.song_hash.as_deref().unwrap_or_else(file)
+}
+
+/// Returns whether a phrase of the ground truth was held out of the reference statistics.
+pub fn is_held_out(split: Split) -> bool {
+    split != Split::Train
 }

@@ -1,89 +1,182 @@
 //! The report of an evaluation, from its rows.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
+use anyhow::bail;
+
+use super::rows::{self, Rows};
+use super::splits::{ALL, SPLITS, telling};
+use super::{Evaluand, motions};
+use crate::evaluation::interval::{holm, paired_difference};
 use crate::motion::Trajectory;
 use crate::plot::{self, Format, MOTION_WIDTH_PX, MotionPanel, MotionPlot};
-use crate::report::{self, Against, CheckLine, Metric, Report, Worst};
-use crate::stages::motion_source::generated_frames;
+use crate::report::{
+    self, Against, CheckLine, Metric, Outcome, Paired, Report, Verdict, VerdictTest, Worst,
+};
+
 use crate::store::Location;
-use crate::store::tables::{GenerationRow, MetricRow, SanityCheckRow};
+use crate::store::tables::{
+    GenerationRow, MetricRow, SanityCheckRow, SongMetricRow, VerdictRow,
+};
 use crate::training::TemporalConfig;
 use crate::units::frames_to_s;
 
+/// Another run that was evaluated.
+pub struct Other {
+    run: String,
+    metrics: Vec<MetricRow>,
+    songs: Vec<SongMetricRow>,
+    /// A motion of it; none for motions of another program.
+    made: Option<GenerationRow>,
+}
+
+impl Other {
+    /// Reads the numbers of a run.
+    ///
+    /// # Errors
+    /// One sentence where it was not evaluated.
+    pub fn read(store: &Location, run: &str) -> anyhow::Result<Self> {
+        let metrics = rows::metrics_of(store, run)?;
+        if metrics.is_empty() {
+            bail!(
+                "run \"{run}\" has no metrics to compare with; run first: motiongen evaluate --store {store} \
+                 --run {run}"
+            );
+        }
+        let songs = rows::songs_of(store, run)?;
+        let made = motions::of_run(store, run, Some(1)).ok().and_then(|mut rows| rows.pop());
+        Ok(Self { run: run.to_owned(), metrics, songs, made })
+    }
+}
+
 /// What a report tells of.
-pub struct Evaluated<'a> {
+pub struct Page<'a> {
     pub store: &'a Location,
-    pub run: &'a str,
-    pub generations: &'a [GenerationRow],
-    pub checks: &'a [SanityCheckRow],
-    pub metrics: &'a [MetricRow],
-    /// Metrics of another run, and a motion of it.
-    pub against: Option<(Vec<MetricRow>, GenerationRow)>,
+    pub subject: &'a Evaluand,
+    pub found: &'a Rows,
+    pub against: Option<&'a Other>,
     pub data_hash: &'a str,
 }
 
-impl Evaluated<'_> {
+impl Page<'_> {
     /// Puts the report together, with pictures of `n_worst` motions.
     ///
     /// # Errors
     /// When frames cannot be read or drawn.
     pub fn report(&self, n_worst: usize) -> anyhow::Result<Report> {
-        let first = &self.generations[0];
-        let n_frames: i64 = self.generations.iter().map(|row| row.n_frames).sum();
-        let length_s = frames_to_s(usize::try_from(n_frames).unwrap_or(0));
+        let Self { subject, found, .. } = self;
+        let made = subject.generations.first();
+        let length_s = subject.length_s();
+        let n = subject.motions.len();
         let mut facts = vec![
-            ("run".to_owned(), self.run.to_owned()),
-            ("motions".to_owned(), format!("{}, {length_s:.1} s in all", self.generations.len())),
-            ("ground truth".to_owned(), self.data_hash[..16.min(self.data_hash.len())].to_owned()),
+            ("run".to_owned(), subject.run.clone()),
+            ("motions".to_owned(), format!("{n}, {length_s:.1} s in all")),
+            ("real motion".to_owned(), self.data_hash[..16.min(self.data_hash.len())].to_owned()),
         ];
-        facts.extend(settings(first).map(|(name, value)| (name.to_owned(), value)));
-        let against = self.against.as_ref().map(|(metrics, there)| Against {
-            run: there.run.clone(),
-            metrics: shown(metrics),
-            settings: settings(there)
-                .into_iter()
-                .zip(settings(first))
+        let own_settings = made.map(settings);
+        facts.extend(
+            own_settings.iter().flatten().map(|(name, value)| ((*name).to_owned(), value.clone())),
+        );
+        Ok(Report {
+            title: format!("Evaluation of {}", subject.run),
+            facts,
+            verdicts: verdicts(&found.verdicts),
+            notes: self.notes(),
+            checks: lines(&found.checks),
+            metrics: shown(&found.metrics),
+            worst: self.worst(n_worst)?,
+            against: self.against.map(|other| self.compared(other)),
+        })
+    }
+
+    /// Compares the run with another one.
+    fn compared(&self, other: &Other) -> Against {
+        let here = self.subject.generations.first().map(settings);
+        let there = other.made.as_ref().map(settings);
+        let pairs = there.into_iter().flatten().zip(here.into_iter().flatten());
+        Against {
+            run: other.run.clone(),
+            metrics: shown(&other.metrics),
+            paired: paired(&other.songs, &self.found.songs),
+            settings: pairs
                 .filter(|(there, here)| there != here)
                 .map(|((name, there), (_, here))| (name.to_owned(), there, here))
                 .collect(),
+        }
+    }
+
+    /// Returns what is to be known beside verdicts and numbers.
+    fn notes(&self) -> Vec<String> {
+        let mut notes = self.subject.notes.clone();
+        let split = telling_split(&self.found.verdicts);
+        let value = |subject: &str, metric: &str| {
+            let is_it = |row: &&MetricRow| {
+                row.subject == subject && row.metric == metric && row.split == split
+            };
+            self.found.metrics.iter().find(is_it).and_then(|row| row.value)
+        };
+        let truth = self.found.metrics.iter().find(|row| {
+            row.subject == "held_out_truth" && row.metric == "locking_r2"
         });
-        Ok(Report {
-            title: format!("Evaluation of {}", self.run),
-            facts,
-            checks: lines(self.checks),
-            metrics: shown(self.metrics),
-            worst: self.worst(n_worst)?,
-            against,
-        })
+        let real = truth.and_then(|row| row.value);
+        if let (Some(own), Some(real)) = (value("generated", "locking_r2"), real)
+            && own > real
+        {
+            notes.push(format!(
+                "Over-locking: free harmonics of the bar explain R² {own:.3} of the vertical velocity, more than the \
+                 {real:.3} of real motion."
+            ));
+        }
+        if let Some(ratio) = value("generated", "coupling_ratio")
+            && ratio > 1.25
+        {
+            notes.push(format!(
+                "Over-locking: the amplitude locked to the bar is {ratio:.2} times that of real motion; lower \
+                 --guidance."
+            ));
+        }
+        let n_candidates = self.subject.n_candidates;
+        if n_candidates > 1 {
+            notes.push(format!(
+                "Each motion is the best of {n_candidates} candidates, chosen among other things by R² of free \
+                 harmonics of the bar: R² is that of the chosen ones. The verdict on following the music does not \
+                 rest on it."
+            ));
+        }
+        notes
     }
 
     /// Returns the motions that fail the most checks; of equals those with the lowest score.
     fn worst(&self, n: usize) -> anyhow::Result<Vec<Worst>> {
         let mut failed: BTreeMap<(&str, i32), Vec<&SanityCheckRow>> = BTreeMap::new();
-        for row in self.checks.iter().filter(|row| !row.passed) {
+        let is_final = |row: &&SanityCheckRow| row.stage.as_deref() != Some("raw");
+        for row in self.found.checks.iter().filter(is_final).filter(|row| !row.passed) {
             failed.entry((&row.phrase_id, row.sample)).or_default().push(row);
         }
-        let n_failed = |row: &GenerationRow| {
-            failed.get(&(row.phrase_id.as_str(), row.sample)).map_or(0, Vec::len)
+        let motions = &self.subject.motions;
+        let n_failed = |i: &usize| {
+            failed.get(&(motions[*i].phrase_id.as_str(), motions[*i].sample)).map_or(0, Vec::len)
         };
-        let mut order: Vec<&GenerationRow> = self.generations.iter().collect();
+        let score = |i: &usize| {
+            let row = self.subject.generations.get(*i);
+            row.and_then(|row| row.score).unwrap_or(f64::NEG_INFINITY)
+        };
+        let mut order: Vec<usize> = (0..motions.len()).collect();
         order.sort_by(|a, b| {
-            let score = |row: &GenerationRow| row.score.unwrap_or(f64::NEG_INFINITY);
             n_failed(b).cmp(&n_failed(a)).then(score(a).total_cmp(&score(b)))
         });
-        order.into_iter().take(n).map(|row| self.card(row, &failed)).collect()
+        order.into_iter().take(n).map(|i| self.card(i, &failed)).collect()
     }
 
     fn card(
         &self,
-        row: &GenerationRow,
+        i: usize,
         failed: &BTreeMap<(&str, i32), Vec<&SanityCheckRow>>,
     ) -> anyhow::Result<Worst> {
-        let sample = usize::try_from(row.sample).unwrap_or(0);
-        let motion =
-            Trajectory::new(generated_frames(self.store, self.run, &row.phrase_id, sample)?)?;
-        let name = format!("{}, sample {sample}", row.phrase_id);
+        let looked_at = &self.subject.motions[i];
+        let phrase_id = looked_at.phrase_id.as_str();
+        let motion = Trajectory::new(self.subject.frames(self.store, i)?)?;
+        let name = format!("{phrase_id}, sample {}", looked_at.sample);
         let plotted = MotionPlot {
             title: &name,
             motion: &motion,
@@ -92,11 +185,13 @@ impl Evaluated<'_> {
             jerk_limit_m_s3: TemporalConfig::default().target_jerk,
         };
         let picture = plot::motion(&plotted, &MotionPanel::USUAL, MOTION_WIDTH_PX, Format::Svg)?;
-        let messages = failed.get(&(row.phrase_id.as_str(), row.sample));
-        let seconds = frames_to_s(usize::try_from(row.n_frames).unwrap_or(0));
+        let messages = failed.get(&(phrase_id, looked_at.sample));
+        let seconds = frames_to_s(motion.n_frames());
         let mut facts = vec![("length".to_owned(), format!("{seconds:.1} s"))];
-        facts.extend(row.score.map(|score| ("score".to_owned(), format!("{score:.3}"))));
-        facts.push(("seed".to_owned(), (row.seed as u64).to_string()));
+        if let Some(row) = self.subject.generations.get(i) {
+            facts.extend(row.score.map(|score| ("score".to_owned(), format!("{score:.3}"))));
+            facts.push(("seed".to_owned(), (row.seed as u64).to_string()));
+        }
         Ok(Worst {
             facts,
             failed: messages.into_iter().flatten().map(|row| row.message.clone()).collect(),
@@ -104,6 +199,85 @@ impl Evaluated<'_> {
             name,
         })
     }
+}
+
+/// Returns the split whose verdicts are told.
+fn telling_split(rows: &[VerdictRow]) -> &'static str {
+    let there: BTreeSet<&str> = rows.iter().map(|row| row.split.as_str()).collect();
+    let splits = SPLITS.into_iter().filter(|split| there.contains(split.name()));
+    telling(splits).map_or(ALL, |split| split.name())
+}
+
+/// Returns the verdicts of the split that tells most.
+fn verdicts(rows: &[VerdictRow]) -> Vec<Verdict> {
+    let split = telling_split(rows);
+    let outcome = |name: &str| match name {
+        "won" => Outcome::Won,
+        "lost" => Outcome::Lost,
+        _ => Outcome::Open,
+    };
+    let mut found: Vec<Verdict> = Vec::new();
+    for row in rows.iter().filter(|row| row.split == split) {
+        let test = VerdictTest {
+            test: row.test.clone(),
+            outcome: outcome(&row.outcome),
+            statistic: row.statistic.clone(),
+            value: row.value,
+            ci_low: row.ci_low,
+            ci_high: row.ci_high,
+            unit: row.unit.clone(),
+            rule: row.rule.clone(),
+            limit: Some(row.limit),
+            against: row.against.clone(),
+            message: row.message.clone(),
+        };
+        match found.iter_mut().find(|verdict| verdict.verdict == row.verdict) {
+            Some(verdict) => verdict.tests.push(test),
+            None => found.push(Verdict {
+                verdict: row.verdict.clone(),
+                split: row.split.clone(),
+                outcome: outcome(&row.verdict_outcome),
+                tests: vec![test],
+            }),
+        }
+    }
+    found
+}
+
+/// Pairs the numbers of songs that both runs have, and adjusts the probabilities for their number.
+fn paired(there: &[SongMetricRow], here: &[SongMetricRow]) -> Vec<Paired> {
+    let key = |row: &SongMetricRow| {
+        [&row.metric, &row.variant, &row.split, &row.song].map(String::clone)
+    };
+    let known: BTreeMap<[String; 4], f64> = there.iter().map(|row| (key(row), row.value)).collect();
+    let mut pairs: BTreeMap<[String; 3], Vec<f64>> = BTreeMap::new();
+    for row in here {
+        let [metric, variant, split, song] = key(row);
+        let of_song = [metric.clone(), variant.clone(), split.clone(), song];
+        if let Some(other) = known.get(&of_song) {
+            pairs.entry([metric, variant, split]).or_default().push(row.value - other);
+        }
+    }
+    let found: Vec<_> =
+        pairs.into_iter().map(|(key, differences)| (key, paired_difference(&differences))).collect();
+    let p: Vec<f64> = found.iter().filter_map(|(_, pair)| pair.p_either()).collect();
+    let mut adjusted = holm(&p).into_iter();
+    found
+        .into_iter()
+        .filter_map(|([metric, variant, split], pair)| {
+            let p_holm = pair.p_either().and_then(|_| adjusted.next());
+            Some(Paired {
+                metric,
+                variant,
+                split,
+                difference: pair.estimate.value?,
+                ci_low: pair.estimate.ci_low,
+                ci_high: pair.estimate.ci_high,
+                p_holm,
+                n_songs: pair.estimate.n,
+            })
+        })
+        .collect()
 }
 
 /// What determines the motions of a run.
@@ -125,7 +299,9 @@ fn lines(rows: &[SanityCheckRow]) -> Vec<CheckLine> {
     for row in rows {
         let (value, badness) = (row.value.unwrap_or(f64::NAN), Badness::of(row));
         let is_it = |(line, _): &&mut (CheckLine, Badness)| {
-            line.set == row.check_set && line.check == row.check_name
+            line.set == row.check_set
+                && line.check == row.check_name
+                && Some(line.stage.as_str()) == row.stage.as_deref()
         };
         if let Some((line, worst)) = lines.iter_mut().find(is_it) {
             line.n += 1;
@@ -139,6 +315,8 @@ fn lines(rows: &[SanityCheckRow]) -> Vec<CheckLine> {
         }
         let line = CheckLine {
             set: row.check_set.clone(),
+            stage: row.stage.clone().unwrap_or_default(),
+            by_construction: row.by_construction == Some(true),
             check: row.check_name.clone(),
             threshold: row.threshold,
             n: 1,
@@ -191,8 +369,10 @@ mod tests {
             model: "m".to_owned(),
             phrase_id: "p".to_owned(),
             sample: 0,
+            stage: Some("final".to_owned()),
             check_set: "strict".to_owned(),
             check_name: check.to_owned(),
+            by_construction: Some(false),
             value,
             threshold: 1.0,
             passed,

@@ -5,12 +5,37 @@ use std::path::PathBuf;
 
 use anyhow::ensure;
 
+use crate::evaluation::verdict::Quality;
 use crate::motion::ChannelLimits;
 use crate::stages::{ClientParams, all_threads};
 use crate::store::digest;
 
 /// Raised when evaluate writes something else for the same motions and settings.
-const OUTPUT_VERSION: u32 = 1;
+const OUTPUT_VERSION: u32 = 2;
+
+/// A verdict that may be required.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum RequiredVerdict {
+    /// All four.
+    All,
+    Sound,
+    LikeReal,
+    FollowsMusic,
+    Varied,
+}
+
+impl RequiredVerdict {
+    /// Whether the verdict of this name, as tables spell it, is required.
+    pub fn asks_for(self, verdict: &str) -> bool {
+        match self {
+            Self::All => true,
+            Self::Sound => verdict == Quality::Sound.name(),
+            Self::LikeReal => verdict == Quality::LikeReal.name(),
+            Self::FollowsMusic => verdict == Quality::FollowsMusic.name(),
+            Self::Varied => verdict == Quality::Varied.name(),
+        }
+    }
+}
 
 /// What the user asks for.
 #[derive(Clone, Debug, clap::Args)]
@@ -19,9 +44,16 @@ pub struct Params {
     #[arg(long, value_name = "URL")]
     pub store: String,
     /// The run of generate whose motions are evaluated.
-    #[arg(long, value_name = "NAME")]
-    pub run: String,
-    /// Sanity checks only: no ground truth is read and no metrics are written.
+    #[arg(long, value_name = "NAME", required_unless_present = "motions", conflicts_with = "motions")]
+    pub run: Option<String>,
+    /// Motions of any program instead: a folder of files named after the store's phrases (ID.npy, ID.csv, ID.bvh,
+    /// ID.parquet; of several motions ID.0.npy, ID.1.npy, …).
+    #[arg(long, value_name = "DIR")]
+    pub motions: Option<PathBuf>,
+    /// With --motions: the name under which tables keep what was found [default: the folder's]
+    #[arg(long, value_name = "NAME", requires = "motions")]
+    pub name: Option<String>,
+    /// Sanity checks only: no real motion is read, and no numbers and verdicts are written.
     #[arg(long)]
     pub quick: bool,
     /// Most motions that are looked at, the same ones every time [default: all]
@@ -45,6 +77,14 @@ pub struct Params {
     /// Motions that fail the most, which the report shows.
     #[arg(long, value_name = "N", default_value_t = 3, help_heading = "Report")]
     pub worst: usize,
+    /// Exit code 1 unless these verdicts are won, on music that the model did not meet, where there is any.
+    #[arg(long, value_enum, value_name = "VERDICT", num_args = 1.., value_delimiter = ',',
+          conflicts_with = "quick", help_heading = "Exit code")]
+    pub require: Vec<RequiredVerdict>,
+    /// Windows of music for which the untrained network, and the trained one without its music, are sampled as
+    /// baselines; 0 leaves both out, and the verdict on following the music open.
+    #[arg(long, value_name = "N", default_value_t = 256)]
+    pub baseline_windows: usize,
     /// Exit code 1 when fewer than this share of the motions pass the reference's checks, 0 to 1.
     #[arg(long, value_name = "X", help_heading = "Exit code")]
     pub min_pass_rate: Option<f64>,
@@ -91,8 +131,8 @@ impl Params {
     /// those that need the ground truth.
     pub fn digest(&self, quick: bool) -> String {
         let text = format!(
-            "{OUTPUT_VERSION}\n{:?}\n{:?}\n{:?}\n{quick}",
-            self.num_samples, self.num_frames, self.limits
+            "{OUTPUT_VERSION}\n{:?}\n{:?}\n{:?}\n{}\n{quick}",
+            self.num_samples, self.num_frames, self.limits, self.baseline_windows
         );
         digest(text.as_bytes())
     }

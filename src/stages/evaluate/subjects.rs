@@ -1,22 +1,24 @@
 //! Whose motion is measured: what was generated, and what it is compared with.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::num::NonZeroUsize;
+use std::sync::Arc;
 
-use ndarray::{Array2, ArrayView2, s};
+use ndarray::Array2;
 
-use super::measure::{Measurer, Seen, kept_of, stride_for};
-use super::motions::{Phrases, excerpt};
-use super::truth::{RETRIEVAL_FRAMES, Truth};
+use super::measure::kept_frames;
+use super::splits::{ALL, MusicSplit};
+use crate::evaluation::Measured;
+use crate::evaluation::coupling::Coupling;
 use crate::evaluation::metrics::{
-    Danced, Music, Number, of_channels, of_control, of_motion, of_music,
+    Danced, MotionContext, Music, MusicContext, MusicWindow, N_WRONG_TEMPI, Number, PhaseOrigin,
+    channel_numbers, motion_numbers, music_numbers, phase_numbers, shifted_numbers,
+    soundness_numbers,
 };
-use crate::generation::Retrieval;
-use crate::store::tables::GenerationRow;
-use crate::training::Split;
+use crate::evaluation::reference_statistics::ReferenceStatistics;
 
-/// Windows of music for which the library is asked for its nearest phrase.
-pub const MAX_RETRIEVED: usize = 500;
+/// Other songs whose music a motion is held against.
+const MAX_OTHER_SONGS: usize = 8;
 
 /// Whose numbers they are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -24,11 +26,17 @@ pub enum Subject {
     Generated,
     /// The same motions with the music of other songs.
     Shuffled,
+    /// The same motions with the bars shifted by beats.
+    Shifted,
+    /// Motion of the run's own network with its first weights.
+    Untrained,
+    /// Motion of the trained network, its music withheld.
+    NoMusic,
     /// The library's phrase with the nearest features.
     Retrieval,
     MeanMotion,
     HeldOutTruth,
-    GroundTruth,
+    TrainingTruth,
 }
 
 impl Subject {
@@ -37,212 +45,177 @@ impl Subject {
         match self {
             Self::Generated => "generated",
             Self::Shuffled => "shuffled",
+            Self::Shifted => "shifted",
+            Self::Untrained => "untrained",
+            Self::NoMusic => "no_music",
             Self::Retrieval => "retrieval",
             Self::MeanMotion => "mean_motion",
             Self::HeldOutTruth => "held_out_truth",
-            Self::GroundTruth => "ground_truth",
+            Self::TrainingTruth => "training_truth",
         }
     }
 }
 
-/// Every song.
-pub const ALL: &str = "all";
-/// Songs that the model did not learn from.
-pub const HELD_OUT: &str = "held_out";
-
-/// A number, whose it is and of which songs.
+/// Numbers of a subject, all of one split.
+#[derive(Clone, Debug)]
 pub struct Finding {
     pub subject: Subject,
     pub split: &'static str,
-    pub number: Number,
+    pub numbers: Vec<Number>,
 }
 
-/// A motion with what is needed to measure a set of them.
+/// A window of motion with what is needed to measure a set of them.
+#[derive(Clone, Debug)]
 pub struct Item {
-    pub phrase_id: String,
+    /// Number of the song; windows of one song are no independent ones.
     pub song: usize,
+    /// Number of the phrase that it was danced to.
     pub phrase: usize,
-    pub is_held_out: bool,
-    pub seen: Seen,
-    pub music: Option<Music>,
+    pub first_frame: usize,
+    pub split: MusicSplit,
+    pub measured: Arc<Measured>,
+    /// The same window as it was decoded; none where that is not known.
+    pub decoded: Option<Arc<Measured>>,
+    pub music: Option<Arc<Music>>,
 }
 
-/// What is measured.
-pub struct Subjects<'a> {
-    pub phrases: &'a Phrases,
-    pub truth: Option<&'a Truth>,
-    pub measurer: &'a Measurer<'a>,
+impl Item {
+    fn music(&self) -> Option<MusicWindow<'_>> {
+        self.music.as_ref()?.window(self.first_frame, self.measured.n_frames)
+    }
+
+    /// Returns the window with its music.
+    pub fn as_danced(&self) -> Danced<'_> {
+        self.danced(&self.measured)
+    }
+
+    fn danced<'a>(&'a self, measured: &'a Measured) -> Danced<'a> {
+        Danced {
+            song: self.song,
+            phrase: self.phrase,
+            first_frame: self.first_frame,
+            motion: measured,
+            music: self.music(),
+        }
+    }
+}
+
+/// How sets of windows are measured.
+#[derive(Clone, Copy)]
+pub struct Meter<'a> {
+    pub reference: Option<&'a ReferenceStatistics>,
+    pub coupling: Option<&'a Coupling>,
+    /// Windows that a Fréchet distance is made of, the same for all subjects.
+    pub n_frechet: usize,
     pub threads: NonZeroUsize,
 }
 
-impl Subjects<'_> {
-    /// Returns the motions of a run with their music.
-    pub fn generated(&self, rows: &[GenerationRow], seen: Vec<Option<Seen>>) -> Vec<Item> {
-        let mut number_of: BTreeMap<String, usize> = BTreeMap::new();
-        rows.iter()
-            .zip(seen)
-            .filter_map(|(row, seen)| {
-                let (seen, id) = (seen?, &row.phrase_id);
-                let n = number_of.len();
-                Some(Item {
-                    phrase_id: id.clone(),
-                    song: self.phrases.song(id),
-                    phrase: *number_of.entry(id.clone()).or_insert(n),
-                    is_held_out: self.phrases.is_held_out(id),
-                    music: self.phrases.music(id, seen.measured.n_frames),
-                    seen,
-                })
-            })
-            .collect()
+/// What is known of how a set of windows was made.
+#[derive(Clone, Copy)]
+pub struct Making<'a> {
+    /// Tells the checks that post-processing makes true.
+    pub holds: &'a dyn Fn(&str) -> bool,
+    pub phase: PhaseOrigin,
+}
+
+impl Meter<'_> {
+    /// Measures a set of windows.
+    pub fn numbers(&self, split: &str, items: &[&Item], making: &Making) -> Vec<Number> {
+        let danced: Vec<Danced> = items.iter().map(|item| item.danced(&item.measured)).collect();
+        // Wrong tempi take most of the time; of all splits together nothing rests on them.
+        let n_wrong_tempi = if split == ALL { 0 } else { N_WRONG_TEMPI };
+        let mut numbers = music_numbers(&danced, &self.music_context(n_wrong_tempi));
+        numbers.extend(phase_numbers(&danced, making.phase, ""));
+        numbers.extend(soundness_numbers(&danced, making.holds, ""));
+        let context = MotionContext { reference: self.reference, n_frechet: self.n_frechet };
+        numbers.extend(motion_numbers(&danced, &context));
+        numbers
     }
 
-    /// Returns the phrases of the ground truth.
-    pub fn truth(&self) -> Vec<Item> {
-        let Some(truth) = self.truth else { return Vec::new() };
-        let feed = |give: &mut dyn FnMut(usize, Array2<f32>)| {
-            for (i, phrase) in truth.phrases.iter().enumerate() {
-                give(i, phrase.motion.clone());
-            }
-            Ok::<_, std::convert::Infallible>(())
-        };
-        let n_frames = truth.phrases.iter().map(|phrase| phrase.motion.nrows()).sum();
-        let measurer = Measurer { stride: stride_for(n_frames), ..*self.measurer };
-        let Ok(seen) = measurer.run(truth.phrases.len(), feed);
-        let with_music =
-            |(i, (phrase, seen)): (usize, (&super::truth::TruthPhrase, Option<Seen>))| {
-                let seen = seen?;
-                Some(Item {
-                    phrase_id: phrase.id.clone(),
-                    song: self.phrases.song(&phrase.id),
-                    phrase: i,
-                    is_held_out: phrase.split != Split::Train,
-                    music: self.phrases.music_of_phase(&phrase.id, &seen.measured.phase),
-                    seen,
-                })
-            };
-        truth.phrases.iter().zip(seen).enumerate().filter_map(with_music).collect()
-    }
-
-    /// Returns the motions that the library has for the music of a phrase, window by window.
-    pub fn retrieved(&self, item: &Item, features: ArrayView2<f32>, most: usize) -> Vec<Item> {
-        let Some(truth) = self.truth else { return Vec::new() };
-        let Some((index, of_phrase)) = &truth.retrieval else { return Vec::new() };
-        windows(features.nrows())
-            .take(most)
-            .filter_map(|first| {
-                let window = features.slice(s![first..first + RETRIEVAL_FRAMES, ..]);
-                let (nearest, _) = Retrieval::nearest(index, window)?;
-                let phrase = &truth.phrases[*of_phrase.get(nearest)?];
-                let motion = phrase.motion.slice(s![..RETRIEVAL_FRAMES, ..]).to_owned();
-                Some(Item {
-                    phrase_id: phrase.id.clone(),
-                    song: item.song,
-                    phrase: item.phrase,
-                    is_held_out: item.is_held_out,
-                    seen: self.measurer.look(&motion),
-                    music: item.music.as_ref().map(|m| excerpt(m, first, RETRIEVAL_FRAMES)),
-                })
-            })
-            .collect()
-    }
-
-    /// Returns the best constant with the music of each phrase, one for each window.
-    pub fn mean_motion(&self, generated: &[Item]) -> Vec<Item> {
-        let Some(truth) = self.truth else { return Vec::new() };
-        let mut phrases = BTreeSet::new();
-        let firsts = generated.iter().filter(|item| phrases.insert(item.phrase));
-        let of_windows = firsts
-            .flat_map(|item| windows(item.seen.measured.n_frames).map(move |first| (item, first)));
-        of_windows
-            .take(MAX_RETRIEVED)
-            .map(|(item, first)| Item {
-                phrase_id: item.phrase_id.clone(),
-                song: item.song,
-                phrase: item.phrase,
-                is_held_out: item.is_held_out,
-                seen: self.measurer.look(&truth.mean_motion),
-                music: item.music.as_ref().map(|m| excerpt(m, first, RETRIEVAL_FRAMES)),
-            })
-            .collect()
-    }
-
-    /// Measures a set of motions; of a shuffled one only how far it follows its music.
-    pub fn numbers(&self, subject: Subject, split: &'static str, items: &[&Item]) -> Vec<Finding> {
+    /// Measures how sound windows were as they were decoded; nothing where that is not known.
+    pub fn decoded(&self, items: &[&Item], phase: PhaseOrigin) -> Vec<Number> {
         let danced: Vec<Danced> = items
             .iter()
-            .map(|item| Danced {
-                song: item.song,
-                phrase: item.phrase,
-                motion: &item.seen.measured,
-                music: item.music.as_ref(),
-            })
+            .filter_map(|item| item.decoded.as_ref().map(|measured| item.danced(measured)))
             .collect();
-        let mut numbers = of_music(&danced, self.threads);
-        numbers.extend(of_motion(&danced, self.truth.map(|truth| &truth.statistics)));
-        findings(subject, split, numbers)
+        if danced.is_empty() {
+            return Vec::new();
+        }
+        let mut numbers = soundness_numbers(&danced, &|_| false, DECODED);
+        let mut phases = phase_numbers(&danced, phase, DECODED);
+        // Beats of motion are those of what people see.
+        phases.retain(|number| number.metric != "rayleigh");
+        numbers.extend(phases);
+        numbers
     }
 
-    /// Measures motions with the music of other songs: each song takes the music of the next.
+    /// Measures windows with the music of other songs.
     ///
-    /// None for a single song.
-    pub fn shuffled(&self, split: &'static str, items: &[&Item]) -> Vec<Finding> {
-        let mut of_song: BTreeMap<usize, &Music> = BTreeMap::new();
+    /// The coupling is that with up to eight other songs; all else is with the next song. Nothing for a single song.
+    pub fn shuffled(&self, items: &[&Item]) -> Vec<Number> {
+        let mut songs: BTreeMap<usize, &Arc<Music>> = BTreeMap::new();
         for item in items {
             if let Some(music) = &item.music {
-                let known = of_song.entry(item.song).or_insert(music);
-                // The longest, so that every motion has music to its end.
+                let known = songs.entry(item.song).or_insert(music);
+                // The longest, so that every window has music to its end.
                 if music.bars.len() > known.bars.len() {
                     *known = music;
                 }
             }
         }
-        if of_song.len() < 2 {
+        let numbers: Vec<usize> = songs.keys().copied().collect();
+        if numbers.len() < 2 {
             return Vec::new();
         }
-        let next = |song: usize| {
-            let after = of_song.range(song + 1..).next().or_else(|| of_song.iter().next());
-            after.map(|(_, music)| *music)
+        let other = |item: &Item, step: usize| -> Option<&Music> {
+            let place = numbers.iter().position(|song| *song == item.song)?;
+            songs.get(&numbers[(place + step) % numbers.len()]).map(|music| &***music)
         };
-        let danced: Vec<Danced> = items
+        fn danced_to<'a>(item: &'a Item, music: Option<&'a Music>) -> Danced<'a> {
+            let n = item.measured.n_frames;
+            let music = music.filter(|_| item.music.is_some()).and_then(|music| {
+                // Music that is shorter begins again.
+                let n_starts = (music.bars.len() + 1).checked_sub(n).filter(|n| *n > 0)?;
+                music.window(item.first_frame % n_starts, n)
+            });
+            Danced { music, ..item.danced(&item.measured) }
+        }
+        let next: Vec<Danced> = items.iter().map(|item| danced_to(item, other(item, 1))).collect();
+        let mut found = music_numbers(&next, &self.music_context(0));
+        let steps = 1..=MAX_OTHER_SONGS.min(numbers.len() - 1);
+        let all: Vec<Danced> = items
             .iter()
-            .map(|item| Danced {
-                song: item.song,
-                phrase: item.phrase,
-                motion: &item.seen.measured,
-                music: item.music.as_ref().and_then(|_| next(item.song)),
-            })
+            .flat_map(|item| steps.clone().map(move |step| danced_to(item, other(item, step))))
             .collect();
-        findings(Subject::Shuffled, split, of_music(&danced, self.threads))
+        let pooled = music_numbers(&all, &self.music_context(0));
+        let is_coupling = |number: &Number| ["coupling", "locking_p"].contains(&number.metric);
+        found.retain(|number| !is_coupling(number));
+        found.extend(pooled.into_iter().filter(is_coupling));
+        found
+    }
+
+    /// Measures windows with their bars shifted by beats; nothing where no coupling is known.
+    pub fn shifted(&self, items: &[&Item]) -> Vec<Number> {
+        let danced: Vec<Danced> = items.iter().map(|item| item.danced(&item.measured)).collect();
+        self.coupling.map_or_else(Vec::new, |coupling| shifted_numbers(&danced, coupling))
+    }
+
+    fn music_context(&self, n_wrong_tempi: usize) -> MusicContext<'_> {
+        MusicContext { coupling: self.coupling, n_wrong_tempi, n_threads: self.threads }
     }
 }
 
-/// Compares the values of channels with those of the ground truth.
-pub fn channels(
-    subject: Subject,
-    split: &'static str,
-    items: &[&Item],
+/// What is added to the variants of numbers of motion as it was decoded.
+pub const DECODED: &str = "raw";
+
+/// Compares the values of channels with those of the training split.
+pub fn channels<'a>(
+    kept: impl IntoIterator<Item = &'a Array2<f32>>,
     truth: &Array2<f32>,
-) -> Vec<Finding> {
-    let kept = kept_of(items.iter().map(|item| &item.seen));
-    findings(subject, split, of_channels(kept.view(), truth.view()))
-}
-
-/// Sums up how far motions are from their constraints.
-pub fn control(split: &'static str, rows: &[&GenerationRow], phrases: &Phrases) -> Vec<Finding> {
-    let of = |miss: fn(&GenerationRow) -> Option<f64>| -> (Vec<f64>, Vec<usize>) {
-        rows.iter().filter_map(|row| Some((miss(row)?, phrases.song(&row.phrase_id)))).unzip()
-    };
-    let position = of(|row| row.control_error_mm);
-    let orientation = of(|row| row.control_error_deg);
-    let numbers = of_control([&position.0, &orientation.0], [&position.1, &orientation.1]);
-    findings(Subject::Generated, split, numbers)
-}
-
-fn findings(subject: Subject, split: &'static str, numbers: Vec<Number>) -> Vec<Finding> {
-    numbers.into_iter().map(|number| Finding { subject, split, number }).collect()
-}
-
-/// First frames of the windows of a track.
-fn windows(n_frames: usize) -> impl Iterator<Item = usize> {
-    (0..n_frames / RETRIEVAL_FRAMES).map(|i| i * RETRIEVAL_FRAMES)
+) -> Vec<Number> {
+    let kept = kept_frames(kept);
+    if kept.nrows() == 0 || truth.nrows() == 0 {
+        return Vec::new();
+    }
+    channel_numbers(kept.view(), truth.view())
 }

@@ -1,33 +1,33 @@
-//! The ground truth: motion of the phrases that there is to learn from.
+//! Real motion: of the training split, by which all is measured, and held-out, which says how good a number can be.
 
 use std::num::NonZeroUsize;
 
-use ndarray::Array2;
+use ndarray::{Array2, ArrayView2};
 
 use crate::evaluation::baseline::mean_motion;
 use crate::evaluation::reference_statistics::ReferenceStatistics;
+use crate::evaluation::window::{window, window_frames, window_starts};
 use crate::generation::Retrieval;
 use crate::stages::Progress;
 use crate::stages::retrieval::{index_of, read_dataset};
 use crate::store::{Location, StoreError};
 use crate::training::{DatasetError, Split};
 
-/// Frames of the windows for which the library is asked for its nearest phrase.
-pub const RETRIEVAL_FRAMES: usize = 120;
-/// Where the statistics of the ground truth are kept in a store.
+/// Where the statistics of real motion are kept in a store.
 const STATISTICS: &str = "reference";
 
-/// Motion to compare with.
+/// Real motion to compare with.
 pub struct Truth {
     pub phrases: Vec<TruthPhrase>,
+    /// Of the training split alone.
     pub statistics: ReferenceStatistics,
-    /// The library's phrases by their features, and the place of each in `phrases`.
+    /// The training phrases by their features, and the place of each in `phrases`.
     pub retrieval: Option<(Retrieval, Vec<usize>)>,
-    /// The best constant.
+    /// The best constant, a window of it.
     pub mean_motion: Array2<f32>,
 }
 
-/// A phrase of the ground truth.
+/// A phrase with real motion.
 pub struct TruthPhrase {
     pub id: String,
     pub split: Split,
@@ -35,7 +35,7 @@ pub struct TruthPhrase {
     pub motion: Array2<f32>,
 }
 
-/// Reads the ground truth of a store; none, and a note, where there is too little.
+/// Reads the real motion of a store; none, and a note, where there is too little.
 ///
 /// # Errors
 /// When the store cannot be read.
@@ -49,8 +49,8 @@ pub fn read(
         Ok(dataset) => dataset,
         Err(DatasetError::Empty { .. }) => {
             progress.note(
-                "the store has no phrases with motion and features, so that there is no ground truth to \
-                 compare with; build one with motiongen library",
+                "the store has no phrases with motion and features, so that there is no real motion to \
+                 compare with; build a library with motiongen library",
             );
             return Ok(None);
         }
@@ -61,26 +61,31 @@ pub fn read(
         let motion = dataset.motion(phrase, 0, phrase.n_frames)?;
         phrases.push(TruthPhrase { id: phrase.id.to_string(), split: phrase.split, motion });
     }
-    let retrieval = index_of(&dataset, RETRIEVAL_FRAMES)?;
     let train = || phrases.iter().filter(|phrase| phrase.split == Split::Train);
-    let mean = mean_motion(train().map(|phrase| phrase.motion.view()), RETRIEVAL_FRAMES);
-    let statistics = statistics(store, data_hash, &phrases)?;
+    let too_little =
+        "the training phrases of the store are too few or too short to compare with; two windows of 2.5 s are \
+         the least";
+    let Some(length) = window_frames(train().map(|phrase| phrase.motion.nrows())) else {
+        progress.note(too_little);
+        return Ok(None);
+    };
+    let retrieval = index_of(&dataset, length)?;
+    let mean = mean_motion(train().map(|phrase| phrase.motion.view()), length);
+    let statistics = statistics(store, data_hash, train(), length)?;
     let (Some(mean_motion), Some(statistics)) = (mean, statistics) else {
-        progress.note(
-            "the phrases with motion and features are too few or too short to compare with; two chunks of \
-             2.5 s are the least",
-        );
+        progress.note(too_little);
         return Ok(None);
     };
     Ok(Some(Truth { phrases, statistics, retrieval, mean_motion }))
 }
 
-/// Returns the statistics of the ground truth: those that the store keeps of these data, else measured, and
+/// Returns the statistics of the training split: those that the store keeps of these data, else measured, and
 /// kept.
-fn statistics(
+fn statistics<'a>(
     store: &Location,
     data_hash: &str,
-    phrases: &[TruthPhrase],
+    train: impl Iterator<Item = &'a TruthPhrase>,
+    window_frames: usize,
 ) -> anyhow::Result<Option<ReferenceStatistics>> {
     // Named by its data, so that no artefact is ever changed.
     let path = format!("{STATISTICS}/{}.json", &data_hash[..32.min(data_hash.len())]);
@@ -89,6 +94,7 @@ fn statistics(
             let known = String::from_utf8_lossy(&bytes);
             if let Ok(known) = ReferenceStatistics::from_json(&known)
                 && known.check_data(data_hash).is_ok()
+                && known.window_frames == window_frames
             {
                 return Ok(Some(known));
             }
@@ -98,8 +104,15 @@ fn statistics(
         Err(StoreError::NotFound { .. }) => {}
         Err(e) => return Err(e.into()),
     }
-    let motions: Vec<_> = phrases.iter().map(|phrase| phrase.motion.view()).collect();
-    let measured = ReferenceStatistics::fit(&motions, data_hash.to_owned());
+    let windows: Vec<Array2<f32>> = train
+        .flat_map(|phrase| {
+            let motion = phrase.motion.view();
+            window_starts(motion.nrows(), window_frames)
+                .map(move |first| window(motion, first, window_frames))
+        })
+        .collect();
+    let views: Vec<ArrayView2<f32>> = windows.iter().map(|window| window.view()).collect();
+    let measured = ReferenceStatistics::fit(&views, data_hash.to_owned());
     if let Some(measured) = &measured {
         let text = serde_json::to_vec_pretty(measured)?;
         store.put_new(&path, text.into())?;

@@ -1,0 +1,41 @@
+//! Is it varied?
+
+use super::{Evidence, Rule, Test, estimate, real};
+use crate::evaluation::interval::Estimate;
+
+/// Least distance over that of real motion.
+const MIN_RATIO: f64 = 0.5;
+
+/// Windows of different songs are as different as in real motion, anywhere and at the same place, which one motion
+/// for all songs is not.
+pub(super) fn tests(evidence: &Evidence) -> Vec<Test> {
+    let Evidence { own, truth, .. } = evidence;
+    let test = |name, what: &str, metric: &'static str, truth_metric: &str| {
+        let (a, b) = (estimate(own, metric, "axes"), estimate(truth, truth_metric, "axes"));
+        let over = |x: Option<f64>| Some(x? / b.value.filter(|b| *b > 0.0)?);
+        let ratio = Estimate {
+            value: over(a.value),
+            ci_low: over(a.ci_low),
+            ci_high: over(a.ci_high),
+            n: a.n,
+        };
+        Test::of_value(
+            name,
+            format!("{what} over that of real motion"),
+            ratio,
+            "",
+            Rule::AtLeast(MIN_RATIO),
+            real(truth, truth_metric, "axes"),
+        )
+    };
+    vec![
+        test("songs", "distance of windows of different songs", "mean_distance", "mean_distance"),
+        // Real motion at one place of different songs is as different as anywhere.
+        test(
+            "one_for_all",
+            "distance of windows of different songs at the same place",
+            "song_distance",
+            "mean_distance",
+        ),
+    ]
+}

@@ -1,0 +1,495 @@
+//! The work: motions become windows, windows become numbers, and numbers verdicts.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use ndarray::{Array2, ArrayView2, s};
+
+use super::measure::{MeasuredMotion, Measurer, kept_frames, stride_for};
+use super::motions::{Phrases, is_held_out};
+use super::params::Params;
+use super::splits::{ALL, MusicSplit, SPLITS};
+use super::subjects::{Finding, Item, Making, Meter, Subject, channels};
+use super::truth::{Truth, TruthPhrase};
+use crate::evaluation::Measured;
+use crate::evaluation::coupling::{Coupling, Harmonics, Template, consistency_p};
+use crate::evaluation::metrics::{
+    Danced, Number, PhaseOrigin, control_numbers, coupling_ratio, motion_ratios, song_harmonics,
+};
+use crate::evaluation::verdict::{Evidence, Verdict, verdicts};
+use crate::evaluation::window::window_starts;
+use crate::generation::Retrieval;
+use crate::stages::Progress;
+use crate::store::{Location, Snapshot, StoreError, digest, tables};
+
+/// Windows of music for which the library is asked for its nearest phrase.
+const MAX_RETRIEVED: usize = 500;
+/// Windows of real motion that are measured beside what was generated, evenly among all.
+const MAX_TRUTH_WINDOWS: usize = 4000;
+/// A coupling that training motion shows with a lower probability by chance is taken for one.
+const COUPLING_P: f64 = 0.01;
+/// Seed of that test.
+const COUPLING_SEED: u64 = 2026;
+
+/// Stages of the making of a motion at which it is checked.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stage {
+    /// As it was decoded.
+    Raw,
+    /// After post-processing.
+    Final,
+}
+
+impl Stage {
+    /// Returns the name of the stage in tables.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Raw => "raw",
+            Self::Final => "final",
+        }
+    }
+}
+
+/// A motion that is evaluated.
+#[derive(Clone, Debug)]
+pub struct Motion {
+    pub phrase_id: String,
+    pub sample: i32,
+    pub split: MusicSplit,
+    /// Largest misses of its constraints: mm and degrees.
+    pub misses: [Option<f64>; 2],
+}
+
+/// A motion, measured as it is and, where that is known, as it was decoded.
+pub struct Evaluated {
+    pub is: MeasuredMotion,
+    pub decoded: Option<MeasuredMotion>,
+}
+
+/// Motion that was sampled as a baseline: one window each, and the place of its music.
+pub struct SampledWindow {
+    pub subject: Subject,
+    pub phrase_id: String,
+    pub first_frame: usize,
+    /// \[T, 25\]
+    pub frames: Array2<f32>,
+}
+
+/// What was found.
+pub struct Found {
+    pub findings: Vec<Finding>,
+    pub verdicts: Vec<(MusicSplit, Verdict)>,
+}
+
+/// What is evaluated, and what it is compared with.
+pub struct Job<'a> {
+    pub params: &'a Params,
+    pub store: &'a Location,
+    pub motions: &'a [Motion],
+    pub phrases: &'a Phrases,
+    pub truth: Option<&'a Truth>,
+    pub holds: &'a (dyn Fn(&str) -> bool + Sync),
+    pub phase: PhaseOrigin,
+    /// Whether motions were decoded by this program.
+    pub has_raw: bool,
+    /// Whether there is a network whose first weights are a baseline.
+    pub has_network: bool,
+    /// Split of the windows that were sampled.
+    pub sampled_split: Option<MusicSplit>,
+}
+
+impl Job<'_> {
+    /// Makes numbers and verdicts of motions that were measured.
+    ///
+    /// # Errors
+    /// [`StoreError`] when features cannot be read.
+    pub fn numbers(
+        &self,
+        evaluated: &[Evaluated],
+        sampled: &[SampledWindow],
+        progress: &dyn Progress,
+    ) -> Result<Found, StoreError> {
+        let measurer = self.measurer(1);
+        let generated = self.generated(evaluated);
+        progress.say("measuring what it is compared with");
+        let (training, held_out) = self.real_motion();
+        let coupling = self.coupling(&training);
+        let retrieved = self.retrieved(&measurer, &generated)?;
+        let constant = self.mean_motion(&measurer, &generated);
+        let sampled = self.sampled(&measurer, sampled);
+        let training_kept = kept_frames(training.iter().map(|(_, kept)| kept));
+        let held_out_items: Vec<&Item> = held_out.iter().map(|(item, _)| item).collect();
+        let meter = |n_own: usize| Meter {
+            reference: self.truth.map(|truth| &truth.statistics),
+            coupling: coupling.as_ref(),
+            n_frechet: match held_out_items.len() {
+                0 => n_own,
+                n => n.min(n_own),
+            },
+            threads: self.params.threads,
+        };
+        let real = Making { holds: &|_| false, phase: PhaseOrigin::Own };
+        let own = Making { holds: self.holds, phase: self.phase };
+        let mut findings = Vec::new();
+        let mut all_verdicts = Vec::new();
+        let largest = SPLITS
+            .iter()
+            .map(|split| generated.iter().filter(|(item, _)| item.split == *split).count())
+            .max()
+            .unwrap_or(0);
+        let truth_name = MusicSplit::HeldOut.name();
+        let truth = meter(largest).numbers(truth_name, &held_out_items, &real);
+        let mut truth_numbers = truth.clone();
+        truth_numbers.extend(channels(held_out.iter().map(|(_, kept)| kept), &training_kept));
+        if !held_out_items.is_empty() {
+            let (subject, split) = (Subject::HeldOutTruth, truth_name);
+            findings.push(Finding { subject, split, numbers: truth_numbers });
+        }
+        if !training.is_empty() {
+            let items: Vec<&Item> = training.iter().map(|(item, _)| item).collect();
+            // Distances from itself say nothing.
+            let mut numbers = meter(items.len()).numbers(ALL, &items, &real);
+            numbers.retain(|number| !DISTANCES.contains(&number.metric));
+            findings.push(Finding { subject: Subject::TrainingTruth, split: ALL, numbers });
+        }
+        let splits: Vec<MusicSplit> = SPLITS
+            .into_iter()
+            .filter(|split| generated.iter().any(|(item, _)| item.split == *split))
+            .collect();
+        progress.say("measuring what was generated");
+        if splits.len() > 1 {
+            let items: Vec<&Item> = generated.iter().map(|(item, _)| item).collect();
+            let mut numbers = meter(items.len()).numbers(ALL, &items, &own);
+            numbers.extend(meter(0).decoded(&items, self.raw_phase()));
+            numbers.extend(self.control(None));
+            findings.push(Finding { subject: Subject::Generated, split: ALL, numbers });
+        }
+        for split in splits {
+            let chosen: Vec<&(Item, Array2<f32>)> =
+                generated.iter().filter(|(item, _)| item.split == split).collect();
+            let items: Vec<&Item> = chosen.iter().map(|(item, _)| item).collect();
+            let meter = meter(items.len());
+            let name = split.name();
+            let mut numbers = meter.numbers(name, &items, &own);
+            numbers.extend(meter.decoded(&items, self.raw_phase()));
+            numbers.extend(motion_ratios(&numbers, &truth));
+            numbers.extend(coupling_ratio(&numbers, &truth));
+            numbers.extend(channels(chosen.iter().map(|(_, kept)| kept), &training_kept));
+            numbers.extend(self.control(Some(split)));
+            let shuffled = meter.shuffled(&items);
+            let shifted = meter.shifted(&items);
+            let of_split = |items: &'_ [Item]| -> Vec<Item> {
+                items.iter().filter(|item| item.split == split).cloned().collect()
+            };
+            let baseline = |subject: Subject, items: &[Item]| -> Finding {
+                let items = of_split(items);
+                let items: Vec<&Item> = items.iter().collect();
+                let numbers = match items.is_empty() {
+                    true => Vec::new(),
+                    false => meter.numbers(name, &items, &real),
+                };
+                Finding { subject, split: name, numbers }
+            };
+            let untrained = baseline(Subject::Untrained, &sampled.untrained);
+            let evidence = Evidence {
+                own: &numbers,
+                shuffled: &shuffled,
+                shifted: &shifted,
+                untrained: &untrained.numbers,
+                truth: &truth,
+                has_raw: self.has_raw,
+                has_network: self.has_network && self.sampled_split == Some(split),
+            };
+            all_verdicts.extend(verdicts(&evidence).map(|verdict| (split, verdict)));
+            let finding = |subject, numbers| Finding { subject, split: name, numbers };
+            findings.extend([
+                finding(Subject::Generated, numbers),
+                finding(Subject::Shuffled, shuffled),
+                finding(Subject::Shifted, shifted),
+                untrained,
+                baseline(Subject::NoMusic, &sampled.no_music),
+                baseline(Subject::Retrieval, &retrieved),
+                baseline(Subject::MeanMotion, &constant),
+            ]);
+        }
+        findings.retain(|finding| !finding.numbers.is_empty());
+        Ok(Found { findings, verdicts: all_verdicts })
+    }
+
+    /// Returns what measures motions of which one frame in `stride` is kept.
+    pub fn measurer(&self, stride: usize) -> Measurer<'_> {
+        Measurer {
+            limits: self.params.limits,
+            reference: self.truth.map(|truth| &truth.statistics),
+            num_frames: self.params.num_frames.map(Into::into),
+            stride,
+            threads: self.params.threads,
+        }
+    }
+
+    fn raw_phase(&self) -> PhaseOrigin {
+        if self.has_raw { PhaseOrigin::Own } else { self.phase }
+    }
+
+    /// Returns the windows of the motions with their music, and the frames that are kept of each motion with its first.
+    fn generated(&self, evaluated: &[Evaluated]) -> Vec<(Item, Array2<f32>)> {
+        let mut number_of: BTreeMap<&str, usize> = BTreeMap::new();
+        let mut music_of: BTreeMap<&str, Option<Arc<_>>> = BTreeMap::new();
+        let mut items = Vec::new();
+        for (motion, found) in self.motions.iter().zip(evaluated) {
+            let id = motion.phrase_id.as_str();
+            let n = number_of.len();
+            let phrase = *number_of.entry(id).or_insert(n);
+            let music = music_of
+                .entry(id)
+                .or_insert_with(|| self.phrases.music(id, found.is.n_frames).map(Arc::new))
+                .clone();
+            // Two motions for a phrase may differ in length: music reaches as far as the longer one.
+            let music = match music {
+                Some(known) if known.bars.len() < found.is.n_frames => {
+                    let longer = self.phrases.music(id, found.is.n_frames).map(Arc::new);
+                    music_of.insert(id, longer.clone());
+                    longer
+                }
+                music => music,
+            };
+            let firsts = window_starts(found.is.n_frames, self.measurer(1).window_frames());
+            for (i, (first_frame, window)) in firsts.zip(&found.is.windows).enumerate() {
+                let decoded = found.decoded.as_ref().and_then(|decoded| decoded.windows.get(i));
+                let item = Item {
+                    song: self.phrases.song(id),
+                    phrase,
+                    first_frame,
+                    split: motion.split,
+                    measured: Arc::new(window.clone()),
+                    decoded: decoded.cloned().map(Arc::new),
+                    music: music.clone(),
+                };
+                let kept = match i {
+                    0 => found.is.kept.clone(),
+                    _ => Array2::zeros((0, crate::motion::MOTION_DIM)),
+                };
+                items.push((item, kept));
+            }
+        }
+        items
+    }
+
+    /// Returns windows of the training split's and of held-out real motion, with the frames that are kept of them.
+    fn real_motion(&self) -> (Measurements, Measurements) {
+        let Some(truth) = self.truth else { return (Vec::new(), Vec::new()) };
+        let measure = |phrases: Vec<(usize, &TruthPhrase)>| -> Measurements {
+            let n = phrases.len();
+            let chosen: Vec<(usize, &TruthPhrase)> =
+                (0..n.min(MAX_TRUTH_WINDOWS)).map(|i| phrases[i * n / n.min(MAX_TRUTH_WINDOWS)]).collect();
+            let n_frames = chosen.iter().map(|(_, phrase)| phrase.motion.nrows()).sum();
+            let measurer = self.measurer(stride_for(n_frames));
+            let feed = |give: &mut dyn FnMut(usize, Array2<f32>)| {
+                for (i, (_, phrase)) in chosen.iter().enumerate() {
+                    give(i, phrase.motion.clone());
+                }
+                Ok::<_, std::convert::Infallible>(())
+            };
+            let Ok(found) = measurer.run(chosen.len(), feed);
+            let length = measurer.window_frames();
+            let mut items = Vec::new();
+            for ((place, phrase), measured) in chosen.iter().zip(found) {
+                let Some(measured) = measured else { continue };
+                let phase: Vec<f64> = phrase
+                    .motion
+                    .column(crate::motion::Channel::Phase.range().start)
+                    .iter()
+                    .map(|x| f64::from(*x))
+                    .collect();
+                let music = self.phrases.music_of_real(&phrase.id, &phase).map(Arc::new);
+                let firsts = window_starts(measured.n_frames, length);
+                for (i, (first_frame, window)) in firsts.zip(measured.windows).enumerate() {
+                    let item = Item {
+                        song: self.phrases.song(&phrase.id),
+                        phrase: *place,
+                        first_frame,
+                        split: MusicSplit::HeldOut,
+                        measured: Arc::new(window),
+                        decoded: None,
+                        music: music.clone(),
+                    };
+                    let kept = match i {
+                        0 => measured.kept.clone(),
+                        _ => Array2::zeros((0, crate::motion::MOTION_DIM)),
+                    };
+                    items.push((item, kept));
+                }
+            }
+            items
+        };
+        let phrases = truth.phrases.iter().enumerate();
+        let (held_out, training) =
+            phrases.partition::<Vec<_>, _>(|(_, phrase)| is_held_out(phrase.split));
+        (measure(training), measure(held_out))
+    }
+
+    /// Returns what vertical velocity is known to owe to the bar: that of the construction, or the mean of training
+    /// motion where that is no chance.
+    fn coupling(&self, training: &Measurements) -> Option<Coupling> {
+        if self.phrases.is_constructed() {
+            return Some(Coupling::Constructed);
+        }
+        let danced: Vec<Danced> = training.iter().map(|(item, _)| item.as_danced()).collect();
+        let songs: Vec<Harmonics> = song_harmonics(&danced).into_values().collect();
+        let p = consistency_p(&songs, COUPLING_SEED)?;
+        if p < COUPLING_P { Template::fit(&songs).map(Coupling::Learned) } else { None }
+    }
+
+    /// Asks the library for the nearest phrases of other songs, for one motion of each phrase.
+    fn retrieved(
+        &self,
+        measurer: &Measurer,
+        generated: &[(Item, Array2<f32>)],
+    ) -> Result<Vec<Item>, StoreError> {
+        let Some((truth, (index, of_phrase))) =
+            self.truth.and_then(|truth| Some((truth, truth.retrieval.as_ref()?)))
+        else {
+            return Ok(Vec::new());
+        };
+        let mut names: BTreeSet<&str> =
+            self.motions.iter().map(|motion| motion.phrase_id.as_str()).collect();
+        if names.len() > MAX_RETRIEVED {
+            // A song here and there, where there are more than are asked for.
+            let mut order: Vec<&str> = names.into_iter().collect();
+            order.sort_by_cached_key(|id| digest(id.as_bytes()));
+            order.truncate(MAX_RETRIEVED);
+            names = order.into_iter().collect();
+        }
+        let most = MAX_RETRIEVED.div_ceil(names.len().max(1));
+        let owned: BTreeSet<String> = names.iter().map(|id| (*id).to_owned()).collect();
+        let length = measurer.window_frames();
+        let mut found: BTreeMap<String, Vec<Item>> = BTreeMap::new();
+        Snapshot::take(self.store, tables::features())?.visit_items(
+            &owned,
+            |id, features: Array2<f32>| {
+                let song = self.phrases.song(id);
+                let is_other =
+                    |i: usize| self.phrases.song(&truth.phrases[of_phrase[i]].id) != song;
+                let items = window_starts(features.nrows(), length).take(most).filter_map(|first| {
+                    let window = features.slice(s![first..first + length, ..]);
+                    let nearest = nearest_phrase(index, window, &is_other)?;
+                    let phrase = &truth.phrases[*of_phrase.get(nearest)?];
+                    let window = phrase.motion.slice(s![..length, ..]);
+                    self.baseline_item(measurer, generated, id, first, window)
+                });
+                let items: Vec<Item> = items.collect();
+                found.insert(id.to_owned(), items);
+                Ok::<_, StoreError>(())
+            },
+        )?;
+        Ok(found.into_values().flatten().collect())
+    }
+
+    /// Measures a window of some motion with the music of a place of a phrase that motion was generated for.
+    fn baseline_item(
+        &self,
+        measurer: &Measurer,
+        generated: &[(Item, Array2<f32>)],
+        phrase_id: &str,
+        first_frame: usize,
+        window: ArrayView2<f32>,
+    ) -> Option<Item> {
+        let place = self.motions.iter().position(|motion| motion.phrase_id == phrase_id)?;
+        let motion = &self.motions[place];
+        let song = self.phrases.song(phrase_id);
+        let known = generated.iter().find(|(item, _)| {
+            item.song == song
+                && item.music.as_ref().is_some_and(|music| {
+                    music.bars.len() >= first_frame + measurer.window_frames()
+                })
+        });
+        let music = match known.filter(|_| self.phrases.is_song(phrase_id)) {
+            Some((item, _)) => item.music.clone(),
+            None => self
+                .phrases
+                .music(phrase_id, first_frame + measurer.window_frames())
+                .map(Arc::new),
+        };
+        let measured: Measured = measurer.measure(window).windows.into_iter().next()?;
+        Some(Item {
+            song,
+            phrase: place,
+            first_frame,
+            split: motion.split,
+            measured: Arc::new(measured),
+            decoded: None,
+            music,
+        })
+    }
+
+    /// Returns the best constant with the music of each phrase, one for each window.
+    fn mean_motion(
+        &self,
+        measurer: &Measurer,
+        generated: &[(Item, Array2<f32>)],
+    ) -> Vec<Item> {
+        let Some(truth) = self.truth else { return Vec::new() };
+        let Some(still) =
+            measurer.measure(truth.mean_motion.view()).windows.into_iter().next().map(Arc::new)
+        else {
+            return Vec::new();
+        };
+        let mut places = BTreeSet::new();
+        generated
+            .iter()
+            .filter(|(item, _)| places.insert((item.phrase, item.first_frame)))
+            .take(MAX_RETRIEVED)
+            .map(|(item, _)| Item { measured: still.clone(), decoded: None, ..item.clone() })
+            .collect()
+    }
+
+    fn sampled(&self, measurer: &Measurer, sampled: &[SampledWindow]) -> Sampled {
+        let item = |window: &SampledWindow| {
+            let (id, first) = (window.phrase_id.as_str(), window.first_frame);
+            self.baseline_item(measurer, &[], id, first, window.frames.view())
+        };
+        let of_subject = |subject: Subject| -> Vec<Item> {
+            sampled.iter().filter(|window| window.subject == subject).filter_map(item).collect()
+        };
+        Sampled {
+            untrained: of_subject(Subject::Untrained),
+            no_music: of_subject(Subject::NoMusic),
+        }
+    }
+
+    /// Sums up how far motions are from their constraints.
+    fn control(&self, split: Option<MusicSplit>) -> Vec<Number> {
+        let chosen = || {
+            self.motions.iter().filter(move |motion| split.is_none_or(|split| motion.split == split))
+        };
+        let misses = |i: usize| -> (Vec<f64>, Vec<usize>) {
+            chosen()
+                .filter_map(|motion| {
+                    Some((motion.misses[i]?, self.phrases.song(&motion.phrase_id)))
+                })
+                .unzip()
+        };
+        let (position, orientation) = (misses(0), misses(1));
+        control_numbers([&position.0, &orientation.0], [&position.1, &orientation.1])
+    }
+}
+
+/// Windows with the frames that are kept of their motions.
+type Measurements = Vec<(Item, Array2<f32>)>;
+
+/// Baselines that were sampled.
+struct Sampled {
+    untrained: Vec<Item>,
+    no_music: Vec<Item>,
+}
+
+/// Metrics that say how far windows are from the training split.
+const DISTANCES: [&str; 4] = ["fid_k", "fid_g", "feature_shift", "channel_distance"];
+
+fn nearest_phrase(
+    index: &Retrieval,
+    window: ArrayView2<f32>,
+    is_among: &dyn Fn(usize) -> bool,
+) -> Option<usize> {
+    index.nearest_among(window, is_among).map(|(nearest, _)| nearest)
+}

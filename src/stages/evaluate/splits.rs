@@ -1,0 +1,35 @@
+//! Of which music numbers are: whether the model learned from it.
+
+pub use crate::generation::MusicSplit;
+
+/// Everything that was generated.
+pub const ALL: &str = "all";
+
+/// Every split, in the order in which they are measured.
+pub const SPLITS: [MusicSplit; 4] =
+    [MusicSplit::HeldOut, MusicSplit::Validation, MusicSplit::TrainedOn, MusicSplit::Unknown];
+
+/// Returns the split that tells most of those that are there: what was held out, else what nobody knows of, else what
+/// checkpoints were chosen by, else what was learned from.
+pub fn telling(splits: impl IntoIterator<Item = MusicSplit>) -> Option<MusicSplit> {
+    splits.into_iter().min_by_key(|split| match split {
+        MusicSplit::HeldOut => 0,
+        MusicSplit::Unknown => 1,
+        MusicSplit::Validation => 2,
+        MusicSplit::TrainedOn => 3,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn validation_never_counts_as_held_out() {
+        use MusicSplit::{HeldOut, TrainedOn, Unknown, Validation};
+        assert_eq!(telling([TrainedOn, Validation, HeldOut]), Some(HeldOut));
+        assert_eq!(telling([TrainedOn, Validation, Unknown]), Some(Unknown));
+        assert_eq!(telling([TrainedOn, Validation]), Some(Validation));
+        assert_eq!(telling([]), None);
+    }
+}
