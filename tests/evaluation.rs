@@ -7,6 +7,7 @@ use motiongen::evaluation::beats::{
 };
 use motiongen::evaluation::body::{part, poses};
 use motiongen::evaluation::consistency::consistency;
+use motiongen::evaluation::coupling::{CoupledPassage, Coupling, CouplingSums};
 use motiongen::evaluation::control::{
     ControlErrors, control_errors, position_error_mm, rotation_error_deg, spread_mm,
 };
@@ -15,15 +16,16 @@ use motiongen::evaluation::diversity::{diversity, mean_distance, multimodality};
 use motiongen::evaluation::frechet::{Gaussian, frechet_distance};
 use motiongen::evaluation::geometric::{GeometricThresholds, geometric_features};
 use motiongen::evaluation::interval::{
-    Estimate, bootstrap_estimate, mean_estimate, share_estimate,
+    Estimate, clustered_mean_estimate, clustered_share_estimate, jackknife_estimate, mean_estimate,
+    paired_difference, share_estimate,
 };
 use motiongen::evaluation::kinetic::{CHUNK_FRAMES, Formula, axis_features, marker_features};
-use motiongen::evaluation::locking::{Passage, locking_against};
+use motiongen::evaluation::locking::{BarLocking, Passage, r2_at};
 use motiongen::evaluation::reference_statistics::{
     FeatureSet, FeatureStatistics, ReferenceStatistics,
 };
 use motiongen::evaluation::sanity::checks;
-use motiongen::evaluation::training_range::range_checks;
+use motiongen::evaluation::window_range::{Posture, WindowRange, posture};
 use motiongen::motion::rates::MotionRange;
 use motiongen::motion::{Channel, ChannelLimits, MOTION_DIM, Poses};
 use ndarray::{Array2, ArrayView2, s};
@@ -40,6 +42,10 @@ struct Golden {
     thresholds: GeometricThresholds,
     training_range: MotionRange,
     locking: LockingRows,
+    /// Rotations, and the coefficient on the constructed coupling at each.
+    coupling: Vec<[f64; 2]>,
+    postures: Vec<PostureRow>,
+    window_range: WindowRange,
     channels: Vec<f64>,
     features: FeatureRows,
     control: ControlRows,
@@ -94,7 +100,19 @@ struct LockingRow {
     r2: f64,
     wrong_mean: f64,
     effect: f64,
-    p: f64,
+    wrong_share: f64,
+}
+
+#[derive(Deserialize)]
+struct PostureRow {
+    speed_m_s: f64,
+    turn_rate_rad_s: f64,
+    tilt_rad: f64,
+    lowest_m: f64,
+    highest_m: f64,
+    turning_rad_s: f64,
+    jerk_m_s3: f64,
+    axis_speed_m_s: [f64; 3],
 }
 
 #[derive(Deserialize)]
@@ -145,9 +163,13 @@ struct ControlRow {
 #[derive(Deserialize)]
 struct IntervalRows {
     values: Vec<f64>,
+    clusters: Vec<usize>,
     mean: [f64; 3],
-    bootstrap_of_median: [f64; 3],
+    clustered: [f64; 3],
     share: [f64; 3],
+    clustered_share: [f64; 3],
+    jackknife_of_pairs: [f64; 3],
+    p_greater: f64,
 }
 
 fn golden() -> Golden {
@@ -265,12 +287,73 @@ fn locking_is_a_regression_on_the_bar() {
         ("mistimed", (0..4).map(|i| vec![mistimed(i)]).collect(), &golden.locking.mistimed),
     ];
     for (what, fits, wanted) in cases {
-        let found = locking_against(&fits, &golden.locking.ratios).expect("finite");
+        let fits: Vec<Vec<Passage>> = fits;
+        let groups: Vec<usize> =
+            fits.iter().enumerate().flat_map(|(i, fit)| fit.iter().map(move |_| i)).collect();
+        let passages: Vec<Passage> = fits.into_iter().flatten().collect();
+        let ratios = &golden.locking.ratios;
+        let wrong: Vec<Vec<f64>> =
+            ratios.iter().map(|&ratio| r2_at(&passages, &groups, ratio)).collect();
+        let own = r2_at(&passages, &groups, 1.0);
+        let found = BarLocking::against(&own, &wrong).expect("finite");
         assert_near(&format!("R², {what}"), found.r2, wanted.r2);
         assert_near(&format!("mean of wrong R², {what}"), found.wrong_mean, wanted.wrong_mean);
         assert_near(&format!("effect, {what}"), found.effect.expect("spread"), wanted.effect);
-        assert_near(&format!("p, {what}"), found.p, wanted.p);
+        assert_near(&format!("wrong share, {what}"), found.wrong_share, wanted.wrong_share);
     }
+}
+
+#[test]
+fn the_coefficient_is_a_regression_on_what_was_constructed() {
+    let golden = golden();
+    let mut sums = CouplingSums::default();
+    for row in &golden.motions {
+        let heights = row.column(1);
+        let rise_m_s: Vec<f64> = heights.windows(2).map(|y| (y[1] - y[0]) * 30.0).collect();
+        let activity: Vec<f64> =
+            (0..row.n_frames).map(|t| 0.5 + 0.4 * (0.05 * t as f64).sin()).collect();
+        let bars = row.bars();
+        let passage = CoupledPassage {
+            rise_m_s: &rise_m_s,
+            bars: &bars,
+            beats_per_bar: 4,
+            activity: Some(&activity),
+        };
+        sums.add(&Coupling::Constructed, &passage);
+    }
+    for &[rotation, wanted] in &golden.coupling {
+        let found = sums.coefficient(rotation).expect("finite");
+        assert_near(&format!("coefficient, rotated by {rotation}"), found, wanted);
+    }
+}
+
+#[test]
+fn bounds_of_windows_are_numpys() {
+    let golden = golden();
+    let found: Vec<Posture> = golden
+        .motions
+        .iter()
+        .map(|row| posture(row.frames().view()).expect("finite"))
+        .collect();
+    for (found, wanted) in found.iter().zip(&golden.postures) {
+        assert_near("speed", found.speed_m_s, wanted.speed_m_s);
+        assert_near("turn rate", found.turn_rate_rad_s, wanted.turn_rate_rad_s);
+        assert_near("tilt", found.tilt_rad, wanted.tilt_rad);
+        assert_all_near("height", &found.height_m, &[wanted.lowest_m, wanted.highest_m]);
+        assert_near("turning", found.turning_rad_s, wanted.turning_rad_s);
+        assert_near("jerk", found.jerk_m_s3, wanted.jerk_m_s3);
+        assert_all_near("speeds", &found.axis_speed_m_s, &wanted.axis_speed_m_s);
+    }
+    let (range, wanted) = (WindowRange::fit(&found).expect("finite"), golden.window_range);
+    let numbers = |range: &WindowRange| {
+        let [low, high] = range.height_m;
+        let [from, to] = range.jerk_m_s3;
+        let others =
+            [range.speed_m_s, range.turn_rate_rad_s, range.tilt_rad, range.turning_rad_s];
+        [&others[..], &[low, high, from, to]].concat()
+    };
+    assert_eq!(range.n_windows, wanted.n_windows);
+    assert_all_near("bounds", &numbers(&range), &numbers(&wanted));
 }
 
 #[test]
@@ -333,7 +416,9 @@ fn reference_statistics_hold_the_quantiles_of_the_ground_truth() {
         ]
     };
     assert_all_near("thresholds", &numbers(&found.thresholds), &numbers(&golden.thresholds));
-    let (range, wanted) = (found.training_range, golden.training_range);
+    let views: Vec<_> = golden.motions.iter().map(MotionRow::frames).collect();
+    let range = MotionRange::fit(views.iter().map(|frames| frames.view())).expect("finite");
+    let wanted = golden.training_range;
     assert_near("speed", range.speed_m_s, wanted.speed_m_s);
     assert_near("turn rate", range.turn_rate_rad_s, wanted.turn_rate_rad_s);
     let mean = |i: usize| golden.motions.iter().map(|row| row.markers[i]).sum::<f64>() / 4.0;
@@ -421,17 +506,26 @@ fn intervals_are_those_of_their_formulas() {
         let found = [found.value, found.ci_low, found.ci_high].map(|x| x.expect("a number"));
         assert_all_near(what, &found, &wanted);
     };
-    let values = &golden.values;
+    let (values, clusters) = (&golden.values, &golden.clusters);
     check("mean", mean_estimate(values), golden.mean);
-    let median = |indices: &[usize]| {
-        let mut drawn: Vec<f64> = indices.iter().map(|&i| values[i]).collect();
-        drawn.sort_by(f64::total_cmp);
-        // An odd number of values has one in the middle.
-        drawn.get(drawn.len() / 2).copied()
-    };
-    let found = bootstrap_estimate(values.len(), 101, 77, median);
-    check("bootstrap", found, golden.bootstrap_of_median);
+    check("mean over clusters", clustered_mean_estimate(values, clusters), golden.clustered);
     check("share", share_estimate(17, 23), golden.share);
+    let passed: Vec<bool> = values.iter().map(|x| *x < 2.0).collect();
+    let found = clustered_share_estimate(&passed, clusters);
+    check("share over clusters", found, golden.clustered_share);
+    let spread = |left_out: Option<usize>| {
+        let kept: Vec<f64> = values
+            .iter()
+            .zip(clusters)
+            .filter(|(_, cluster)| Some(**cluster) != left_out)
+            .map(|(x, _)| *x)
+            .collect();
+        mean_distance(Array2::from_shape_vec((kept.len(), 1), kept).ok()?.view())
+    };
+    check("jackknife", jackknife_estimate(5, 23, spread), golden.jackknife_of_pairs);
+    let differences: Vec<f64> = values[..7].iter().map(|x| x - 1.5).collect();
+    let found = paired_difference(&differences).p_greater.expect("a spread");
+    assert_near("p of a difference", found, golden.p_greater);
 }
 
 #[test]
@@ -444,7 +538,8 @@ fn motion_that_is_not_finite_has_no_metric_and_passes_no_check() {
     assert!(consistency(frames.view(), ChannelLimits::Wide).is_none());
     assert!(ReferenceStatistics::fit(&[frames.view()], String::new()).is_none());
     assert!(MotionRange::fit([frames.view()]).is_none());
-    let range = range_checks(&golden.training_range, frames.view());
+    assert!(posture(frames.view()).is_none());
+    let range = golden.window_range.checks(None);
     let all = checks(frames.view(), ChannelLimits::Wide);
     let passed: Vec<&str> =
         all.iter().chain(&range).filter(|check| check.passed).map(|check| check.name).collect();

@@ -62,7 +62,8 @@ fn of_pairs(features: ArrayView2<f64>, n_pairs: usize, draws: &mut Draws) -> Opt
     mean.is_finite().then_some(mean)
 }
 
-fn distance(a: ArrayView1<f64>, b: ArrayView1<f64>) -> f64 {
+/// Euclidean distance of two features.
+pub fn distance(a: ArrayView1<f64>, b: ArrayView1<f64>) -> f64 {
     a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt()
 }
 

@@ -2,11 +2,14 @@
 
 use std::collections::BTreeMap;
 
-use ndarray::{Array2, ArrayView1, ArrayView2, Axis, concatenate};
+use ndarray::{Array2, ArrayView2, Axis, concatenate};
 
 use super::super::consistency::Consistency;
 use super::super::control::{POSITION_THRESHOLDS_MM, ROTATION_THRESHOLDS_DEG, control_errors};
 use super::super::distribution::channel_distances;
+use super::super::diversity::{
+    DIVERSITY_PAIRS, MULTIMODALITY_PAIRS, distance, diversity, mean_distance, multimodality,
+};
 use super::super::frechet::{Gaussian, frechet_distance};
 use super::super::interval::{
     Estimate, clustered_mean_estimate, clustered_share_estimate, jackknife_estimate,
@@ -17,9 +20,14 @@ use super::super::measured::Measured;
 use super::super::reference_statistics::{FeatureSet, ReferenceStatistics};
 use super::super::sanity::CheckSet;
 use super::super::window_range::Posture;
-use super::{Danced, Number, mean_over};
+use super::{Danced, Number, SEED, mean_over};
 use crate::motion::CHANNEL_NAMES;
 
+/// Windows, evenly among all, whose pairs are compared: every one with every other.
+const MAX_COMPARED: usize = 400;
+/// Replications of numbers that draw pairs, as for HumanML3D.
+const N_DIVERSITY: u64 = 20;
+const N_MULTIMODALITY: u64 = 5;
 /// Windows of a song, evenly among all, whose features are compared with those of other songs.
 const MAX_COMPARED_PER_SONG: usize = 24;
 /// Songs, evenly among all, that are compared with each other.
@@ -206,13 +214,48 @@ fn joined(motion: &Measured) -> Option<Array2<f64>> {
     concatenate(Axis(1), &[a, b]).ok()
 }
 
-fn distance(a: ArrayView1<f64>, b: ArrayView1<f64>) -> f64 {
-    a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt()
+/// How different windows are: all of them, those of different songs, and those of one place of one phrase.
+fn variety_numbers(danced: &[Danced]) -> Vec<Number> {
+    let groups = rows_by_song(danced, joined);
+    let n_windows = groups.iter().map(Vec::len).sum();
+    let most = MAX_COMPARED.div_ceil(groups.len().max(1));
+    let kept = |left_out: Option<usize>| {
+        let kept = groups.iter().enumerate().filter(|(group, _)| Some(*group) != left_out);
+        let rows = kept.flat_map(|(_, rows)| evenly(rows.len(), most).map(|i| &rows[i]));
+        stacked(rows)
+    };
+    let spread = |left_out| mean_distance(kept(left_out)?.view());
+    let pairs = |left_out| {
+        let rows = kept(left_out)?;
+        let seeds = SEED..SEED + N_DIVERSITY;
+        let found: Option<Vec<f64>> =
+            seeds.map(|seed| diversity(rows.view(), DIVERSITY_PAIRS, seed)).collect();
+        Some(found?.iter().sum::<f64>() / N_DIVERSITY as f64)
+    };
+    let whole = |metric, protocol: String, estimate: Estimate| {
+        Number::new(metric, "axes", "", estimate.non_negative(), protocol)
+    };
+    let mut numbers = vec![
+        whole(
+            "mean_distance",
+            format!("every pair of up to {MAX_COMPARED} windows, one song left out at a time"),
+            jackknife_estimate(groups.len(), n_windows, spread),
+        ),
+        whole(
+            "diversity",
+            format!(
+                "{DIVERSITY_PAIRS} pairs of windows, {N_DIVERSITY} replications, one song left out at a time"
+            ),
+            jackknife_estimate(groups.len(), n_windows, pairs),
+        ),
+    ];
+    numbers.extend(song_distances(danced));
+    numbers.push(multimodality_number(danced));
+    numbers
 }
 
-/// How different windows are: of different songs anywhere, of different songs at the same place, and of one place of
-/// one phrase.
-fn variety_numbers(danced: &[Danced]) -> Vec<Number> {
+/// Distance of windows of different songs, anywhere in them and at the same place.
+fn song_distances(danced: &[Danced]) -> [Number; 2] {
     let mut songs: BTreeMap<usize, Vec<(usize, Array2<f64>)>> = BTreeMap::new();
     for item in danced {
         if let Some(rows) = joined(item.motion).filter(|rows| rows.nrows() > 0) {
@@ -223,8 +266,9 @@ fn variety_numbers(danced: &[Danced]) -> Vec<Number> {
     let songs: Vec<Vec<&(usize, Array2<f64>)>> = evenly(songs.len(), MAX_COMPARED_SONGS)
         .map(|i| evenly(songs[i].len(), MAX_COMPARED_PER_SONG).map(|j| &songs[i][j]).collect())
         .collect();
-    // Sums of pairs of songs are made once: the jackknife only adds them up.
-    let pair = |i: usize, j: usize, is_same_place: bool| -> (f64, f64) {
+    let n_windows = songs.iter().map(Vec::len).sum();
+    // Sum and number of the pairs of two songs.
+    let pairs_of = |i: usize, j: usize, is_same_place: bool| -> (f64, f64) {
         let (mut sum, mut n) = (0.0, 0.0);
         for (first, rows) in &songs[i] {
             for (other_first, other) in &songs[j] {
@@ -236,10 +280,9 @@ fn variety_numbers(danced: &[Danced]) -> Vec<Number> {
         }
         (sum, n)
     };
-    let n_windows = songs.iter().map(Vec::len).sum();
-    let between = |metric: &'static str, is_same_place: bool, protocol: &str| {
+    [("anywhere", false), ("same_place", true)].map(|(variant, is_same_place)| {
         let pairs: Vec<Vec<(f64, f64)>> = (0..songs.len())
-            .map(|i| (0..i).map(|j| pair(i, j, is_same_place)).collect())
+            .map(|i| (0..i).map(|j| pairs_of(i, j, is_same_place)).collect())
             .collect();
         let mean = |left_out: Option<usize>| {
             let (mut sum, mut n) = (0.0, 0.0);
@@ -254,8 +297,12 @@ fn variety_numbers(danced: &[Danced]) -> Vec<Number> {
             (n > 0.0).then(|| sum / n)
         };
         let estimate = jackknife_estimate(songs.len(), n_windows, mean).non_negative();
-        Number::new(metric, "axes", "", estimate, protocol)
-    };
+        Number::new("song_distance", variant, "", estimate, "windows of different songs")
+    })
+}
+
+/// How different motions are for one place of one phrase.
+fn multimodality_number(danced: &[Danced]) -> Number {
     let mut places: BTreeMap<(usize, usize), (usize, Vec<Array2<f64>>)> = BTreeMap::new();
     for item in danced {
         if let Some(rows) = joined(item.motion).filter(|rows| rows.nrows() > 0) {
@@ -265,25 +312,19 @@ fn variety_numbers(danced: &[Danced]) -> Vec<Number> {
         }
     }
     let several = places.values().filter(|(_, rows)| rows.len() > 1);
-    let (values, of_songs): (Vec<f64>, Vec<usize>) = several
-        .map(|(song, rows)| {
-            // Neighbours in order, so that every motion counts and none twice more than another.
-            let steps = rows.windows(2).map(|pair| distance(pair[0].row(0), pair[1].row(0)));
-            (steps.sum::<f64>() / (rows.len() - 1) as f64, *song)
-        })
-        .unzip();
-    let multimodality = clustered_mean_estimate(&values, &of_songs).non_negative();
-    vec![
-        between("mean_distance", false, "windows of different songs"),
-        between("song_distance", true, "windows of different songs at the same place"),
-        Number::new(
-            "multimodality",
-            "axes",
-            "",
-            multimodality,
-            "windows of different motions at one place of one phrase",
-        ),
-    ]
+    let of_place = |(song, rows): &(usize, Vec<Array2<f64>>)| {
+        let rows = stacked(rows)?;
+        let seeds = SEED..SEED + N_MULTIMODALITY;
+        let found: Option<Vec<f64>> =
+            seeds.map(|seed| multimodality(&[rows.view()], MULTIMODALITY_PAIRS, seed)).collect();
+        Some((found?.iter().sum::<f64>() / N_MULTIMODALITY as f64, *song))
+    };
+    let (values, songs): (Vec<f64>, Vec<usize>) = several.filter_map(of_place).unzip();
+    let protocol = format!(
+        "motions at one place of one phrase, {MULTIMODALITY_PAIRS} pairs, {N_MULTIMODALITY} replications"
+    );
+    let estimate = clustered_mean_estimate(&values, &songs).non_negative();
+    Number::new("multimodality", "axes", "", estimate, protocol)
 }
 
 /// Compares the values of each channel, of frames `[n, 25]`, with those of the training split.

@@ -32,8 +32,8 @@ fn good() -> Vec<Number> {
         number("locking_wrong_r2", "per_song", 0.02),
         by_song("coupling", "constructed", &[0.9, 1.1, 1.0, 0.95]),
         number("coupling_ratio", "constructed", 1.0),
-        number("mean_distance", "axes", 5.0),
-        number("song_distance", "axes", 4.6),
+        number("song_distance", "anywhere", 5.0),
+        number("song_distance", "same_place", 4.6),
     ];
     for axis in ["x", "y", "z"] {
         numbers.push(number("speed_ratio", axis, 0.9));
@@ -49,7 +49,7 @@ fn truth() -> Vec<Number> {
         number("fid_g", "", 0.7),
         number("feature_shift", "", 0.1),
         number("coupling", "constructed", 1.0),
-        number("mean_distance", "axes", 5.2),
+        number("song_distance", "anywhere", 5.2),
     ]
 }
 
@@ -104,8 +104,8 @@ fn good_motion_wins_and_each_fault_loses_its_verdict() {
         (number("locking_wrong_share", "per_song", 0.3), "follows_music", "wrong_tempi"),
         (number("coupling_ratio", "constructed", 0.3), "follows_music", "amplitude"),
         (number("coupling_ratio", "constructed", 2.4), "follows_music", "amplitude"),
-        (number("mean_distance", "axes", 0.4), "varied", "songs"),
-        (number("song_distance", "axes", 0.0), "varied", "one_for_all"),
+        (number("song_distance", "anywhere", 0.4), "varied", "songs"),
+        (number("song_distance", "same_place", 0.0), "varied", "one_for_all"),
     ];
     for (change, verdict, test) in cases {
         assert_eq!(lost(change), [(verdict, Outcome::Lost, vec![test])]);

@@ -293,8 +293,12 @@ impl Job<'_> {
             let Ok(found) = measurer.run(chosen.len(), feed);
             let length = measurer.window_frames();
             let mut items = Vec::new();
-            for ((place, phrase), measured) in chosen.iter().zip(found) {
+            // Takes of one place of a song are motions for one phrase.
+            let mut places: BTreeMap<(usize, u64), usize> = BTreeMap::new();
+            for ((_, phrase), measured) in chosen.iter().zip(found) {
                 let Some(measured) = measured else { continue };
+                let n = places.len();
+                let place = *places.entry(self.phrases.place(&phrase.id)).or_insert(n);
                 let phase: Vec<f64> = phrase
                     .motion
                     .column(crate::motion::Channel::Phase.range().start)
@@ -306,7 +310,7 @@ impl Job<'_> {
                 for (i, (first_frame, window)) in firsts.zip(measured.windows).enumerate() {
                     let item = Item {
                         song: self.phrases.song(&phrase.id),
-                        phrase: *place,
+                        phrase: place,
                         first_frame,
                         split: MusicSplit::HeldOut,
                         measured: Arc::new(window),

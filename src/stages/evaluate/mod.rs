@@ -19,9 +19,10 @@ use anyhow::{Context as _, bail};
 use ndarray::Array2;
 
 use super::motion_source::generated_frames;
-use super::{Contract, Progress, Stage, Summary};
+use super::{Contract, Progress, Stage, Summary, learned};
 use crate::evaluation::holds_by_construction;
 use crate::evaluation::metrics::PhaseOrigin;
+use crate::generation::LearnedFrom;
 use crate::motion::postprocess::PostProcessConfig;
 use crate::report::{self, Report};
 use crate::store::tables::{self, GenerationRow, SanityCheckRow};
@@ -30,13 +31,17 @@ use crate::units::frames_to_s;
 
 use job::{Evaluated, Job, Motion, Stage as MadeAt};
 use measure::{MAX_KEPT_FRAMES, MeasuredMotion, stride_for};
-use motions::Phrases;
+use motions::{Phrases, is_held_out};
 pub use params::{Params, RequiredVerdict};
 use rows::{Known, Rows, RunName};
 use splits::MusicSplit;
+use truth::Truth;
 
 /// The name under which sanity checks are committed; numbers and verdicts have the stage's.
 const CHECKS: &str = "evaluate-checks";
+
+/// Songs whose activity is read; that of others counts as its mean.
+const MAX_HEARD_SONGS: usize = 500;
 
 /// The stage.
 pub struct Evaluate;
@@ -57,11 +62,12 @@ impl Stage for Evaluate {
         let store = Location::open(&params.store, &params.client.options())?;
         let against = params.against.as_deref().map(|run| page::Other::read(&store, run));
         let against = against.transpose()?;
-        let subject = Evaluand::read(&store, &params)?;
+        let mut subject = Evaluand::read(&store, &params)?;
         let data_hash = subject.phrases.truth_digest();
+        let run = subject.run.clone();
         let known = Known {
             store: &store,
-            run: &subject.run,
+            run: &run,
             params_hash: &params.digest(params.quick),
             whole_hash: &params.digest(false),
             input_hash: &subject.input_hash(&data_hash),
@@ -72,7 +78,7 @@ impl Stage for Evaluate {
             is_up_to_date = is_up_to_date && known.is_up_to_date(stage)?;
         }
         let found = if is_up_to_date {
-            Rows::read(&store, &subject.run, params.quick)?
+            Rows::read(&store, &run, params.quick)?
         } else {
             store.sweep()?;
             let found = subject.evaluate(&store, &params, &data_hash, progress)?;
@@ -101,7 +107,7 @@ impl Stage for Evaluate {
             store: store.to_string(),
             n_motions: subject.motions.len(),
             length_s: subject.length_s(),
-            run: subject.run,
+            run,
             is_up_to_date,
             has_metrics: !found.metrics.is_empty(),
             page: params.report,
@@ -137,12 +143,14 @@ impl Evaluand {
             let truth = with_motion.map(|row| row.phrase_id.clone());
             generations.iter().map(|row| row.phrase_id.clone()).chain(truth).collect()
         })?;
+        let (splits, notes) = splits_of(store, &phrases, &generations)?;
         let motions = generations
             .iter()
-            .map(|row| Motion {
+            .zip(splits)
+            .map(|(row, split)| Motion {
                 phrase_id: row.phrase_id.clone(),
                 sample: row.sample,
-                split: MusicSplit::Unknown,
+                split,
                 misses: [row.control_error_mm, row.control_error_deg],
             })
             .collect();
@@ -154,7 +162,7 @@ impl Evaluand {
             generations,
             postprocess: PostProcessConfig::default(),
             n_candidates: 1,
-            notes: Vec::new(),
+            notes,
         })
     }
 
@@ -188,7 +196,7 @@ impl Evaluand {
 
     /// Measures the motions, and all that they are compared with.
     fn evaluate(
-        &self,
+        &mut self,
         store: &Location,
         params: &Params,
         data_hash: &str,
@@ -198,6 +206,9 @@ impl Evaluand {
             true => None,
             false => truth::read(store, data_hash, params.threads, progress)?,
         };
+        if let Some(truth) = &truth {
+            self.hear(store, truth)?;
+        }
         let has_phase = self.phrases.has_beats();
         let holds = |check: &str| holds_by_construction(check, &self.postprocess, has_phase);
         let job = Job {
@@ -234,6 +245,23 @@ impl Evaluand {
             rows.add(name, found, &|song| self.phrases.song_name(song));
         }
         Ok(rows)
+    }
+
+    /// Reads the activity of the songs that were danced to, and of those with held-out real motion.
+    fn hear(&mut self, store: &Location, truth: &Truth) -> Result<(), StoreError> {
+        let held_out = truth.phrases.iter().filter(|phrase| is_held_out(phrase.split));
+        let ids = self.motions.iter().map(|motion| motion.phrase_id.as_str());
+        let songs = self.phrases.songs_of(ids.chain(held_out.map(|phrase| phrase.id.as_str())));
+        let songs: BTreeSet<String> = songs.into_iter().take(MAX_HEARD_SONGS).collect();
+        let mut heard: Vec<(String, Array2<f32>)> = Vec::new();
+        Snapshot::take(store, tables::features())?.visit_items(&songs, |id, features| {
+            heard.push((id.to_owned(), features));
+            Ok::<_, StoreError>(())
+        })?;
+        for (id, features) in heard {
+            self.phrases.add_features(&id, features.view());
+        }
+        Ok(())
     }
 
     /// Reads and measures the motions of a run.
@@ -277,6 +305,44 @@ impl Evaluand {
             is.into_iter().flatten().map(|is| Evaluated { is, decoded: None }).collect();
         Ok(evaluated)
     }
+}
+
+/// Returns what the model that made each motion had to do with its music, as the card says, and a note where that is
+/// not known.
+fn splits_of(
+    store: &Location,
+    phrases: &Phrases,
+    generations: &[GenerationRow],
+) -> anyhow::Result<(Vec<MusicSplit>, Vec<String>)> {
+    let mut models: BTreeMap<(&str, &str), Option<LearnedFrom>> = BTreeMap::new();
+    let mut notes = Vec::new();
+    for row in generations {
+        let key = (row.model.as_str(), row.weights.as_str());
+        if models.contains_key(&key) {
+            continue;
+        }
+        let learned_from = match learned::of_model(store, key.0, key.1)? {
+            Ok(learned_from) => Some(learned_from),
+            Err(why) => {
+                notes.push(format!(
+                    "Nobody knows which of these songs model {} learned from: {why}.",
+                    row.model
+                ));
+                None
+            }
+        };
+        models.insert(key, learned_from);
+    }
+    let split = |row: &GenerationRow| -> MusicSplit {
+        let learned_from = models.get(&(row.model.as_str(), row.weights.as_str()));
+        match (learned_from, phrases.row(&row.phrase_id)) {
+            (Some(Some(learned_from)), Some(phrase)) => {
+                learned_from.split_of(phrase.song_hash.as_deref(), &phrase.content_hash)
+            }
+            _ => MusicSplit::Unknown,
+        }
+    };
+    Ok((generations.iter().map(split).collect(), notes))
 }
 
 /// A required verdict that was not won, and how it ended.

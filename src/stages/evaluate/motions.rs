@@ -169,6 +169,11 @@ impl Phrases {
         of_song.get(first..first + n_frames).map(<[f64]>::to_vec)
     }
 
+    /// Returns the song of a phrase and the frame of it at which the phrase begins.
+    pub fn place(&self, phrase_id: &str) -> (usize, u64) {
+        (self.song(phrase_id), self.start_frames(phrase_id).round() as u64)
+    }
+
     /// Where in its song a phrase begins.
     fn start_frames(&self, phrase_id: &str) -> f64 {
         self.rows.get(phrase_id).and_then(|row| row.start_s).unwrap_or(0.0) * FPS

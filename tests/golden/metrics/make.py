@@ -28,7 +28,8 @@ from scipy import linalg
 from scipy.signal import argrelextrema
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
-from scipy.stats import wasserstein_distance
+from scipy.stats import t as student
+from scipy.stats import ttest_1samp, wasserstein_distance
 
 HERE = pathlib.Path(__file__).resolve().parent
 FPS = 30.0
@@ -186,7 +187,64 @@ def locking(fits, ratios):
         "r2": own,
         "wrong_mean": wrong.mean(),
         "effect": (own - wrong.mean()) / wrong.std(ddof=1),
-        "p": (1 + np.sum(wrong >= own)) / (1 + len(wrong)),
+        "wrong_share": (1 + np.sum(wrong >= own)) / (1 + len(wrong)),
+    }
+
+
+def rise(phi, activity, bar_s):
+    """h(φ, a) of four beats in a bar (docs/architecture.md), m."""
+    total = np.zeros_like(phi)
+    for n, amplitude in ((1, 0.03), (2, 0.02), (4, 0.012)):
+        hz = n / bar_s
+        gain = 0.0 if hz > 6.0 else min(1.0, (2.0 / hz) ** 2)
+        total += amplitude * gain * np.cos(2 * np.pi * n * phi)
+    return -(0.5 + activity) * total
+
+
+def coupling(passages, rotation):
+    """Regression of vertical velocity on the constructed one, with the norm of the bar where it is."""
+    v, u, norm_u = [], [], []
+    for y, bars, activity in passages:
+        bar_s = (len(bars) - 1) / FPS / (bars[-1] - bars[0])
+        v.append(np.diff(y) * FPS)
+        u.append(np.diff(rise(bars + rotation, activity, bar_s)) * FPS)
+        norm_u.append(np.diff(rise(bars, activity, bar_s)) * FPS)
+    v, u, norm_u = (np.concatenate(x) for x in (v, u, norm_u))
+    return np.sum((v - v.mean()) * u) / np.sum((norm_u - norm_u.mean()) ** 2)
+
+
+def posture(frames):
+    """What the bounds of windows are of, from positions and orientations."""
+    p, q = frames[:, 0:3], frames[:, 9:13] / norm(frames[:, 9:13])[:, None]
+    velocity = np.diff(p, axis=0) * FPS
+    jerk = np.diff(velocity, n=2, axis=0) * FPS**2
+    turn = 2 * np.arccos(np.clip(np.abs(np.sum(q[1:] * q[:-1], 1)), 0, 1)) * FPS
+    # The y of the body's up axis: 1 - 2 (x² + z²).
+    tilt = np.arccos(np.clip(1 - 2 * (q[:, 1] ** 2 + q[:, 3] ** 2), -1, 1))
+    return {
+        "speed_m_s": norm(velocity).max(),
+        "turn_rate_rad_s": turn.max(),
+        "tilt_rad": tilt.mean(),
+        "lowest_m": p[:, 1].min(),
+        "highest_m": p[:, 1].max(),
+        "turning_rad_s": turn.mean(),
+        "jerk_m_s3": norm(jerk).mean(),
+        "axis_speed_m_s": np.sqrt(np.mean(velocity**2, 0)),
+    }
+
+
+def window_range(postures):
+    def at(percent, key):
+        return np.percentile([window[key] for window in postures], percent)
+
+    return {
+        "n_windows": len(postures),
+        "speed_m_s": at(99.5, "speed_m_s"),
+        "turn_rate_rad_s": at(99.5, "turn_rate_rad_s"),
+        "tilt_rad": at(99.5, "tilt_rad"),
+        "height_m": [at(0.5, "lowest_m"), at(99.5, "highest_m")],
+        "turning_rad_s": at(99.5, "turning_rad_s"),
+        "jerk_m_s3": [at(0.5, "jerk_m_s3"), at(99.5, "jerk_m_s3")],
     }
 
 
@@ -450,21 +508,41 @@ def control(rng, motions):
     }
 
 
+def wilson(p, n, z):
+    centre = (p + z**2 / (2 * n)) / (1 + z**2 / n)
+    wide = z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
+    return [p, centre - wide, centre + wide]
+
+
 def intervals(rng):
     values = np.round(rng.gamma(2.0, 1.0, 23), DIGITS)
+    clusters = np.array([0, 0, 0, 0, 1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 4, 4, 4, 4, 4, 4, 1, 1, 3])
     n = len(values)
-    half = 1.96 * values.std(ddof=1) / np.sqrt(n)
-    draws = SplitMix64(77)
-    medians = [np.median(values[[draws.below(n) for _ in range(n)]]) for _ in range(101)]
-    median, spread = np.median(values), 1.96 * np.std(medians, ddof=1)
-    p, count, z = 17 / 23, 23, 1.96
-    centre = (p + z**2 / (2 * count)) / (1 + z**2 / count)
-    wide = z * np.sqrt(p * (1 - p) / count + z**2 / (4 * count**2)) / (1 + z**2 / count)
+    half = student.ppf(0.975, n - 1) * values.std(ddof=1) / np.sqrt(n)
+    sums = np.array([np.sum(values[clusters == g] - values.mean()) for g in range(5)])
+    clustered = student.ppf(0.975, 4) * np.sqrt(5 / 4 * np.sum(sums**2)) / n
+    passed = values < 2.0
+    share = passed.mean()
+    sums = np.array([np.sum(passed[clusters == g] - share) for g in range(5)])
+    variance = 5 / 4 * np.sum(sums**2) / n**2
+    effective = min(n, max(1.0, share * (1 - share) / variance))
+
+    def spread(kept):
+        pairs = np.abs(kept[:, None] - kept[None, :])
+        return np.sum(pairs) / (len(kept) * (len(kept) - 1))
+
+    whole = spread(values)
+    pseudo = np.array([5 * whole - 4 * spread(values[clusters != g]) for g in range(5)])
+    wide = student.ppf(0.975, 4) * pseudo.std(ddof=1) / np.sqrt(5)
     return {
         "values": values,
+        "clusters": clusters,
         "mean": [values.mean(), values.mean() - half, values.mean() + half],
-        "bootstrap_of_median": [median, median - spread, median + spread],
-        "share": [p, centre - wide, centre + wide],
+        "clustered": [values.mean(), values.mean() - clustered, values.mean() + clustered],
+        "share": wilson(17 / 23, 23, 1.96),
+        "clustered_share": wilson(share, effective, student.ppf(0.975, 4)),
+        "jackknife_of_pairs": [pseudo.mean(), pseudo.mean() - wide, pseudo.mean() + wide],
+        "p_greater": ttest_1samp(values[:7] - 1.5, 0.0, alternative="greater").pvalue,
     }
 
 
@@ -528,6 +606,12 @@ def main():
         fits.append((frames[:, 4], bars))
     mistimed = [(signal, bars * 0.87) for signal, bars in fits]
     together = [tuple(np.concatenate(parts) for parts in zip(*fits[:2])), fits[2]]
+    passages = []
+    for row, frames in zip(rows, motions):
+        t = np.arange(len(frames))
+        bars = (t + row["first_frame"]) / row["bar_frames"]
+        passages.append((frames[:, 1], bars, 0.5 + 0.4 * np.sin(0.05 * t)))
+    postures = [posture(frames) for frames in motions]
     everything = np.concatenate(motions)
     speeds, rates = norm(everything[:, 3:6]), norm(everything[:, 13:16])
     result = {
@@ -543,6 +627,9 @@ def main():
             "together": locking(together, ratios),
             "mistimed": locking(mistimed, ratios),
         },
+        "coupling": [[rotation, coupling(passages, rotation)] for rotation in (0.0, 0.1, 0.25, 0.7)],
+        "postures": postures,
+        "window_range": window_range(postures),
         "channels": [
             wasserstein_distance(motions[1][:, i], motions[0][:, i]) / motions[0][:, i].std()
             for i in range(25)
