@@ -5,7 +5,7 @@ use super::model_files::{folder_of, is_model_name};
 use super::train::session::{Looker, MachineParams, read_phrases};
 use super::trained::{Trained, Tuned};
 use super::{Progress, Stage as _, finetune::Finetune, train::Train};
-use crate::generation::{CardError, LearnedFrom, ModelCard, Use, file_names};
+use crate::generation::{CardError, LearnedFrom, ModelCard, Purpose, file_names};
 use crate::store::{Location, Patience, StoreError};
 use crate::training::{Dataset, Split};
 
@@ -17,12 +17,12 @@ pub fn learned_path(run: &str, command: &str) -> String {
 /// Lists what is learned from a dataset: phrases of the training and of the validation split.
 fn of_dataset(dataset: &Dataset) -> LearnedFrom {
     let used = dataset.phrases().iter().filter_map(|phrase| {
-        let used_for = match phrase.split {
-            Split::Train => Use::Training,
-            Split::Validation => Use::Validation,
+        let purpose = match phrase.split {
+            Split::Train => Purpose::Training,
+            Split::Validation => Purpose::Validation,
             Split::Test => return None,
         };
-        Some((used_for, phrase.song_hash.as_deref(), &*phrase.content_hash))
+        Some((purpose, phrase.song_hash.as_deref(), &*phrase.content_hash))
     });
     LearnedFrom::new(dataset.fingerprint(), used)
 }
