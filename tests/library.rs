@@ -31,12 +31,12 @@ fn library_command(store: &Path, more: &[impl AsRef<OsStr>]) -> Command {
     command
 }
 
-fn library(store: &Path, more: &[impl AsRef<OsStr>]) -> Output {
+pub fn library(store: &Path, more: &[impl AsRef<OsStr>]) -> Output {
     finish(&mut library_command(store, more))
 }
 
 /// Returns the flags that name folders of songs and captures, and others.
-fn from(songs: &Path, captures: &Path, more: &[&str]) -> Vec<std::ffi::OsString> {
+pub fn from(songs: &Path, captures: &Path, more: &[&str]) -> Vec<std::ffi::OsString> {
     let mut flags = vec!["--songs".into(), songs.into(), "--captures".into(), captures.into()];
     flags.extend(more.iter().map(std::convert::Into::into));
     flags
@@ -45,7 +45,7 @@ fn from(songs: &Path, captures: &Path, more: &[&str]) -> Vec<std::ffi::OsString>
 const RATE_HZ: u32 = 11_025;
 
 /// A song of clicks at `tempo_bpm`, the first at 0.25 s, louder and louder up to its middle.
-fn clicks(tempo_bpm: f64, duration_s: f64) -> Vec<u8> {
+pub fn clicks(tempo_bpm: f64, duration_s: f64) -> Vec<u8> {
     let n_samples = (duration_s * f64::from(RATE_HZ)) as usize;
     let sample = |i: usize| {
         let time_s = i as f64 / f64::from(RATE_HZ);
@@ -60,7 +60,7 @@ fn clicks(tempo_bpm: f64, duration_s: f64) -> Vec<u8> {
 }
 
 /// The beats of [`clicks`], numbered in bars.
-fn beat_list(tempo_bpm: f64, duration_s: f64, beats_per_bar: usize) -> String {
+pub fn beat_list(tempo_bpm: f64, duration_s: f64, beats_per_bar: usize) -> String {
     let n_beats = ((duration_s - 0.25) * tempo_bpm / 60.0) as usize;
     (0..n_beats)
         .map(|i| format!("{} {}\n", 0.25 + i as f64 * 60.0 / tempo_bpm, i % beats_per_bar + 1))
@@ -68,7 +68,7 @@ fn beat_list(tempo_bpm: f64, duration_s: f64, beats_per_bar: usize) -> String {
 }
 
 /// Writes songs: a waltz and a march with their beats, and one whose beats have to be found.
-fn write_songs(dir: &Dir) -> PathBuf {
+pub fn write_songs(dir: &Dir) -> PathBuf {
     dir.write("songs/a waltz.wav", clicks(141.3, 9.0));
     dir.write("songs/a waltz.beats.txt", beat_list(141.3, 9.0, 3));
     dir.write("songs/marches/one.wav", clicks(93.7, 11.0));
@@ -78,7 +78,7 @@ fn write_songs(dir: &Dir) -> PathBuf {
 }
 
 /// Writes three captures of the demo library, one of them a BVH file.
-fn write_captures(dir: &Dir) -> PathBuf {
+pub fn write_captures(dir: &Dir) -> PathBuf {
     for (from, to) in [
         ("cmu_01_03/trajectory.npy", "captures/cmu.npy"),
         ("humanoid3d_dance_b/trajectory.npy", "captures/more/dance.npy"),
@@ -91,7 +91,7 @@ fn write_captures(dir: &Dir) -> PathBuf {
 }
 
 /// Returns the constructed phrases of a store.
-fn constructed(store: &Path) -> BTreeMap<String, PhraseRow> {
+pub fn constructed(store: &Path) -> BTreeMap<String, PhraseRow> {
     phrases(store).into_iter().filter(|(_, row)| row.is_constructed()).collect()
 }
 

@@ -20,6 +20,7 @@ mod onnx;
 mod plot_features;
 mod plot_motion;
 mod plot_training;
+mod provenance;
 mod query_tables;
 mod rooms;
 mod schemas;

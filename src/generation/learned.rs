@@ -89,7 +89,7 @@ pub struct LearnedFrom {
 
 /// What a phrase was used for in training.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Use {
+pub enum Purpose {
     Training,
     Validation,
 }
@@ -122,14 +122,14 @@ impl LearnedFrom {
     /// Lists the phrases that a model learns from: what each is used for, its `song_hash` and its `content_hash`.
     pub fn new<'a>(
         data: &str,
-        phrases: impl IntoIterator<Item = (Use, Option<&'a str>, &'a str)>,
+        phrases: impl IntoIterator<Item = (Purpose, Option<&'a str>, &'a str)>,
     ) -> Self {
         let (trained_on, validated_on) = (MusicDigests::default(), MusicDigests::default());
         let mut new = Self { data: data.to_owned(), trained_on, validated_on, is_complete: true };
-        for (used_for, song_hash, content_hash) in phrases {
-            let digests = match used_for {
-                Use::Training => &mut new.trained_on,
-                Use::Validation => &mut new.validated_on,
+        for (purpose, song_hash, content_hash) in phrases {
+            let digests = match purpose {
+                Purpose::Training => &mut new.trained_on,
+                Purpose::Validation => &mut new.validated_on,
             };
             let song = song_hash.and_then(ShortDigest::of_digest);
             let phrase = ShortDigest::of_digest(content_hash);
@@ -187,7 +187,7 @@ mod tests {
         bytes.map(|byte| format!("{byte:02x}")).collect()
     }
 
-    fn learned(phrases: &[(Use, Option<&str>, &str)]) -> LearnedFrom {
+    fn learned(phrases: &[(Purpose, Option<&str>, &str)]) -> LearnedFrom {
         let hashed: Vec<_> =
             phrases.iter().map(|&(u, song, phrase)| (u, song.map(hash), hash(phrase))).collect();
         LearnedFrom::new("d", hashed.iter().map(|(u, s, p)| (*u, s.as_deref(), p.as_str())))
@@ -195,11 +195,11 @@ mod tests {
 
     fn known() -> LearnedFrom {
         learned(&[
-            (Use::Training, Some("song a"), "a1"),
-            (Use::Training, Some("song a"), "a2"),
-            (Use::Training, Some("both"), "b1"),
-            (Use::Validation, Some("both"), "b2"),
-            (Use::Validation, Some("song v"), "v1"),
+            (Purpose::Training, Some("song a"), "a1"),
+            (Purpose::Training, Some("song a"), "a2"),
+            (Purpose::Training, Some("both"), "b1"),
+            (Purpose::Validation, Some("both"), "b2"),
+            (Purpose::Validation, Some("song v"), "v1"),
         ])
     }
 
@@ -232,19 +232,21 @@ mod tests {
 
     #[test]
     fn a_list_with_gaps_holds_nothing_out() {
-        let gap = learned(&[(Use::Training, None, "a1"), (Use::Training, Some("song b"), "b1")]);
+        let gap =
+            learned(&[(Purpose::Training, None, "a1"), (Purpose::Training, Some("song b"), "b1")]);
         assert!(!gap.is_complete);
         assert_eq!(split(&gap, Some("song n"), "new"), "unknown");
         assert_eq!(split(&gap, Some("song b"), "new"), "trained_on");
         assert_eq!(split(&gap, Some("song n"), "a1"), "trained_on");
         // A gap of the validation is one, too.
-        let gap = learned(&[(Use::Training, Some("song a"), "a1"), (Use::Validation, None, "v")]);
+        let gap =
+            learned(&[(Purpose::Training, Some("song a"), "a1"), (Purpose::Validation, None, "v")]);
         assert_eq!(split(&gap, Some("song n"), "new"), "unknown");
         // Who names nothing says nothing.
         assert_eq!(split(&learned(&[]), Some("song n"), "new"), "unknown");
         // Two courses of training: a gap of either is one of both, another look at the same phrases fills it.
-        let full = learned(&[(Use::Training, Some("song a"), "a1")]);
-        let gap = learned(&[(Use::Training, None, "a1")]);
+        let full = learned(&[(Purpose::Training, Some("song a"), "a1")]);
+        let gap = learned(&[(Purpose::Training, None, "a1")]);
         assert!(!full.clone().and(gap.clone()).is_complete);
         assert!(!gap.clone().and(full.clone()).is_complete);
         assert_eq!(gap.refreshed(full.clone()), full);

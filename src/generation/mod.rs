@@ -25,7 +25,7 @@ pub use card::{
 pub use control::{Constraints, ControlError, Miss, REACH_FRAMES, Wanted, continuing, facing};
 pub use eager::EagerEngine;
 pub use engine::{Engine, EngineError, Inputs};
-pub use learned::{LearnedFrom, MusicDigests, MusicSplit, ShortDigest, Use};
+pub use learned::{LearnedFrom, MusicDigests, MusicSplit, Purpose, ShortDigest};
 pub use pool::Pool;
 pub use retrieval::Retrieval;
 pub use runtime::{OnnxEngine, SessionPlan};

@@ -5,7 +5,7 @@ use super::model_files::{folder_of, is_model_name};
 use super::train::session::{Looker, MachineParams, read_phrases};
 use super::trained::{Trained, Tuned};
 use super::{Progress, Stage as _, finetune::Finetune, train::Train};
-use crate::generation::{CardError, LearnedFrom, ModelCard, Use, file_names};
+use crate::generation::{CardError, LearnedFrom, ModelCard, Purpose, file_names};
 use crate::store::{Location, Patience, StoreError};
 use crate::training::{Dataset, Split};
 
@@ -17,12 +17,12 @@ pub fn learned_path(run: &str, command: &str) -> String {
 /// Lists what is learned from a dataset: phrases of the training and of the validation split.
 fn of_dataset(dataset: &Dataset) -> LearnedFrom {
     let used = dataset.phrases().iter().filter_map(|phrase| {
-        let used_for = match phrase.split {
-            Split::Train => Use::Training,
-            Split::Validation => Use::Validation,
+        let purpose = match phrase.split {
+            Split::Train => Purpose::Training,
+            Split::Validation => Purpose::Validation,
             Split::Test => return None,
         };
-        Some((used_for, phrase.song_hash.as_deref(), &*phrase.content_hash))
+        Some((purpose, phrase.song_hash.as_deref(), &*phrase.content_hash))
     });
     LearnedFrom::new(dataset.fingerprint(), used)
 }
@@ -88,7 +88,8 @@ pub fn of_run(
     Ok(by_finetune.map(|by_finetune| by_train.and(by_finetune)))
 }
 
-/// Returns what a command learned from the data with a fingerprint: from its list, else from the store.
+/// Returns what a command learned from the data with a fingerprint: from its list, and where that is missing or has
+/// gaps from the store.
 fn of_command(
     store: &Location,
     run: &str,
@@ -99,14 +100,21 @@ fn of_command(
 ) -> anyhow::Result<Option<LearnedFrom>> {
     let text = store.read_if_there(&learned_path(run, command))?;
     let listed: Option<LearnedFrom> = text.and_then(|text| serde_json::from_slice(&text).ok());
-    if let Some(listed) = listed.filter(|listed| listed.data == data) {
-        return Ok(Some(listed));
+    let listed = listed.filter(|listed| listed.data == data);
+    if listed.as_ref().is_some_and(|listed| listed.is_complete) {
+        return Ok(listed);
     }
     let watch = Looker(progress);
     let stage = super::export::Export::NAME;
     let phrases = read_phrases(store, stage, machine, max_train_phrases, progress, &watch)?;
-    let is_same = phrases.dataset.fingerprint() == data;
-    Ok(is_same.then(|| of_dataset(&phrases.dataset)))
+    if phrases.dataset.fingerprint() != data {
+        return Ok(listed);
+    }
+    let found = of_dataset(&phrases.dataset);
+    Ok(Some(match listed {
+        Some(listed) => listed.refreshed(found),
+        None => found,
+    }))
 }
 
 /// Why nobody knows what the model of a motion learned from.

@@ -187,9 +187,9 @@ fn is_settled(planned: &Planned, ledger: &Ledger, params_hash: &str, origin: &st
 /// did not write it.
 ///
 /// # Errors
-/// [`StoreError`] when a part of an older version cannot be read.
+/// [`StoreError`] when the commits cannot be read.
 fn unidentified(store: &Location) -> Result<BTreeSet<String>, StoreError> {
-    // Parts that this program does not read are not its to mend; it says so where they are wanted.
+    // Rows that cannot be read cannot be mended, and keep nobody from ingesting others.
     let (table, _) = Snapshot::take_known(store, PhraseRow::schema())?;
     let lacks = |row: &PhraseRow| {
         let has_music = row.audio_url.is_some() || row.features_url.is_some();
@@ -198,8 +198,10 @@ fn unidentified(store: &Location) -> Result<BTreeSet<String>, StoreError> {
     let mut found = BTreeSet::new();
     for i in 0..table.parts().len() {
         if table.parts()[i].part.schema_version < table.version() {
-            let rows = table.part(i).rows_where(lacks)?;
-            found.extend(rows.into_iter().map(|row| row.phrase_id));
+            match table.part(i).rows_where(lacks) {
+                Ok(rows) => found.extend(rows.into_iter().map(|row| row.phrase_id)),
+                Err(e) => tracing::warn!("{e}; the songs of its phrases stay unknown"),
+            }
         }
     }
     Ok(found)
