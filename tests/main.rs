@@ -1,5 +1,6 @@
 //! The one integration-test crate; every file of `tests/` is a module of it.
 
+mod adversaries;
 mod audio_header;
 mod diffusion;
 mod engine;

@@ -157,7 +157,7 @@ fn noise(n: usize, band_hz: [f64; 2], draws: &mut Draws) -> Vec<f64> {
 /// Shares of trials in which 4 songs × 8 motions that ignore the music have p < 0.01 and p < 0.1, by the known
 /// coupling and by consistency; each motion the best of `best_of`, by the score with which generate chooses.
 fn false_alarms(band_hz: [f64; 2], best_of: usize, n_trials: u64) -> [[f64; 2]; 2] {
-    const N_FRAMES: usize = 330;
+    const N_FRAMES: usize = 190;
     let trial = |seed: u64| -> [f64; 2] {
         let mut draws = Draws::new(seed);
         let (mut coupled, mut consistent) = (Vec::new(), Vec::new());
