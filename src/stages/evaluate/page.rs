@@ -41,6 +41,7 @@ impl Evaluated<'_> {
         let against = self.against.as_ref().map(|(metrics, there)| Against {
             run: there.run.clone(),
             metrics: shown(metrics),
+            paired: Vec::new(),
             settings: settings(there)
                 .into_iter()
                 .zip(settings(first))
@@ -51,6 +52,8 @@ impl Evaluated<'_> {
         Ok(Report {
             title: format!("Evaluation of {}", self.run),
             facts,
+            verdicts: Vec::new(),
+            notes: Vec::new(),
             checks: lines(self.checks),
             metrics: shown(self.metrics),
             worst: self.worst(n_worst)?,
@@ -139,6 +142,8 @@ fn lines(rows: &[SanityCheckRow]) -> Vec<CheckLine> {
         }
         let line = CheckLine {
             set: row.check_set.clone(),
+            stage: "final".to_owned(),
+            by_construction: false,
             check: row.check_name.clone(),
             threshold: row.threshold,
             n: 1,
