@@ -156,6 +156,15 @@ mod tests {
         }
     }
 
+    /// Writes the page of the example for a look at it:
+    /// `MOTIONGEN_PAGE=example.html cargo test --lib example_page -- --ignored`.
+    #[test]
+    #[ignore = "writes a file"]
+    fn example_page_to_look_at() {
+        let file = std::env::var_os("MOTIONGEN_PAGE").expect("MOTIONGEN_PAGE names a file");
+        std::fs::write(file, page(&example())).expect("written");
+    }
+
     #[test]
     fn nothing_is_asked_of_a_network_and_nothing_runs() {
         let page = page(&example());

@@ -253,8 +253,8 @@ fn fitted(text: &str, n: usize) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::Metric;
-    use super::super::example::{check, example, metric};
+    use super::super::example::{check, example, metric, test, verdict};
+    use super::super::{Metric, VerdictTest};
     use super::*;
 
     /// What stands over the rest where no verdict was measured.
@@ -268,33 +268,68 @@ open  Is it varied? not measured
     #[test]
     fn a_report_is_a_few_lines() {
         let wanted = "\
-sanity: reference 118 of 120 (98.3 %), strict at most 96 of 120 (80 %)
+LOST  Is it sound? (all songs of the run) 3 tests: 2 lost, 1 won
+      upright: 0.31 of the windows are as upright as training motion; held-out real motion has 0.97.
+      jerk: The jerk is 4.1 times that of real motion, at most 1.5 is asked.
+open  Is it like real motion? not measured
+open  Does it follow its music? (songs that nothing was learned from) 2 tests: 1 open, 1 won
+won   Is it varied? (songs that nothing was learned from) 1 test: 1 won
+note: Nobody knows which songs this model learned from.
+note: Each motion is the best of 8 candidates, chosen by R².
+
+sanity, raw motion: reference not measured, strict 31 of 120 (25.8 %)
+  strict velocity: 31 of 120 passed; the worst: 512, threshold 404
+sanity, final motion: reference 118 of 120 (98.3 %), strict 96 of 120 (80 %)
   reference phase: 118 of 120 passed; the worst: 512, threshold 404
   strict jerk: 96 of 120 passed; the worst: Mean jerk: 512
-  strict velocity: 119 of 120 passed; the worst: 512, threshold 404
 
-all music            generated  shuffled  mean motion  held out truth  ground truth
-pass_rate reference      0.983         –            –               –             –
+all music            generated  shuffled  mean motion  held out truth  training truth
+pass_rate reference      0.983         –            –               –               –
 
-unseen music         generated  shuffled  mean motion  held out truth  ground truth
-locking_r2 per_song     0.0990   0.00900            –               –             –
-locking_p per_song     0.00500     0.710            –               –             –
-fid_k axes                2.50         –         31.2           0.800             –
-fid_g                     1.50         –            –               –             –
-diversity axes            3.00         –            –               –             –
-jerk_mean, m/s³           61.2         –            –               –             –
+held-out music       generated  shuffled  mean motion  held out truth  training truth
+locking_r2 per_song     0.0990   0.00900            –               –               –
+locking_p per_song     0.00500     0.710            –               –               –
+fid_k axes                2.50         –         31.2           0.800               –
+fid_g                     1.50         –            –               –               –
+jerk_mean, m/s³           61.2         –            –               –               –
+diversity axes            3.00         –            –               –               –
 
-compared with before, 2 numbers: 1 better, 1 without an interval
+compared with before, 2 numbers: 1 better, 1 not paired
+  1 number is compared song by song; it is called better, worse or different only where p is below 0.05
   steps: 20 there, 50 here
-  better   fid_k axes, unseen music: 3.50 there, 2.50 here (-1.00)
+  better   fid_k axes, held-out music: 3.50 there, 2.50 here (-1.00, p 0.0120, 11 songs)
 ";
         assert_eq!(terminal(&example()), wanted);
     }
 
     #[test]
     fn an_empty_report_says_that_nothing_was_measured() {
-        let wanted = "sanity: reference not measured, strict not measured\n";
-        assert_eq!(terminal(&Report::default()), wanted);
+        let sanity = "sanity, final motion: reference not measured, strict not measured\n";
+        assert_eq!(terminal(&Report::default()), format!("{ALL_OPEN}\n{sanity}"));
+    }
+
+    #[test]
+    fn verdicts_are_in_ascii_and_a_long_sentence_goes_on_below() {
+        let message = "0.31 of the windows are as upright as those of training motion, where at least \
+                       0.92 is asked, which is 0.95 of the 0.97 that held-out real motion has.";
+        let lost = VerdictTest {
+            message: message.to_owned(),
+            ..test("share_upright", Outcome::Lost, 0.31, 0.92)
+        };
+        let report = Report {
+            verdicts: vec![verdict("sound", "unknown", Outcome::Lost, vec![lost])],
+            notes: vec!["x".repeat(200)],
+            ..Report::default()
+        };
+        let text = terminal(&report);
+        let wanted = "\
+LOST  Is it sound? (nobody knows whether these songs were learned from) 1 test: 1 lost
+      share upright: 0.31 of the windows are as upright as those of training motion, where at least 0.92 is asked, which
+        is 0.95 of the 0.97 that held-out real motion has.
+open  Is it like real motion? not measured
+";
+        assert!(text.starts_with(wanted) && wanted.is_ascii(), "{text}");
+        assert!(text.lines().all(|line| line.chars().count() <= 120), "{text}");
     }
 
     #[test]
@@ -311,6 +346,9 @@ compared with before, 2 numbers: 1 better, 1 without an interval
             ..Report::default()
         };
         report.metrics.push(metric("generated", "all", "diversity", &long, Some(1.0)));
+        let lost = VerdictTest { message: long.clone(), ..test(&long, Outcome::Lost, 1.0, 0.5) };
+        report.verdicts = vec![verdict(&long, &long, Outcome::Lost, vec![lost])];
+        report.notes = vec![long.clone()];
         report.against = Some(Against {
             run: long.clone(),
             settings: vec![(long.clone(), long.clone(), long)],
@@ -328,8 +366,13 @@ compared with before, 2 numbers: 1 better, 1 without an interval
     #[test]
     fn text_from_outside_commands_no_terminal() {
         let hostile = "\u{1b}[2J\nnext";
+        let lost =
+            VerdictTest { message: hostile.to_owned(), ..test(hostile, Outcome::Lost, 1.0, 0.5) };
         let report = Report {
+            verdicts: vec![verdict(hostile, hostile, Outcome::Lost, vec![lost])],
+            notes: vec![hostile.to_owned()],
             checks: vec![CheckLine {
+                stage: hostile.to_owned(),
                 worst_message: hostile.to_owned(),
                 ..check("strict", "jerk", 2, 1)
             }],
@@ -342,7 +385,7 @@ compared with before, 2 numbers: 1 better, 1 without an interval
         };
         let text = terminal(&report);
         assert!(!text.contains('\u{1b}') && !text.contains("\nnext"), "{text}");
-        assert_eq!(text.matches("\u{fffd}[2J\u{fffd}next").count(), 5, "{text}");
+        assert_eq!(text.matches("\u{fffd}[2J\u{fffd}next").count(), 11, "{text}");
     }
 
     #[test]
@@ -356,12 +399,12 @@ compared with before, 2 numbers: 1 better, 1 without an interval
             ],
             ..Report::default()
         };
-        let wanted = "\
-sanity: reference not measured, strict not measured
+        let wanted = "
+sanity, final motion: reference not measured, strict not measured
 
-unseen music   generated
-fid_k markers          –
+held-out music  generated
+fid_k markers           –
 ";
-        assert_eq!(terminal(&report), wanted);
+        assert_eq!(terminal(&report), format!("{ALL_OPEN}{wanted}"));
     }
 }
