@@ -1,10 +1,10 @@
 //! The section that compares this run with another one.
 
-use super::comparison::{Pair, Verdict, counts, pairs};
+use super::comparison::{Change, Pair, counts, family, pairs};
 use super::html::{Escaped, put};
 use super::names::{music, words};
 use super::numbers::{MISSING, difference, interval, value};
-use super::{Against, Metric, Report};
+use super::{Against, Metric, Report, ordered};
 
 /// Writes the section: settings that differ, numbers that differ, and folded away all others.
 pub(super) fn section(out: &mut String, report: &Report, against: &Against) {
@@ -16,10 +16,10 @@ pub(super) fn section(out: &mut String, report: &Report, against: &Against) {
         put!(out, "<p>No number was measured in both runs.</p>\n</section>\n");
         return;
     }
-    put!(out, "<p>{}.</p>\n", counts(&pairs));
+    put!(out, "<p>{}.</p>\n<p>{}.</p>\n", family(against), counts(&pairs));
     let (notable, others): (Vec<Pair>, Vec<Pair>) = pairs.into_iter().partition(Pair::is_notable);
     if notable.is_empty() {
-        put!(out, "<p>Nothing differs by more than the intervals.</p>\n");
+        put!(out, "<p>Nothing is shown to differ.</p>\n");
     } else {
         table(out, against, &notable);
     }
@@ -58,8 +58,8 @@ fn table(out: &mut String, against: &Against, pairs: &[Pair]) {
     put!(
         out,
         "<div class=\"scroll\"><table>\n<thead><tr><th scope=\"col\">metric</th><th scope=\"col\">{}</th>\
-         <th scope=\"col\">here</th><th scope=\"col\">difference</th><th scope=\"col\" \
-         class=\"text\">verdict</th></tr></thead>\n<tbody>\n",
+         <th scope=\"col\">here</th><th scope=\"col\">difference</th><th scope=\"col\">p (Holm)</th><th \
+         scope=\"col\">songs</th><th scope=\"col\" class=\"text\">change</th></tr></thead>\n<tbody>\n",
         Escaped(&against.run)
     );
     for pair in pairs {
@@ -86,21 +86,28 @@ fn row(out: &mut String, pair: &Pair) {
         }
         put!(out, "</td>");
     }
-    let class = match pair.verdict {
-        Verdict::Better => "text good",
-        Verdict::Worse => "text bad",
-        _ => "text",
+    put!(out, "<td>{}", pair.difference.map_or_else(|| MISSING.to_owned(), difference));
+    let ends = pair.paired.and_then(|paired| paired.ci_low.zip(paired.ci_high));
+    if let Some((low, high)) = ends.and_then(|(low, high)| ordered(low, high)) {
+        put!(out, " <span class=\"interval\">{}</span>", interval(low, high));
+    }
+    let n_songs = pair.paired.map_or_else(|| MISSING.to_owned(), |p| p.n_songs.to_string());
+    let class = match pair.change {
+        Change::Better => "word good",
+        Change::Worse => "word bad",
+        _ => "word",
     };
     put!(
         out,
-        "<td>{}</td><td class=\"{class}\">{}</td></tr>\n",
-        pair.difference.map_or_else(|| MISSING.to_owned(), difference),
-        pair.verdict.words()
+        "</td><td>{}</td><td>{n_songs}</td><td class=\"{class}\">{}</td></tr>\n",
+        value(pair.paired.and_then(|paired| paired.p_holm)),
+        pair.change.words()
     );
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::Paired;
     use super::super::example::{metric, with_interval};
     use super::*;
 
@@ -120,28 +127,48 @@ mod tests {
         let against = Against {
             run: "<old>".to_owned(),
             metrics: vec![of(2.5), jerk(Some(3.0))],
-            paired: Vec::new(),
+            paired: vec![Paired {
+                metric: "fid_k".to_owned(),
+                variant: "axes".to_owned(),
+                split: "all".to_owned(),
+                difference: -1.25,
+                ci_low: Some(-1.75),
+                ci_high: Some(-0.75),
+                p_holm: Some(0.015),
+                n_songs: 9,
+            }],
             settings: vec![("steps".to_owned(), "20".to_owned(), "<50>".to_owned())],
         };
-        let told = told(vec![of(1.5), jerk(None)], &against);
+        let told = told(vec![of(1.5), jerk(Some(4.0))], &against);
         let (seen, folded) = told.split_once("<details>").expect("details");
-        assert!(seen.contains("<h2>Compared with &lt;old&gt;</h2>"));
-        assert!(seen.contains("<p>2 numbers: 1 better, 1 not measured.</p>"));
-        assert!(seen.contains(
+        for wanted in [
+            "<h2>Compared with &lt;old&gt;</h2>",
+            "<p>1 number is compared song by song; it is called better, worse or different only where p is \
+             below 0.05.</p>\n<p>2 numbers: 1 better, 1 not paired.</p>",
             "<tr><th scope=\"row\">steps</th><td class=\"text\">20</td><td \
-             class=\"text\">&lt;50&gt;</td></tr>"
-        ));
-        assert!(seen.contains(
+             class=\"text\">&lt;50&gt;</td></tr>",
             "<tr><th scope=\"row\"><code>fid_k</code> axes <small>all music</small></th><td title=\"n = \
              100\">2.50 <span class=\"interval\">[2.50, 2.50]</span></td><td title=\"n = 100\">1.50 <span \
-             class=\"interval\">[1.50, 1.50]</span></td><td>-1.00</td><td class=\"text \
-             good\">better</td></tr>"
-        ));
+             class=\"interval\">[1.50, 1.50]</span></td><td>-1.25 <span class=\"interval\">[-1.8, \
+             -0.8]</span></td><td>0.0150</td><td>9</td><td class=\"word good\">better</td></tr>",
+        ] {
+            assert!(seen.contains(wanted), "{wanted} in {seen}");
+        }
         assert!(folded.contains("<summary>The others (1)</summary>"));
         assert!(folded.contains(
-            "<small>unseen music, m/s³</small></th><td title=\"n = 100\">3.00</td><td title=\"n = \
-             100\">–</td><td>–</td><td class=\"text\">not measured</td>"
+            "<small>held-out music, m/s³</small></th><td title=\"n = 100\">3.00</td><td title=\"n = \
+             100\">4.00</td><td>+1.00</td><td>–</td><td>–</td><td class=\"word\">not paired</td>"
         ));
+    }
+
+    #[test]
+    fn without_pairs_nothing_is_called_better() {
+        let of = |x: f64| with_interval(metric("generated", "all", "fid_k", "axes", Some(x)), x, x);
+        let against = Against { run: "b".to_owned(), metrics: vec![of(9.5)], ..Against::default() };
+        let told = told(vec![of(1.5)], &against);
+        assert!(told.contains("<p>No number is paired song by song, so that none is called"));
+        assert!(told.contains("<p>Nothing is shown to differ.</p>"));
+        assert!(!told.contains("good") && !told.contains(">better<"), "{told}");
     }
 
     #[test]

@@ -1,10 +1,10 @@
 //! Dots with intervals: the numbers of all subjects on one scale.
 
-use super::Metric;
 use super::html::{Escaped, put};
-use super::names::{self, GROUND_TRUTH, HELD_OUT_TRUTH, OWN};
+use super::names::{self, OWN, TRUTHS};
 use super::numbers::{interval, number};
 use super::rows::Row;
+use super::{BY_CONSTRUCTION, Metric};
 
 /// Sizes in CSS pixels.
 const WIDTH_PX: f64 = 190.0;
@@ -75,6 +75,7 @@ pub(super) fn told(metric: &Metric) -> String {
             format!("{subject}: {} {}", number(value), interval(low, high))
         }
         (Some(value), None) => format!("{subject}: {}", number(value)),
+        (None, _) if metric.is_by_construction() => format!("{subject}: {BY_CONSTRUCTION}"),
         (None, _) => format!("{subject}: too few (n = {})", metric.n),
     }
 }
@@ -122,7 +123,7 @@ pub(super) fn dots(out: &mut String, row: &Row) {
 
 /// Returns the number of real motion, preferably of music that was not learnt from.
 fn truth(row: &Row) -> Option<f64> {
-    [HELD_OUT_TRUTH, GROUND_TRUTH].into_iter().find_map(|subject| row.of(subject)?.finite())
+    TRUTHS.into_iter().find_map(|subject| row.of(subject)?.finite())
 }
 
 fn mark(out: &mut String, metric: &Metric, scale: Scale, top: f64) {
@@ -206,5 +207,7 @@ mod tests {
     fn what_is_too_little_is_told_so() {
         let metric = Metric { n: 12, ..metric("mean_motion", "all", "fid_k", "axes", None) };
         assert_eq!(told(&metric), "mean motion: too few (n = 12)");
+        let protocol = "the phase is relocked, by construction".to_owned();
+        assert_eq!(told(&Metric { protocol, ..metric }), "mean motion: by construction");
     }
 }

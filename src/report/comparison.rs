@@ -3,35 +3,49 @@
 use super::meaning::is_compat;
 use super::names::OWN;
 use super::rows::{Row, rows};
-use super::{Against, Better, Metric, Report};
+use super::{Against, Better, Metric, Paired, Report};
+
+/// A paired difference with a lower p, adjusted by Holm, is not put down to chance.
+pub(super) const SIGNIFICANT_P: f64 = 0.05;
 
 /// What two numbers say of each other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum Verdict {
+pub(super) enum Change {
     Worse,
     Better,
     Differs,
-    /// Both differ, and neither has an interval that could tell whether by chance.
-    NoInterval,
-    Within,
+    /// Paired, and chance may give such a difference.
+    NotShown,
+    /// Both differ, and no pairing by song tells whether by chance.
+    NotPaired,
     Equal,
     NotMeasured,
 }
 
-impl Verdict {
+impl Change {
+    const ALL: [Self; 7] = [
+        Self::Worse,
+        Self::Better,
+        Self::Differs,
+        Self::NotShown,
+        Self::NotPaired,
+        Self::Equal,
+        Self::NotMeasured,
+    ];
+
     pub const fn words(self) -> &'static str {
         match self {
             Self::Worse => "worse",
             Self::Better => "better",
             Self::Differs => "differs",
-            Self::NoInterval => "no interval",
-            Self::Within => "within the intervals",
+            Self::NotShown => "no difference shown",
+            Self::NotPaired => "not paired",
             Self::Equal => "equal",
             Self::NotMeasured => "not measured",
         }
     }
 
-    /// Returns whether the numbers differ by more than their intervals.
+    /// Returns whether the numbers are shown to differ.
     pub const fn is_notable(self) -> bool {
         matches!(self, Self::Worse | Self::Better | Self::Differs)
     }
@@ -42,9 +56,11 @@ impl Verdict {
 pub(super) struct Pair<'a> {
     pub there: &'a Metric,
     pub here: &'a Metric,
-    /// Here less there.
+    /// The difference song by song, of a number that has it.
+    pub paired: Option<&'a Paired>,
+    /// Here less there: the mean over songs where they are paired.
     pub difference: Option<f64>,
-    pub verdict: Verdict,
+    pub change: Change,
 }
 
 impl Pair<'_> {
@@ -55,7 +71,7 @@ impl Pair<'_> {
 
     /// Returns whether the pair should be seen first.
     pub fn is_notable(&self) -> bool {
-        self.verdict.is_notable() && self.is_counted()
+        self.change.is_notable() && self.is_counted()
     }
 }
 
@@ -70,63 +86,78 @@ pub(super) fn pairs<'a>(report: &'a Report, against: &'a Against) -> Vec<Pair<'a
             .find(|row| key(row) == [here.metric, here.variant, here.split, here.unit])?;
         found.cells[0]
     };
+    let paired = |here: &Metric| {
+        let is_it = |paired: &&Paired| {
+            paired.metric == here.metric
+                && paired.variant == here.variant
+                && paired.split == here.split
+        };
+        against.paired.iter().find(is_it).filter(|paired| paired.difference.is_finite())
+    };
     let mut pairs: Vec<Pair> = rows(&report.metrics, &[OWN])
         .iter()
-        .filter_map(|row| Some(pair(counterpart(row)?, row.cells[0]?)))
+        .filter_map(|row| Some((counterpart(row)?, row.cells[0]?)))
+        .map(|(there, here)| pair(there, here, paired(here)))
         .collect();
     pairs.sort_by_key(|pair| {
-        (!pair.is_notable(), if pair.is_notable() { pair.verdict } else { Verdict::Within })
+        (!pair.is_notable(), if pair.is_notable() { pair.change } else { Change::NotShown })
     });
     pairs
 }
 
-fn pair<'a>(there: &'a Metric, here: &'a Metric) -> Pair<'a> {
+fn pair<'a>(there: &'a Metric, here: &'a Metric, paired: Option<&'a Paired>) -> Pair<'a> {
     let (Some(a), Some(b)) = (there.finite(), here.finite()) else {
-        return Pair { there, here, difference: None, verdict: Verdict::NotMeasured };
+        let change = Change::NotMeasured;
+        return Pair { there, here, paired: None, difference: None, change };
     };
-    // A number without an interval is a point.
-    let (low_a, high_a) = there.interval().unwrap_or((a, a));
-    let (low_b, high_b) = here.interval().unwrap_or((b, b));
-    let has_interval = there.interval().is_some() || here.interval().is_some();
-    let verdict = if a == b {
-        Verdict::Equal
-    } else if !has_interval {
-        Verdict::NoInterval
-    } else if low_a <= high_b && low_b <= high_a {
-        Verdict::Within
-    } else {
-        match (here.better, b > a) {
-            (Better::Neither, _) => Verdict::Differs,
-            (Better::Higher, true) | (Better::Lower, false) => Verdict::Better,
-            (Better::Higher, false) | (Better::Lower, true) => Verdict::Worse,
-        }
+    let difference = paired.map_or(b - a, |paired| paired.difference);
+    let change = match paired {
+        _ if difference == 0.0 && a == b => Change::Equal,
+        None => Change::NotPaired,
+        Some(paired) if difference == 0.0 || !is_significant(paired) => Change::NotShown,
+        Some(_) => match (here.better, difference > 0.0) {
+            (Better::Neither, _) => Change::Differs,
+            (Better::Higher, true) | (Better::Lower, false) => Change::Better,
+            (Better::Higher, false) | (Better::Lower, true) => Change::Worse,
+        },
     };
-    Pair { there, here, difference: Some(b - a), verdict }
+    Pair { there, here, paired, difference: Some(difference), change }
 }
 
-/// Returns how many of the pairs that count have each verdict: `4 numbers: 1 worse, 3 better`.
+fn is_significant(paired: &Paired) -> bool {
+    paired.p_holm.is_some_and(|p| p < SIGNIFICANT_P)
+}
+
+/// Returns how many of the pairs that count changed in each way: `4 numbers: 1 worse, 3 better`.
 pub(super) fn counts(pairs: &[Pair]) -> String {
-    let all = [
-        Verdict::Worse,
-        Verdict::Better,
-        Verdict::Differs,
-        Verdict::NoInterval,
-        Verdict::Within,
-        Verdict::Equal,
-        Verdict::NotMeasured,
-    ];
-    let count = |verdict: Verdict| {
-        let is_it = |pair: &&Pair| pair.is_counted() && pair.verdict == verdict;
+    let count = |change: Change| {
+        let is_it = |pair: &&Pair| pair.is_counted() && pair.change == change;
         let n = pairs.iter().filter(is_it).count();
-        (n > 0).then(|| match verdict {
-            Verdict::Differs if n > 1 => format!("{n} differ"),
-            Verdict::NoInterval => format!("{n} without an interval"),
-            _ => format!("{n} {}", verdict.words()),
+        (n > 0).then(|| match change {
+            Change::Differs if n > 1 => format!("{n} differ"),
+            Change::NotShown => format!("{n} with {}", change.words()),
+            _ => format!("{n} {}", change.words()),
         })
     };
     let n = pairs.iter().filter(|pair| pair.is_counted()).count();
-    let told: Vec<String> = all.into_iter().filter_map(count).collect();
+    let told: Vec<String> = Change::ALL.into_iter().filter_map(count).collect();
     format!("{n} numbers: {}", told.join(", "))
+}
+
+/// Returns what the words of a comparison rest on.
+pub(super) fn family(against: &Against) -> String {
+    let n = against.paired.iter().filter(|paired| paired.p_holm.is_some()).count();
+    match n {
+        0 => "No number is paired song by song, so that none is called better or worse".to_owned(),
+        1 => format!(
+            "1 number is compared song by song; it is called better, worse or different only where p is \
+             below {SIGNIFICANT_P}"
+        ),
+        n => format!(
+            "{n} numbers are compared song by song, and p is Holm's over all of them; one is called better, \
+             worse or different only where p is below {SIGNIFICANT_P}"
+        ),
+    }
 }
 
 #[cfg(test)]
@@ -134,77 +165,107 @@ mod tests {
     use super::super::example::{metric, with_interval};
     use super::*;
 
-    fn of(name: &str, value: f64, interval: Option<(f64, f64)>) -> Metric {
-        let plain = metric("generated", "all", name, "", Some(value));
-        match interval {
-            Some((low, high)) => with_interval(plain, low, high),
-            None => plain,
+    fn of(name: &str, value: f64) -> Metric {
+        metric("generated", "all", name, "", Some(value))
+    }
+
+    fn by_song(name: &str, difference: f64, p_holm: Option<f64>) -> Paired {
+        Paired {
+            metric: name.to_owned(),
+            split: "all".to_owned(),
+            difference,
+            p_holm,
+            n_songs: 7,
+            ..Paired::default()
         }
     }
 
     #[test]
-    fn verdicts_follow_intervals_and_which_way_is_better() {
-        let near = |x: f64| Some((x - 0.1, x + 0.1));
+    fn a_change_needs_a_pair_that_chance_does_not_give() {
         let cases = [
-            ("pass_rate", (0.5, near(0.5)), (0.6, near(0.6)), Verdict::Within),
-            ("pass_rate", (0.5, near(0.5)), (0.8, near(0.8)), Verdict::Better),
-            ("pass_rate", (0.8, near(0.8)), (0.5, near(0.5)), Verdict::Worse),
-            ("fid_k", (0.8, near(0.8)), (0.5, near(0.5)), Verdict::Better),
-            ("fid_k", (0.5, near(0.5)), (0.8, near(0.8)), Verdict::Worse),
-            ("diversity", (0.5, near(0.5)), (0.8, near(0.8)), Verdict::Differs),
-            ("unheard_of", (0.5, near(0.5)), (0.8, near(0.8)), Verdict::Differs),
-            // A point in an interval, and one beyond it.
-            ("fid_k", (0.55, None), (0.5, near(0.5)), Verdict::Within),
-            ("fid_k", (0.65, None), (0.5, near(0.5)), Verdict::Better),
-            ("fid_k", (0.55, None), (0.5, None), Verdict::NoInterval),
-            ("fid_k", (0.5, None), (0.5, None), Verdict::Equal),
-            // Intervals that are none.
-            ("fid_k", (0.55, Some((1.0, 0.0))), (0.5, Some((f64::NAN, 1.0))), Verdict::NoInterval),
+            ("pass_rate", 0.3, Some(0.04), Change::Better),
+            ("pass_rate", -0.3, Some(0.04), Change::Worse),
+            ("fid_k", -0.3, Some(0.04), Change::Better),
+            ("fid_k", 0.3, Some(0.04), Change::Worse),
+            ("diversity", 0.3, Some(0.04), Change::Differs),
+            ("coupling_ratio", 0.3, Some(0.04), Change::Differs),
+            ("unheard_of", 0.3, Some(0.04), Change::Differs),
+            ("fid_k", -0.3, Some(0.05), Change::NotShown),
+            ("fid_k", -0.3, Some(f64::NAN), Change::NotShown),
+            ("fid_k", -0.3, None, Change::NotShown),
+            ("fid_k", 0.0, Some(0.01), Change::NotShown),
         ];
-        for (name, there, here, wanted) in cases {
-            let (there, here) = (of(name, there.0, there.1), of(name, here.0, here.1));
-            assert_eq!(pair(&there, &here).verdict, wanted, "{there:?} {here:?}");
+        for (name, difference, p, wanted) in cases {
+            let (there, here) = (of(name, 0.5), of(name, 0.9));
+            let paired = by_song(name, difference, p);
+            let found = pair(&there, &here, Some(&paired));
+            assert_eq!(found.change, wanted, "{name} {difference} {p:?}");
+            assert_eq!(found.difference, Some(difference));
         }
-        let (there, here) = (of("fid_k", 0.25, None), of("fid_k", 0.75, None));
-        assert_eq!(pair(&there, &here).difference, Some(0.5));
+        // However far apart the intervals are.
+        let (there, here) = (of("fid_k", 0.25), with_interval(of("fid_k", 0.75), 0.74, 0.76));
+        let apart = pair(&there, &here, None);
+        assert_eq!((apart.change, apart.difference), (Change::NotPaired, Some(0.5)));
+        assert_eq!(pair(&there, &there, None).change, Change::Equal);
         let none = Metric { value: None, ..here };
-        let found = pair(&there, &none);
-        assert_eq!((found.difference, found.verdict), (None, Verdict::NotMeasured));
+        let paired = by_song("fid_k", 0.5, Some(0.01));
+        let found = pair(&there, &none, Some(&paired));
+        assert_eq!((found.difference, found.change), (None, Change::NotMeasured));
     }
 
     #[test]
     fn only_what_both_have_is_compared_and_what_differs_comes_first() {
-        let near = |x: f64| Some((x - 0.01, x + 0.01));
         let other = |m: Metric, split: &str| Metric { split: split.to_owned(), ..m };
+        let compat = |value| Metric { variant: "axes_compat".to_owned(), ..of("fid_k", value) };
         let here = vec![
-            of("locking_r2", 0.5, near(0.5)),
-            of("fid_g", 0.5, near(0.5)),
-            of("pass_rate", 0.5, near(0.5)),
-            of("only_here", 0.5, None),
-            other(of("jerk_mean", 0.5, None), "held_out"),
-            Metric { variant: "axes_compat".to_owned(), ..of("fid_k", 0.5, near(0.5)) },
+            of("locking_r2", 0.5),
+            of("fid_g", 0.5),
+            of("pass_rate", 0.5),
+            of("only_here", 0.5),
+            other(of("jerk_mean", 0.5), "held_out"),
+            of("jerk_p95", 0.5),
+            compat(0.5),
             metric("shuffled", "all", "locking_r2", "", Some(0.5)),
         ];
         let there = vec![
-            of("locking_r2", 0.5, near(0.5)),
-            of("fid_g", 0.9, near(0.9)),
-            of("pass_rate", 0.9, near(0.9)),
-            of("only_there", 0.5, None),
-            other(of("jerk_mean", 0.5, None), "all"),
-            Metric { variant: "axes_compat".to_owned(), ..of("fid_k", 0.9, near(0.9)) },
+            of("locking_r2", 0.5),
+            of("fid_g", 0.9),
+            of("pass_rate", 0.9),
+            of("only_there", 0.5),
+            other(of("jerk_mean", 0.5), "all"),
+            of("jerk_p95", 0.9),
+            compat(0.9),
             metric("shuffled", "all", "locking_r2", "", Some(0.7)),
         ];
         let report = Report { metrics: here, ..Report::default() };
-        let against = Against { metrics: there, ..Against::default() };
+        let elsewhere = Paired { split: "held_out".to_owned(), ..by_song("jerk_p95", 1.0, None) };
+        let compat =
+            Paired { variant: "axes_compat".to_owned(), ..by_song("fid_k", -0.4, Some(0.01)) };
+        let paired = vec![
+            by_song("fid_g", -0.4, Some(0.01)),
+            by_song("pass_rate", -0.4, Some(0.02)),
+            Paired { p_holm: Some(0.01), ..elsewhere },
+            by_song("locking_r2", 0.0, None),
+            compat,
+        ];
+        let against = Against { metrics: there, paired, ..Against::default() };
         let pairs = pairs(&report, &against);
-        let found: Vec<_> = pairs.iter().map(|p| (p.here.metric.as_str(), p.verdict)).collect();
+        let found: Vec<_> = pairs.iter().map(|p| (p.here.metric.as_str(), p.change)).collect();
         let wanted = [
-            ("pass_rate", Verdict::Worse),
-            ("fid_g", Verdict::Better),
-            ("locking_r2", Verdict::Equal),
-            ("fid_k", Verdict::Better),
+            ("pass_rate", Change::Worse),
+            ("fid_g", Change::Better),
+            ("locking_r2", Change::Equal),
+            ("fid_k", Change::Better),
+            ("jerk_p95", Change::NotPaired),
         ];
         assert_eq!(found, wanted);
-        assert_eq!(counts(&pairs), "3 numbers: 1 worse, 1 better, 1 equal");
+        assert_eq!(counts(&pairs), "4 numbers: 1 worse, 1 better, 1 not paired, 1 equal");
+        assert_eq!(
+            family(&against),
+            "4 numbers are compared song by song, and p is Holm's over all of them; one is called better, \
+             worse or different only where p is below 0.05"
+        );
+        let none = Against::default();
+        assert!(family(&none).ends_with("so that none is called better or worse"));
     }
 }

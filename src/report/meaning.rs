@@ -4,7 +4,7 @@ use super::Better;
 use Better::{Higher, Lower, Neither};
 use Section::{Asked, Music, Other, Real, Sound, Varied};
 
-/// A question that numbers answer.
+/// A question that numbers answer, and that of the verdicts which rest on them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Section {
     Music,
@@ -21,7 +21,7 @@ impl Section {
 
     pub const fn heading(self) -> &'static str {
         match self {
-            Music => "Does it follow the music?",
+            Music => "Does it follow its music?",
             Real => "Is it like real motion?",
             Varied => "Is it varied?",
             Sound => "Is it sound?",
@@ -43,6 +43,10 @@ impl Section {
     }
 }
 
+/// Verdicts that are asked of every run, in the order in which they are shown among equals.
+pub(super) const VERDICTS: [(&str, Section); 4] =
+    [("sound", Sound), ("like_real", Real), ("follows_music", Music), ("varied", Varied)];
+
 /// What a metric means.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Meaning {
@@ -57,7 +61,7 @@ pub(super) struct Meaning {
 
 /// Every metric that is known, in the order in which they are shown.
 #[rustfmt::skip]
-const MEANINGS: [Meaning; 29] = [
+const MEANINGS: [Meaning; 39] = [
     of("locking_r2", Music, Higher,
         "Share of the vertical velocity that repeats with the bar (R²).",
         "1 is perfect; chance is not 0 but locking_wrong_r2."),
@@ -68,8 +72,15 @@ const MEANINGS: [Meaning; 29] = [
         "locking_r2 less its mean at wrong tempi, in standard deviations over these.",
         "0 by chance."),
     of("locking_p", Music, Lower,
-        "Share of the wrong tempi that do as well as the music’s own.",
-        "About 0.5 by chance; below 0.01 is no chance."),
+        "Probability of as strong a coupling to the bar if the motion had nothing to do with where the bar \
+         begins (bars rotated, song by song).",
+        "About 0.5 by chance; small alone is not enough, see what it is held against."),
+    of("coupling", Music, Neither,
+        "Coefficient, with its sign, of the vertical velocity on the coupling to the bar that is known.",
+        "0 by chance, 1 is as real motion, below 0 is against it."),
+    of("coupling_ratio", Music, Neither,
+        "Amplitude that is locked to the bar over that of held-out real motion.",
+        "1 is right; above is over-locking."),
     of("beat_alignment", Music, Neither,
         "How near beats of motion and of music are, from 0 to 1, for a width in seconds.",
         "Says little alone: chance is beat_alignment_chance."),
@@ -84,20 +95,26 @@ const MEANINGS: [Meaning; 29] = [
         "0 by chance."),
     of("phase_error", Music, Lower,
         "Distance of the bar phase that the motion says from the music’s, in bars.",
-        "1/4 by chance, 0 is perfect."),
+        "1/4 by chance, 0 is perfect; by construction where the phase was relocked."),
     of("phase_coherence", Music, Higher,
         "Whether both phases run at one tempo, whatever lies between them.",
-        "Near 0 by chance, 1 is perfect."),
+        "Near 0 by chance, 1 is perfect; by construction where the phase was relocked."),
     of("rayleigh", Music, Higher,
         "Whether beats of motion keep one place between the beats of music, whichever.",
         "√(π / 4n) by chance with n beats, 1 is perfect."),
     of("fid_k", Real, Lower,
-        "Fréchet distance of speeds and accelerations from the ground truth’s.",
+        "Fréchet distance of speeds and accelerations from real motion’s.",
         "As low as the held-out truth’s is perfect."),
     of("fid_g", Real, Lower,
-        "Fréchet distance of sixteen geometric features from the ground truth’s.",
+        "Fréchet distance of sixteen geometric features from real motion’s.",
         "As low as the held-out truth’s is perfect."),
     of("mean_speed", Real, Neither, "Mean speed of the body.", "Best near the truth’s."),
+    of("speed_ratio", Real, Neither,
+        "Speed along an axis over that of real motion.",
+        "1 is right; below is stiller, above is faster."),
+    of("jerk_ratio", Real, Neither,
+        "Jerk over that of real motion.",
+        "1 is right; above is rougher."),
     of("jerk_mean", Real, Neither,
         "Mean rate of change of the acceleration.",
         "Best near the truth’s; lower is stiller, higher is rougher."),
@@ -105,8 +122,11 @@ const MEANINGS: [Meaning; 29] = [
     of("log_dimensionless_jerk", Real, Neither,
         "Smoothness, whatever size and speed; higher is smoother.",
         "Best near the truth’s."),
+    of("feature_shift", Real, Lower,
+        "Root mean square of the shifts of mean features from real motion’s, in its standard deviations.",
+        "As low as the held-out truth’s is perfect."),
     of("channel_distance", Real, Lower,
-        "Wasserstein distance of a channel’s values from the ground truth’s, in its standard deviations.",
+        "Wasserstein distance of a channel’s values from real motion’s, in its standard deviations.",
         "As low as the held-out truth’s is perfect."),
     of("diversity", Varied, Neither,
         "Mean distance of the features of two motions.",
@@ -120,6 +140,21 @@ const MEANINGS: [Meaning; 29] = [
     of("pass_rate", Sound, Higher,
         "Share of the motions that pass every check of a set.",
         "1 is perfect; real motion need not be."),
+    of("window_pass_rate", Sound, Higher,
+        "Share of the windows that pass every check of a set.",
+        "1 is perfect; real motion need not be."),
+    of("share_upright", Sound, Higher,
+        "Share of the windows whose uprightness is within the range of training motion.",
+        "As high as the held-out truth’s is perfect."),
+    of("share_height", Sound, Higher,
+        "Share of the windows whose height is within the range of training motion.",
+        "As high as the held-out truth’s is perfect."),
+    of("share_turning", Sound, Higher,
+        "Share of the windows whose turning is within the range of training motion.",
+        "As high as the held-out truth’s is perfect."),
+    of("share_jerk", Sound, Higher,
+        "Share of the windows whose jerk is within the range of training motion.",
+        "As high as the held-out truth’s is perfect."),
     of("velocity_error", Sound, Lower,
         "How far velocity is from the change of position.",
         "0 is perfect."),
@@ -198,6 +233,16 @@ mod tests {
         let cases = [
             ("locking_p", Music, Lower),
             ("rayleigh", Music, Higher),
+            ("coupling", Music, Neither),
+            ("coupling_ratio", Music, Neither),
+            ("speed_ratio", Real, Neither),
+            ("jerk_ratio", Real, Neither),
+            ("feature_shift", Real, Lower),
+            ("window_pass_rate", Sound, Higher),
+            ("share_upright", Sound, Higher),
+            ("share_height", Sound, Higher),
+            ("share_turning", Sound, Higher),
+            ("share_jerk", Sound, Higher),
             ("fid_k", Real, Lower),
             ("diversity", Varied, Neither),
             ("pass_rate", Sound, Higher),

@@ -4,8 +4,7 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 
 use super::html::{Escaped, put};
-use super::summary::{Tone, in_short};
-use super::{Report, Worst, against, sanity, tables};
+use super::{Report, Worst, against, panel, sanity, tables};
 
 /// The page, with slots such as `{{title}}`.
 const TEMPLATE: &str = include_str!("page.html");
@@ -26,7 +25,7 @@ pub fn page(report: &Report) -> String {
             "title" => put!(out, "{}", Escaped(&report.title)),
             "style" => out.push_str(STYLE),
             "facts" => facts(&mut out, &report.facts),
-            "short" => short(&mut out, report),
+            "verdicts" => panel::section(&mut out, report),
             "links" => links(&mut out, report),
             "sanity" => sanity::section(&mut out, report),
             "metrics" => tables::metrics(&mut out, report),
@@ -54,23 +53,14 @@ fn facts(out: &mut String, facts: &[(String, String)]) {
     put!(out, "</dl>\n");
 }
 
-fn short(out: &mut String, report: &Report) {
-    for sentence in in_short(report) {
-        let class = match sentence.tone {
-            Tone::Good => " class=\"good\"",
-            Tone::Bad => " class=\"bad\"",
-            Tone::Open => " class=\"open\"",
-            Tone::Plain => "",
-        };
-        put!(out, "<p{class}><span>{}</span></p>\n", Escaped(&sentence.text));
-    }
-}
-
 /// Writes links to the sections that are there.
 fn links(out: &mut String, report: &Report) {
     let mut link = |id: &str, heading: &str| put!(out, "<a href=\"#{id}\">{heading}</a>\n");
     if !report.checks.is_empty() {
         link("sanity", "Sanity checks");
+    }
+    if !report.metrics.is_empty() {
+        link(tables::SUBJECTS_ID, tables::SUBJECTS_HEADING);
     }
     for section in tables::sections(report) {
         link(section.id(), section.heading());
@@ -92,7 +82,7 @@ fn worst(out: &mut String, motions: &[Worst]) {
         put!(out, "<article class=\"card\">\n<h3>{}</h3>\n", Escaped(&motion.name));
         facts(out, &motion.facts);
         if motion.failed.is_empty() {
-            put!(out, "<p class=\"good\">Passes every check.</p>\n");
+            put!(out, "<p>Passes every check.</p>\n");
         } else {
             put!(out, "<ul>\n");
             for message in &motion.failed {
@@ -122,7 +112,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::super::example::{example, metric};
-    use super::super::{Against, CheckLine, Metric};
+    use super::super::{Against, CheckLine, Metric, Outcome, Paired, Verdict, VerdictTest};
     use super::*;
 
     #[test]
@@ -134,27 +124,45 @@ mod tests {
             .map(|piece| piece.split_once("}}").expect("an end of the slot").0)
             .collect();
         let wanted = [
-            "title", "style", "title", "facts", "short", "links", "sanity", "metrics", "against",
-            "worst",
+            "title", "style", "title", "facts", "verdicts", "links", "sanity", "metrics",
+            "against", "worst",
         ];
         assert_eq!(slots, wanted);
         assert!(page.starts_with("<!DOCTYPE html>\n<html lang=\"en\">\n"));
         assert!(page.contains("<title>Evaluation of demo</title>"));
         assert!(page.contains("<h1>Evaluation of demo</h1>"));
         assert!(page.contains("<div><dt>motions</dt><dd>120</dd></div>"));
-        assert!(page.contains("<p class=\"good\"><span>Motion follows the bar of music that"));
+        let verdicts: Vec<&str> = page
+            .split("<article class=\"verdict ")
+            .skip(1)
+            .filter_map(|rest| rest.split('"').next())
+            .collect();
+        assert_eq!(verdicts, ["lost", "open", "open", "won"]);
+        assert!(page.find("class=\"notes\"") < page.find("<nav"));
         assert!(page.contains(STYLE) && !STYLE.contains("</style"));
-        let ids = ["sanity", "music", "real", "varied", "sound", "against", "worst"];
+        let ids = ["sanity", "subjects", "music", "real", "varied", "sound", "against", "worst"];
         for id in ids {
             assert_eq!(page.matches(&format!("<a href=\"#{id}\">")).count(), 1, "{id}");
             assert_eq!(page.matches(&format!("<section id=\"{id}\">")).count(), 1, "{id}");
         }
         assert_eq!(page.matches("<a ").count(), ids.len());
-        for element in ["section", "table", "tr", "th", "td", "svg", "g", "article", "div"] {
+        for element in [
+            "section", "table", "tr", "th", "td", "svg", "g", "article", "div", "details", "h2",
+            "small",
+        ] {
             let n_open = page.matches(&format!("<{element}>")).count()
                 + page.matches(&format!("<{element} ")).count();
             assert_eq!(n_open, page.matches(&format!("</{element}>")).count(), "{element}");
         }
+    }
+
+    /// Writes the page of the example for a look at it:
+    /// `MOTIONGEN_PAGE=example.html cargo test --lib example_page -- --ignored`.
+    #[test]
+    #[ignore = "writes a file"]
+    fn example_page_to_look_at() {
+        let file = std::env::var_os("MOTIONGEN_PAGE").expect("MOTIONGEN_PAGE names a file");
+        std::fs::write(file, page(&example())).expect("written");
     }
 
     #[test]
@@ -183,8 +191,25 @@ mod tests {
     fn an_empty_report_is_a_page() {
         let page = page(&Report::default());
         assert!(!page.contains("<table") && !page.contains("<a ") && !page.contains("{{"));
-        assert_eq!(page.matches("not measured").count(), 8);
+        assert_eq!(page.matches("Not measured.").count(), 4);
         assert_eq!(page.matches("<section").count(), 1);
+    }
+
+    fn test_of(text: &str) -> VerdictTest {
+        let own = || text.to_owned();
+        VerdictTest {
+            test: own(),
+            outcome: Outcome::Open,
+            statistic: own(),
+            value: Some(1.0),
+            ci_low: Some(0.5),
+            ci_high: Some(1.5),
+            unit: own(),
+            rule: own(),
+            limit: Some(0.5),
+            against: own(),
+            message: own(),
+        }
     }
 
     /// Returns a report of which every text is the same.
@@ -204,10 +229,21 @@ mod tests {
         Report {
             title: own(),
             facts: vec![(own(), own())],
-            verdicts: Vec::new(),
-            notes: Vec::new(),
+            verdicts: vec![Verdict {
+                verdict: own(),
+                split: own(),
+                outcome: Outcome::Lost,
+                tests: vec![
+                    VerdictTest { outcome: Outcome::Lost, ..test_of(text) },
+                    test_of(text),
+                    VerdictTest { message: String::new(), ..test_of(text) },
+                ],
+            }],
+            notes: vec![own()],
             checks: vec![CheckLine {
                 set: own(),
+                stage: own(),
+                by_construction: true,
                 check: own(),
                 worst_message: own(),
                 ..CheckLine::default()
@@ -219,7 +255,18 @@ mod tests {
                 failed: vec![own()],
                 svg: own(),
             }],
-            against: Some(Against { run: own(), metrics, paired: Vec::new(), settings: vec![(own(), own(), own())] }),
+            against: Some(Against {
+                run: own(),
+                paired: vec![Paired {
+                    metric: own(),
+                    variant: own(),
+                    split: own(),
+                    difference: 1.0,
+                    ..Paired::default()
+                }],
+                metrics,
+                settings: vec![(own(), own(), own())],
+            }),
         }
     }
 
@@ -235,6 +282,16 @@ mod tests {
         assert!(page.contains(&format!("<code>{told}</code>")));
         assert!(page.contains(&format!("; {told}\">1.00</td>")));
         assert!(page.contains(&format!("<li class=\"bad\">{told}</li>")));
+        // The verdicts, their tests, the caveats and the stage of a check.
+        assert!(
+            page.contains(&format!("</span> {told} <small>{told}</small></h2>\n<p>{told}</p>"))
+        );
+        assert!(page.contains(&format!("<tr><th scope=\"row\">{told} <small>{told}</small></th>")));
+        assert!(page.contains(&format!("<td>1.00 {told} <span class=\"interval\">")));
+        assert!(page.contains(&format!("<td>{told} 0.5 {told}</td>")));
+        assert!(page.contains(&format!("<td class=\"text\">{told} <small>{told}</small></td>")));
+        assert!(page.contains(&format!("<ul class=\"notes\">\n<li>{told}</li>")));
+        assert!(page.contains(&format!("<h3>{told} checks, {told} <small>")));
         assert!(page.contains(&format!("<img alt=\"Plot of {told}\"")));
     }
 

@@ -106,11 +106,6 @@ fn lend_truths(rows: &mut Vec<Row>) {
 
 /// Sorts by metric, variant and split; what is not known stays as it comes.
 fn sort(rows: &mut [Row], metrics: &[Metric]) {
-    let split = |split: &str| match split {
-        ALL => 0,
-        HELD_OUT => 1,
-        _ => 2,
-    };
     let first = |of: &dyn Fn(&Metric) -> bool| metrics.iter().position(of);
     rows.sort_by_cached_key(|row| {
         (
@@ -118,10 +113,13 @@ fn sort(rows: &mut [Row], metrics: &[Metric]) {
             first(&|metric| metric.metric == row.metric),
             row.is_compat(),
             first(&|metric| metric.metric == row.metric && metric.variant == row.variant),
-            split(row.split),
+            names::split_order(row.split),
         )
     });
 }
+
+/// Splits whose numbers are told rather than those of all music.
+const TELLING: [&str; 3] = [HELD_OUT, "validation", "unknown"];
 
 /// Returns the number of a subject, preferably of `split`.
 pub(super) fn find<'a>(
@@ -138,10 +136,13 @@ pub(super) fn find<'a>(
     of().find(|m| m.split == split).or_else(|| of().next())
 }
 
-/// Returns the split of which a number of what was generated is told first: music that the model did not
-/// learn from, where there is any.
-pub(super) fn telling_split<'a>(metrics: &'a [Metric], name: [&str; 2]) -> &'a str {
-    find(metrics, OWN, name, HELD_OUT).map_or(ALL, |metric| &metric.split)
+/// Returns the split of which a number of what was generated is told first: of those that there are, the
+/// music that the model learned least from.
+pub(super) fn telling_split<'a>(metrics: &'a [Metric], [metric, variant]: [&str; 2]) -> &'a str {
+    let is_it = |m: &&Metric| m.subject == OWN && m.metric == metric && m.variant == variant;
+    let of = || metrics.iter().filter(is_it).map(|metric| metric.split.as_str());
+    let first = TELLING.into_iter().find_map(|wanted| of().find(|split| *split == wanted));
+    first.or_else(|| of().next()).unwrap_or(ALL)
 }
 
 #[cfg(test)]
@@ -164,9 +165,9 @@ mod tests {
 
     #[test]
     fn subjects_are_in_order_and_unknown_ones_last() {
-        let metrics = ["visitor", "ground_truth", "shuffled", "generated", "guest", "shuffled"]
+        let metrics = ["visitor", "training_truth", "shuffled", "generated", "guest", "shuffled"]
             .map(|subject| metric(subject, "all", "fid_g", "", Some(1.0)));
-        let wanted = ["generated", "shuffled", "ground_truth", "visitor", "guest"];
+        let wanted = ["generated", "shuffled", "training_truth", "visitor", "guest"];
         assert_eq!(subjects(&metrics), wanted);
     }
 
@@ -202,16 +203,16 @@ mod tests {
             metric("generated", "held_out", "fid_g", "", Some(1.0)),
             metric("shuffled", "held_out", "fid_g", "", Some(1.0)),
             metric("held_out_truth", "held_out", "fid_g", "", Some(1.0)),
-            metric("ground_truth", "all", "fid_g", "", Some(1.0)),
+            metric("training_truth", "all", "fid_g", "", Some(1.0)),
             metric("held_out_truth", "held_out", "diversity", "axes", Some(1.0)),
-            metric("ground_truth", "all", "diversity", "axes", Some(1.0)),
+            metric("training_truth", "all", "diversity", "axes", Some(1.0)),
         ];
         let subjects = subjects(&metrics);
         let wanted = [
-            "fid_g  all | generated:all – held_out_truth:held_out ground_truth:all",
+            "fid_g  all | generated:all – held_out_truth:held_out training_truth:all",
             "fid_g  held_out | generated:held_out shuffled:held_out held_out_truth:held_out \
-             ground_truth:all",
-            "diversity axes all | – – – ground_truth:all",
+             training_truth:all",
+            "diversity axes all | – – – training_truth:all",
             "diversity axes held_out | – – held_out_truth:held_out –",
         ];
         assert_eq!(told(&rows(&metrics, &subjects)), wanted);
@@ -235,6 +236,11 @@ mod tests {
         assert_eq!(telling_split(&metrics, ["fid_g", ""]), "held_out");
         assert_eq!(telling_split(&metrics, ["diversity", "axes"]), "all");
         assert_eq!(telling_split(&metrics, ["fid_k", "axes"]), "all");
+        let of = |split: &str| metric("generated", split, "fid_g", "", Some(1.0));
+        assert_eq!(telling_split(&[of("all"), of("unknown"), of("validation")], ["fid_g", ""]), {
+            "validation"
+        });
+        assert_eq!(telling_split(&[of("trained_on")], ["fid_g", ""]), "trained_on");
         let found = find(&metrics, "generated", ["fid_g", ""], "all").map(|m| m.value);
         assert_eq!(found, Some(Some(1.0)));
     }

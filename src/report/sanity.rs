@@ -4,10 +4,16 @@ use super::html::{Escaped, put};
 use super::names::{ALL, OWN, words};
 use super::numbers::{number, percent, short};
 use super::rows::find;
-use super::{CheckLine, Report};
+use super::{BY_CONSTRUCTION, CheckLine, Report};
 
 /// The sets that are known, in the order in which they are shown.
 pub(super) const SETS: [&str; 2] = ["reference", "strict"];
+
+/// What is checked, in the order in which it is shown: a stage, and which motion that is.
+const STAGES: [(&str, &str); 2] =
+    [("raw", "decoded motion, before post-processing"), (FINAL, "motion after post-processing")];
+/// The stage of tables that do not name one.
+pub(super) const FINAL: &str = "final";
 
 /// Width of a bar for all motions, px.
 const BAR_PX: f64 = 90.0;
@@ -24,13 +30,18 @@ pub(super) enum Passed {
         n_passed: usize,
         n: usize,
     },
+    /// Post-processing makes every check of the set true, so that none tells anything.
+    ByConstruction,
     NotMeasured,
 }
 
 impl Passed {
-    /// Looks for the pass rate of all motions, then at the checks of the set.
-    pub fn of(report: &Report, set: &str) -> Self {
-        let rate = find(&report.metrics, OWN, ["pass_rate", set], ALL);
+    /// Looks for the pass rate of all motions, `strict_raw` of a set at a stage and `strict` of what it
+    /// became in the end, then at the checks of the set that could have failed.
+    pub fn of(report: &Report, stage: &str, set: &str) -> Self {
+        let of_stage = format!("{set}_{stage}");
+        let named = |variant: &str| find(&report.metrics, OWN, ["pass_rate", variant], ALL);
+        let rate = named(&of_stage).or_else(|| named(set).filter(|_| stage == FINAL));
         if let Some((rate, n)) = rate.and_then(|metric| Some((metric.finite()?, metric.n))) {
             let n_passed = (rate * n as f64).round();
             return Self::Exactly {
@@ -38,9 +49,13 @@ impl Passed {
                 n: usize::try_from(n).unwrap_or(0),
             };
         }
-        let lines = || report.checks.iter().filter(|line| line.set == set);
+        let is_of = |line: &&CheckLine| line.set == set && stage_of(line) == stage;
+        let lines = || report.checks.iter().filter(is_of).filter(|line| !line.by_construction);
         let Some(worst) = lines().min_by_key(|line| line.n_passed) else {
-            return Self::NotMeasured;
+            return match report.checks.iter().any(|line| is_of(&line)) {
+                true => Self::ByConstruction,
+                false => Self::NotMeasured,
+            };
         };
         let CheckLine { n_passed, n, .. } = *worst;
         match lines().filter(|line| line.n_passed < line.n).count() {
@@ -58,6 +73,7 @@ impl Passed {
         match self {
             Self::Exactly { n_passed, n } => of(n_passed, n),
             Self::AtMost { n_passed, n } => format!("at most {}", of(n_passed, n)),
+            Self::ByConstruction => format!("all are true {BY_CONSTRUCTION}"),
             Self::NotMeasured => "not measured".to_owned(),
         }
     }
@@ -75,34 +91,82 @@ pub(super) fn sets(checks: &[CheckLine]) -> Vec<&str> {
     found
 }
 
-/// Writes a section with a table for each set.
+/// Returns the stage of a check.
+pub(super) fn stage_of(line: &CheckLine) -> &str {
+    if line.stage.is_empty() { FINAL } else { &line.stage }
+}
+
+/// Returns the stages that checks are of: the known ones in their order, then others as they come.
+pub(super) fn stages(checks: &[CheckLine]) -> Vec<&str> {
+    let mut found: Vec<&str> = Vec::new();
+    for stage in checks.iter().map(stage_of) {
+        if !found.contains(&stage) {
+            found.push(stage);
+        }
+    }
+    let place = |stage: &str| STAGES.iter().position(|(name, _)| *name == stage);
+    found.sort_by_key(|stage| place(stage).unwrap_or(STAGES.len()));
+    found
+}
+
+/// Returns the checks of a set at a stage.
+pub(super) fn lines<'a>(
+    report: &'a Report,
+    stage: &'a str,
+    set: &'a str,
+) -> impl Iterator<Item = &'a CheckLine> {
+    report.checks.iter().filter(move |line| line.set == set && stage_of(line) == stage)
+}
+
+/// Writes a section with a table for each set, of each stage.
 pub(super) fn section(out: &mut String, report: &Report) {
     if report.checks.is_empty() {
         return;
     }
     put!(out, "<section id=\"sanity\">\n<h2>Sanity checks</h2>\n");
-    for set in sets(&report.checks) {
+    if report.checks.iter().any(|line| line.by_construction) {
         put!(
             out,
-            "<h3>{} checks</h3>\n<p>Motions that pass all of them: {}.</p>\n<div class=\"scroll\"><table \
-             class=\"checks\">\n<thead><tr><th scope=\"col\">check</th><th scope=\"col\">threshold</th><th \
-             scope=\"col\">passed</th><th scope=\"col\" class=\"text\">share</th><th scope=\"col\">worst</th><th \
-             scope=\"col\" class=\"text\">what the worst says</th></tr></thead>\n<tbody>\n",
-            Escaped(&capitalized(set)),
-            Escaped(&Passed::of(report, set).words())
+            "<p>What post-processing makes true is marked “{BY_CONSTRUCTION}” and counts in no pass \
+             rate.</p>\n"
         );
-        for line in report.checks.iter().filter(|line| line.set == set) {
-            row(out, line);
+    }
+    for stage in stages(&report.checks) {
+        let known = STAGES.iter().find(|(name, _)| *name == stage);
+        let motion = known.map_or("", |(_, motion)| motion);
+        for set in sets(&report.checks) {
+            if lines(report, stage, set).next().is_none() {
+                continue;
+            }
+            put!(
+                out,
+                "<h3>{} checks, {} <small>{motion}</small></h3>\n<p>Motions that pass all of them: \
+                 {}.</p>\n<div class=\"scroll\"><table class=\"checks\">\n<thead><tr><th \
+                 scope=\"col\">check</th><th scope=\"col\">threshold</th><th \
+                 scope=\"col\">passed</th><th scope=\"col\" class=\"text\">share</th><th \
+                 scope=\"col\">worst</th><th scope=\"col\" class=\"text\">what the worst \
+                 says</th></tr></thead>\n<tbody>\n",
+                Escaped(&capitalized(set)),
+                Escaped(&words(stage)),
+                Escaped(&Passed::of(report, stage, set).words())
+            );
+            for line in lines(report, stage, set) {
+                row(out, line);
+            }
+            put!(out, "</tbody></table></div>\n");
         }
-        put!(out, "</tbody></table></div>\n");
     }
     put!(out, "</section>\n");
 }
 
 fn row(out: &mut String, line: &CheckLine) {
     let CheckLine { check, threshold, n, n_passed, worst_value, worst_message, .. } = line;
-    let is_passed_by_all = n_passed == n;
-    let class = if is_passed_by_all { "good" } else { "bad" };
+    let class = match (n_passed == n, line.by_construction) {
+        // A failure of what should be true by construction is one all the same.
+        (false, _) => "bad",
+        (true, true) => "moot",
+        (true, false) => "good",
+    };
     put!(
         out,
         "<tr class=\"{class}\"><th scope=\"row\">{}</th><td>{}</td><td>{n_passed} of {n}</td><td \
@@ -110,7 +174,9 @@ fn row(out: &mut String, line: &CheckLine) {
         Escaped(&words(check)),
         short(*threshold)
     );
-    if *n > 0 {
+    if line.by_construction {
+        put!(out, "{BY_CONSTRUCTION}");
+    } else if *n > 0 {
         let share = *n_passed as f64 / *n as f64;
         put!(
             out,
@@ -144,7 +210,7 @@ mod tests {
     use super::*;
 
     fn passed(report: &Report, set: &str) -> String {
-        Passed::of(report, set).words()
+        Passed::of(report, "final", set).words()
     }
 
     #[test]
@@ -167,6 +233,70 @@ mod tests {
         };
         report.metrics = vec![of("held_out", 0.5, 4), of("all", 0.3, 10)];
         assert_eq!(passed(&report, "strict"), "3 of 10 (30 %)");
+        // The rate of what came out in the end says nothing of what was decoded.
+        assert_eq!(Passed::of(&report, "raw", "strict"), Passed::NotMeasured);
+        let rate = metric("generated", "all", "pass_rate", "strict_raw", Some(0.25));
+        report.metrics.push(Metric { n: 8, ..rate });
+        assert_eq!(Passed::of(&report, "raw", "strict").words(), "2 of 8 (25 %)");
+        assert_eq!(passed(&report, "strict"), "3 of 10 (30 %)");
+    }
+
+    #[test]
+    fn what_is_so_by_construction_counts_in_no_pass_rate_and_is_not_green() {
+        let given = |check: CheckLine| CheckLine { by_construction: true, ..check };
+        let mut report = Report {
+            checks: vec![
+                given(check("strict", "velocity", 10, 10)),
+                check("strict", "jerk", 10, 7),
+                given(check("reference", "phase", 10, 10)),
+            ],
+            ..Report::default()
+        };
+        assert_eq!(passed(&report, "strict"), "7 of 10 (70 %)");
+        assert_eq!(passed(&report, "reference"), "all are true by construction");
+        let mut out = String::new();
+        section(&mut out, &report);
+        assert!(out.contains("marked “by construction” and counts in no pass rate"));
+        assert!(out.contains(
+            "<tr class=\"moot\"><th scope=\"row\">velocity</th><td>404</td><td>10 of 10</td><td \
+             class=\"share\">by construction</td>"
+        ));
+        assert!(!out.contains("class=\"good\""), "{out}");
+        // Unless it fails.
+        report.checks[0].n_passed = 9;
+        out.clear();
+        section(&mut out, &report);
+        assert!(out.contains("<tr class=\"bad\"><th scope=\"row\">velocity</th>"), "{out}");
+        assert_eq!(passed(&report, "strict"), "7 of 10 (70 %)");
+    }
+
+    #[test]
+    fn stages_are_never_mixed() {
+        let at = |stage: &str, n_passed| CheckLine {
+            stage: stage.to_owned(),
+            ..check("strict", "jerk", 9, n_passed)
+        };
+        let checks = vec![at("", 9), at("draft", 1), at("raw", 2), at("final", 8)];
+        assert_eq!(stages(&checks), ["raw", "final", "draft"]);
+        let report = Report { checks, ..Report::default() };
+        let passed = ["raw", "final", "draft", "other"]
+            .map(|stage| Passed::of(&report, stage, "strict").words());
+        assert_eq!(
+            passed,
+            ["2 of 9 (22.2 %)", "8 of 9 (88.9 %)", "1 of 9 (11.1 %)", "not measured"]
+        );
+        let mut out = String::new();
+        section(&mut out, &report);
+        let headings: Vec<&str> =
+            out.split("<h3>").skip(1).filter_map(|rest| rest.split("</h3>").next()).collect();
+        assert_eq!(
+            headings,
+            [
+                "Strict checks, raw <small>decoded motion, before post-processing</small>",
+                "Strict checks, final <small>motion after post-processing</small>",
+                "Strict checks, draft <small></small>"
+            ]
+        );
     }
 
     #[test]
@@ -193,6 +323,7 @@ mod tests {
             n_passed: 6,
             worst_value: f64::INFINITY,
             worst_message: "<b>&\"'".to_owned(),
+            ..CheckLine::default()
         };
         let mut out = String::new();
         row(&mut out, &line);

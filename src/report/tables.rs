@@ -5,11 +5,15 @@ use super::meaning::{CHANNELS, Section, meaning_of};
 use super::names::{self, music, words};
 use super::numbers::{MISSING, interval, value};
 use super::rows::{Row, rows, subjects};
-use super::{Better, Metric, Report, channels, chart};
+use super::{BY_CONSTRUCTION, Better, Metric, Report, channels, chart};
 
 /// What is said over variants that reproduce a published formula.
 const COMPAT: &str = "These reproduce a published formula that has a defect, a misplaced parenthesis in \
                       its acceleration, and are only for comparison with published numbers.";
+
+/// The section that says what the numbers are held against, in links, and its heading.
+pub(super) const SUBJECTS_ID: &str = "subjects";
+pub(super) const SUBJECTS_HEADING: &str = "What it is held against";
 
 /// Returns the sections that have numbers.
 pub(super) fn sections(report: &Report) -> Vec<Section> {
@@ -46,17 +50,20 @@ pub(super) fn metrics(out: &mut String, report: &Report) {
 }
 
 fn legend(out: &mut String, subjects: &[&str]) {
-    put!(out, "<ul class=\"legend\">\n");
+    put!(
+        out,
+        "<section id=\"{SUBJECTS_ID}\">\n<h2>{SUBJECTS_HEADING}</h2>\n<dl class=\"legend\">\n"
+    );
     for subject in subjects {
         put!(
             out,
-            "<li><span class=\"key {}\">{}</span> {}</li>\n",
+            "<div><dt class=\"key {}\">{}</dt><dd>{}</dd></div>\n",
             chart::color_class(subject),
             Escaped(&words(subject)),
             names::meaning(subject)
         );
     }
-    put!(out, "</ul>\n");
+    put!(out, "</dl>\n</section>\n");
 }
 
 /// Writes rows as a table, those of a metric under what it means.
@@ -135,6 +142,14 @@ fn cell(out: &mut String, row: &Row, metric: Option<&Metric>) {
         put!(out, "<td title=\"not measured\">{missing}</td>");
         return;
     };
+    if metric.finite().is_none() && metric.is_by_construction() {
+        put!(
+            out,
+            "<td class=\"moot\" title=\"{}\">{BY_CONSTRUCTION}</td>",
+            Escaped(&tooltip(metric))
+        );
+        return;
+    }
     let class = if metric.subject == names::OWN { " class=\"own\"" } else { "" };
     put!(out, "<td{class} title=\"{}\">{}", Escaped(&tooltip(metric)), value(metric.value));
     if let Some((low, high)) = metric.interval() {
@@ -147,6 +162,7 @@ fn cell(out: &mut String, row: &Row, metric: Option<&Metric>) {
 fn tooltip(metric: &Metric) -> String {
     let counted = match metric.finite() {
         Some(_) => format!("n = {}", metric.n),
+        None if metric.is_by_construction() => return metric.protocol.clone(),
         None => format!("too few (n = {})", metric.n),
     };
     if metric.protocol.is_empty() { counted } else { format!("{counted}; {}", metric.protocol) }
@@ -200,14 +216,14 @@ mod tests {
             )
         };
         let few = Metric { n: 12, ..metric("mean_motion", "held_out", "fid_k", "axes", None) };
-        let truth = metric("ground_truth", "all", "fid_k", "axes", Some(0.01));
+        let truth = metric("training_truth", "all", "fid_k", "axes", Some(0.01));
         let told = told(vec![own, few, truth, metric("retrieval", "all", "fid_g", "", Some(1.0))]);
         for wanted in [
             "<td class=\"own\" title=\"n = 120; chunks of 75 &quot;frames&quot;\">0.123 \
              <span class=\"interval\">[0.10, 0.15]</span></td>",
             "<td title=\"not measured\">–</td><td title=\"too few (n = 12)\">–</td>",
             "<td title=\"n = 100\">0.0100</td>",
-            "<th scope=\"row\">axes <small>unseen music</small></th>",
+            "<th scope=\"row\">axes <small>held-out music</small></th>",
             "<code>fid_k</code> Fréchet distance of speeds and accelerations",
             "<em>↓ lower is better</em>",
         ] {
@@ -224,10 +240,10 @@ mod tests {
             metric("generated", "all", "control_position", "largest", Some(1.0)),
         ]);
         let headings: Vec<&str> =
-            told.split("<h2>").skip(1).filter_map(|rest| rest.split('<').next()).collect();
+            told.split("<h2>").skip(2).filter_map(|rest| rest.split('<').next()).collect();
         assert_eq!(
             headings,
-            ["Does it follow the music?", "Is it sound?", "Does it do what was asked?", "Other"]
+            ["Does it follow its music?", "Is it sound?", "Does it do what was asked?", "Other"]
         );
         let columns = |table: &str| -> Vec<String> {
             let (head, _) = table.split_once("</thead>").expect("a head");
@@ -241,6 +257,45 @@ mod tests {
         assert_eq!(tables[2], ["generated"]);
         assert_eq!(tables[3], all);
         assert!(told.contains("<code>new_metric</code>"));
+    }
+
+    #[test]
+    fn every_subject_is_explained() {
+        let told = told(vec![
+            metric("untrained", "all", "fid_g", "", Some(1.0)),
+            metric("ground_truth", "all", "fid_g", "", Some(1.0)),
+            metric("visitor", "all", "fid_g", "", Some(1.0)),
+        ]);
+        let (legend, _) = told.split_once("</dl>").expect("a legend");
+        assert_eq!(
+            legend,
+            "<section id=\"subjects\">\n<h2>What it is held against</h2>\n<dl class=\"legend\">\n<div><dt \
+             class=\"key of-untrained\">untrained</dt><dd>the run’s own network with its first weights: what \
+             sampler and post-processing give before anything is learned</dd></div>\n<div><dt class=\"key \
+             of-ground-truth\">ground truth</dt><dd>all real motion, as evaluations of release 0.1 have \
+             it</dd></div>\n<div><dt class=\"key of-others\">visitor</dt><dd></dd></div>\n"
+        );
+    }
+
+    #[test]
+    fn a_number_that_post_processing_makes_is_none() {
+        let relocked = Metric {
+            protocol: "the phase is relocked to the music, by <construction>".to_owned(),
+            ..metric("generated", "all", "phase_error", "", None)
+        };
+        let protocol = relocked.protocol.replace(['<', '>'], "");
+        let told = told(vec![
+            Metric { protocol, ..relocked.clone() },
+            metric("shuffled", "all", "phase_error", "", Some(0.25)),
+            Metric { subject: "visitor".to_owned(), ..relocked },
+        ]);
+        assert!(told.contains(
+            "<td class=\"moot\" title=\"the phase is relocked to the music, by construction\">by \
+             construction</td>"
+        ));
+        assert!(told.contains(
+            "title=\"too few (n = 100); the phase is relocked to the music, by &lt;construction&gt;\">–</td>"
+        ));
     }
 
     #[test]
