@@ -22,6 +22,17 @@ const PHRASES: [(&str, usize, bool); 5] = [
     ("gLO_3", 23, false),
 ];
 
+/// The tables that are empty until there are models.
+const OF_MODELS: [&str; 7] = [
+    "training_log",
+    "onnx_checks",
+    "generations",
+    "generated",
+    "decoded",
+    "sanity_checks",
+    "metrics",
+];
+
 fn write_phrase(dir: &Dir, i: usize, n_frames: usize) -> Vec<Frame> {
     let (id, _, has_audio) = PHRASES[i];
     let frames = coherent(n_frames, i as u32);
@@ -193,13 +204,11 @@ fn tables_counts_rows_bytes_and_parts_of_what_is_live() {
             String::from("table                    rows          bytes   parts  version\n");
         let of_extract = ["features", "extractions", "beats"].map(|name| (name, 0));
         let [phrases, motion, failures] = tables;
-        let of_models =
-            ["training_log", "onnx_checks", "generations", "generated", "sanity_checks", "metrics"];
-        let rest = [failures].into_iter().chain(of_models.map(|name| (name, 0)));
+        let rest = [failures].into_iter().chain(OF_MODELS.map(|name| (name, 0)));
         for (name, n_rows) in [phrases, motion].into_iter().chain(of_extract).chain(rest) {
             let live = live_files(&store, name);
             let n_bytes: u64 = live.iter().sum();
-            let version = if name == "phrases" { 2 } else { 1 };
+            let version = if ["phrases", "generations"].contains(&name) { 2 } else { 1 };
             let n_parts = live.len();
             text += &format!("{name:<16} {n_rows:>12} {n_bytes:>14} {n_parts:>7} {version:>8}\n");
         }
@@ -486,8 +495,6 @@ fn a_store_in_memory_is_asked_inside_the_process() {
     let infos = table_infos(&store, &options).expect("a store");
     let counts: Vec<_> = infos.iter().map(|i| (i.name, i.n_rows, i.n_parts)).collect();
     let empty = ["phrases", "motion", "features", "extractions", "beats"].map(|name| (name, 0, 0));
-    let of_models =
-        ["training_log", "onnx_checks", "generations", "generated", "sanity_checks", "metrics"];
-    let of_models = of_models.map(|name| (name, 0, 0));
+    let of_models = OF_MODELS.map(|name| (name, 0, 0));
     assert_eq!(counts, [&empty[..], &[("failures", 3, 2)], &of_models].concat());
 }

@@ -1,6 +1,6 @@
 //! SQL over the tables of a store: the one file that knows polars.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write;
 use std::str::FromStr;
 
@@ -202,20 +202,44 @@ fn scan(
     // Whole parts are scanned together; a part with superseded rows gets a filter of its own.
     let (whole, partial): (Vec<_>, Vec<_>) = live.iter().partition(|l| l.superseded.is_empty());
     let mut frames = Vec::new();
-    if !whole.is_empty() {
-        frames.push(scan_parts(store, &whole, options)?);
+    let mut by_version: BTreeMap<u32, Vec<&LivePart>> = BTreeMap::new();
+    for part in whole {
+        by_version.entry(part.part.schema_version).or_default().push(part);
+    }
+    for (version, parts) in by_version {
+        let frame = scan_parts(store, &parts, options)?;
+        frames.push(in_columns(frame, schema, version).map_err(failed)?);
     }
     for part in partial {
         let item = schema.item_column();
         let superseded = Series::new(item.into(), part.superseded.as_slice());
         let dead = col(item).is_in(lit(superseded).implode(false), false);
-        frames.push(scan_parts(store, &[part], options)?.filter(dead.not()));
+        let frame = scan_parts(store, &[part], options)?.filter(dead.not());
+        frames.push(in_columns(frame, schema, part.part.schema_version).map_err(failed)?);
     }
     match frames.len() {
         0 => Ok(empty(schema).lazy()),
         1 => Ok(frames.remove(0)),
         _ => concat(frames, UnionArgs::default()).map_err(failed),
     }
+}
+
+/// Returns the rows of parts of a version in the columns that the table has now; those that an older version
+/// did not have are null.
+fn in_columns(
+    mut frame: LazyFrame,
+    schema: &TableSchema,
+    version: u32,
+) -> Result<LazyFrame, PolarsError> {
+    if version == schema.version {
+        return Ok(frame);
+    }
+    let known = frame.collect_schema()?;
+    let column = |c: &super::schema::Column| match known.contains(&c.name) {
+        true => col(c.name.as_ref()),
+        false => lit(NULL).cast(data_type(c)).alias(c.name.as_ref()),
+    };
+    Ok(frame.select(schema.columns.iter().map(column).collect::<Vec<_>>()))
 }
 
 fn scan_parts(
@@ -249,21 +273,20 @@ fn scan_parts(
 }
 
 fn empty(schema: &TableSchema) -> DataFrame {
-    let columns = schema.columns.iter().map(|c| {
-        let data_type = match c.column_type {
-            ColumnType::Utf8 => DataType::String,
-            ColumnType::Boolean => DataType::Boolean,
-            ColumnType::Int32 => DataType::Int32,
-            ColumnType::Int64 => DataType::Int64,
-            ColumnType::Float32 => DataType::Float32,
-            ColumnType::Float64 => DataType::Float64,
-            ColumnType::TimestampUs => {
-                DataType::Datetime(TimeUnit::Microseconds, Some(TimeZone::UTC))
-            }
-        };
-        Field::new(c.name.as_ref().into(), data_type)
-    });
+    let columns = schema.columns.iter().map(|c| Field::new(c.name.as_ref().into(), data_type(c)));
     DataFrame::empty_with_schema(&columns.collect())
+}
+
+fn data_type(column: &super::schema::Column) -> DataType {
+    match column.column_type {
+        ColumnType::Utf8 => DataType::String,
+        ColumnType::Boolean => DataType::Boolean,
+        ColumnType::Int32 => DataType::Int32,
+        ColumnType::Int64 => DataType::Int64,
+        ColumnType::Float32 => DataType::Float32,
+        ColumnType::Float64 => DataType::Float64,
+        ColumnType::TimestampUs => DataType::Datetime(TimeUnit::Microseconds, Some(TimeZone::UTC)),
+    }
 }
 
 /// Says what is wrong with a statement in terms of the store's tables.

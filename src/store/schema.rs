@@ -15,6 +15,8 @@ pub struct TableSchema {
     pub name: &'static str,
     /// Raised when a column changes; parts of another version are refused, not guessed at.
     pub version: u32,
+    /// Oldest version whose parts are read as well: they lack nullable columns alone, which are null then.
+    pub oldest_version: u32,
     /// What one row is.
     pub description: &'static str,
     pub columns: Vec<Column>,
@@ -228,7 +230,8 @@ pub trait Row: Sized {
 macro_rules! rows {
     (
         $description:literal
-        $row:ident in $name:literal version $version:literal sorted by [$($sort:ident),+]
+        $row:ident in $name:literal version $version:literal $(reads $oldest:literal)?
+        sorted by [$($sort:ident),+]
         { $($field:ident: $type:ty, $unit:literal, $meaning:literal;)+ }
     ) => {
         #[doc = $description]
@@ -243,6 +246,8 @@ macro_rules! rows {
                 TableSchema {
                     name: $name,
                     version: $version,
+                    // The first that is written here.
+                    oldest_version: [$($oldest,)? $version][0],
                     description: $description,
                     columns: vec![$(Column {
                         name: stringify!($field).into(),
