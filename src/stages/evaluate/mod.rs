@@ -1,6 +1,16 @@
 //! `evaluate`: generated motion becomes numbers that can be queried, beside those of what it is compared
 //! with.
 
+#[cfg_attr(
+    not(test),
+    expect(dead_code, reason = "the evaluation that samples them is being written")
+)]
+mod baselines;
+#[cfg_attr(
+    not(test),
+    expect(dead_code, reason = "the evaluation that reads them is being written")
+)]
+mod foreign;
 mod measure;
 mod motions;
 mod page;

@@ -162,7 +162,7 @@ fn open_model(params: &Params, store: Option<&Location>) -> anyhow::Result<OpenM
 }
 
 /// Returns one digest for both networks of a model.
-fn weights_digest(card: &ModelCard) -> String {
+pub(in crate::stages) fn weights_digest(card: &ModelCard) -> String {
     let both = format!("{}\n{}\n", card.weights_sha256.unet, card.weights_sha256.decoder);
     sha256(both.as_bytes())
 }

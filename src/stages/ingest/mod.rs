@@ -13,6 +13,7 @@ use super::{ClientParams, Contract, Progress, Stage, Summary, all_threads};
 use crate::store::{Cache, Ledger, Location, Shard, Source, StoreError, digest};
 
 use super::failure::{Failure, write_failures};
+pub(in crate::stages) use layout::is_audio;
 pub use layout::{Layout, Plan, Planned, Role, plan};
 pub use phrase::{Rules, content_hash_of_audio};
 pub(in crate::stages) use phrase::{read_beats, read_bvh, read_trajectory};
