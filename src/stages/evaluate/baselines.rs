@@ -4,7 +4,7 @@
 //! Sampling takes minutes, so that what was sampled is kept in the store under a digest of everything that
 //! determines it: `baselines/<digest>.npy`.
 
-mod kept;
+mod cache;
 #[cfg(test)]
 mod tests;
 
@@ -195,12 +195,12 @@ pub fn sample(
     if model.card.unet.style_dim == 0 {
         settings.style = None;
     }
-    let digest = kept::digest_of(baseline, request, &settings);
-    if let Some(known) = kept::read(store, &digest, windows)? {
+    let digest = cache::digest_of(baseline, request, &settings);
+    if let Some(known) = cache::read(store, &digest, windows)? {
         return Ok(known);
     }
     let motions = sample_all(baseline, request, &settings, progress)?;
-    kept::write(store, &digest, &motions)?;
+    cache::write(store, &digest, &motions)?;
     Ok(motions)
 }
 

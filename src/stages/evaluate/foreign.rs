@@ -66,7 +66,7 @@ pub struct ForeignFile {
 
 /// What a file held, from which its 25 channels came.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Held {
+pub enum FileContent {
     /// All of them.
     Channels,
     /// Positions and orientations: the rest is derived.
@@ -75,7 +75,7 @@ pub enum Held {
     Capture,
 }
 
-impl Held {
+impl FileContent {
     /// Whether the motion has a phase of its own.
     pub const fn has_phase(self) -> bool {
         matches!(self, Self::Channels)
@@ -105,7 +105,7 @@ pub struct ForeignMotion {
     pub path: PathBuf,
     /// \[T, 25\], T ≥ 1
     pub frames: Array2<f32>,
-    pub held: Held,
+    pub content: FileContent,
     pub has_phase: bool,
     /// What is unusual of it and no reason to refuse it.
     pub note: Option<String>,
@@ -212,15 +212,15 @@ impl ForeignFile {
     /// One sentence that names the file, whatever its bytes are.
     pub fn read(&self) -> Result<ForeignMotion, Failure> {
         let place = self.path.display().to_string();
-        let (frames, held) = guarded(&place, || content::read(&self.path))?;
+        let (frames, content) = guarded(&place, || content::read(&self.path))?;
         let note = self.length_note(frames.nrows());
         Ok(ForeignMotion {
             phrase_id: self.phrase_id.clone(),
             sample: self.sample,
             path: self.path.clone(),
             frames,
-            held,
-            has_phase: held.has_phase(),
+            content,
+            has_phase: content.has_phase(),
             note,
         })
     }

@@ -92,7 +92,7 @@ impl Maker<'_> {
             bar_phase(&times_s, beats)
         });
         let priming = self.priming(music)?;
-        let mut best: Option<Kept> = None;
+        let mut best: Option<Candidate> = None;
         let mut rows = Vec::with_capacity(self.settings.best_of);
         for candidate in 0..self.settings.best_of {
             let begun = Instant::now();
@@ -142,10 +142,10 @@ impl Maker<'_> {
             // The first of equals, so that one candidate more changes nothing else.
             let value = score.total.unwrap_or(f64::NEG_INFINITY);
             if best.as_ref().is_none_or(|known| value > known.value) {
-                best = Some(Kept { value, candidate, frames, decoded });
+                best = Some(Candidate { value, candidate, frames, decoded });
             }
         }
-        let Kept { candidate, frames, decoded, .. } =
+        let Candidate { candidate, frames, decoded, .. } =
             best.expect("at least one candidate is sampled");
         rows[candidate].selected = true;
         Ok(Made { frames, decoded, rows, seconds: started.elapsed().as_secs_f64() })
@@ -252,7 +252,7 @@ impl Maker<'_> {
 }
 
 /// The best candidate so far.
-struct Kept {
+struct Candidate {
     value: f64,
     candidate: usize,
     frames: Array2<f32>,

@@ -301,9 +301,9 @@ fn what_was_sampled_is_read_again_and_what_is_broken_sampled_again() {
         windows: &windows,
         threads: NonZeroUsize::MIN,
     };
-    let digest = kept::digest_of(Baseline::Untrained, &request, &settings.0);
+    let digest = cache::digest_of(Baseline::Untrained, &request, &settings.0);
     bench.store.remove(&format!("baselines/{}.npy", &digest[..32])).expect("removed");
-    kept::write(&bench.store, &digest, &other).expect("written");
+    cache::write(&bench.store, &digest, &other).expect("written");
     assert_eq!(bench.sample(Baseline::Untrained, &windows), other);
 
     let mut flipped = bytes.clone();
@@ -335,7 +335,7 @@ fn a_digest_is_that_of_everything_that_determines_the_motion() {
             windows,
             threads: NonZeroUsize::MIN,
         };
-        kept::digest_of(baseline, &request, &settings.0)
+        cache::digest_of(baseline, &request, &settings.0)
     };
     let changed = |change: &dyn Fn(&mut MusicWindow)| {
         let mut windows = windows.clone();
@@ -370,7 +370,7 @@ fn a_digest_is_that_of_everything_that_determines_the_motion() {
             windows: &windows,
             threads: NonZeroUsize::MIN,
         };
-        kept::digest_of(baseline, &request, &settings.0)
+        cache::digest_of(baseline, &request, &settings.0)
     };
     assert_eq!(of_other(Baseline::Untrained), all[0]);
     assert_ne!(of_other(Baseline::NoMusic), all[1]);
@@ -435,42 +435,4 @@ fn windows_that_are_no_music_are_refused() {
     );
     assert_eq!(bench.sample(Baseline::NoMusic, &[]), []);
     assert!(bench.kept().is_empty());
-}
-
-#[test]
-#[ignore = "a measurement"]
-fn time_of_256_windows() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let mut model = model_in(folder.path(), crate::model::Preset::Small.config());
-    model.card.decoder = DecoderConfig::default();
-    model.card.window_frames = 120;
-    let windows: Vec<MusicWindow> = (0..256)
-        .map(|i| MusicWindow {
-            phrase_id: format!("p{i}"),
-            first_frame: 0,
-            features: music(i, 120),
-            phase: None,
-        })
-        .collect();
-    let mut row = row(None);
-    (row.sampler, row.n_steps, row.guidance) = ("DPM-Solver++".to_owned(), 10, 4.0);
-    let settings = RunSettings::of_run(&row, &model.card).expect("settings");
-    for n in [1, 2] {
-        let store = Location::local(&folder.path().join(format!("store{n}"))).expect("a store");
-        let request = Request {
-            store: &store,
-            model: &model,
-            settings: &settings,
-            seed: 0,
-            windows: &windows,
-            threads: NonZeroUsize::new(n).expect("one"),
-        };
-        let begun = std::time::Instant::now();
-        sample(Baseline::Untrained, &request, &Silent).expect("motions");
-        let took_s = begun.elapsed().as_secs_f64();
-        let begun = std::time::Instant::now();
-        sample(Baseline::Untrained, &request, &Silent).expect("motions");
-        let again_s = begun.elapsed().as_secs_f64();
-        std::fs::write(format!("/tmp/baselines_{n}"), format!("{took_s} {again_s}\n")).unwrap();
-    }
 }

@@ -4,14 +4,14 @@ use std::path::Path;
 
 use ndarray::{Array2, ArrayView2, s};
 
-use super::Held;
+use super::FileContent;
 use crate::motion::kinematics::frames_of;
 use crate::motion::npy::{self, NpyError};
 use crate::motion::quaternion::{Quaternion, make_sign_continuous, normalize};
 use crate::motion::{CHANNEL_NAMES, Channel, MOTION_DIM, Poses, exchange};
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::ingest::read_bvh;
-use crate::store::{LooseError, number_columns};
+use crate::store::{NumberColumnsError, number_columns};
 
 /// Numbers of a pose: position x, y, z and quaternion w, x, y, z.
 const POSE_DIM: usize = 7;
@@ -45,13 +45,13 @@ impl Format {
 ///
 /// # Errors
 /// One sentence that names the file.
-pub fn read(path: &Path) -> Result<(Array2<f32>, Held), Failure> {
+pub fn read(path: &Path) -> Result<(Array2<f32>, FileContent), Failure> {
     let place = path.display().to_string();
     let bytes = bytes_of(path, &place)?;
-    let (frames, held) = match Format::of(path) {
+    let (frames, content) = match Format::of(path) {
         Some(Format::Npy) => of_npy(&place, &bytes)?,
-        Some(Format::Csv) => (of_csv(&place, bytes)?, Held::Channels),
-        Some(Format::Bvh) => (read_bvh(&place, &bytes, None)?.into_array(), Held::Capture),
+        Some(Format::Csv) => (of_csv(&place, bytes)?, FileContent::Channels),
+        Some(Format::Bvh) => (read_bvh(&place, &bytes, None)?.into_array(), FileContent::Capture),
         Some(Format::Parquet) => of_parquet(&place, bytes)?,
         None => {
             let message =
@@ -63,7 +63,7 @@ pub fn read(path: &Path) -> Result<(Array2<f32>, Held), Failure> {
         let message = format!("{place}: has no frames; write it again");
         return Err(Failure::new(FailureKind::Shape, &place, message));
     }
-    Ok((frames, held))
+    Ok((frames, content))
 }
 
 fn bytes_of(path: &Path, place: &str) -> Result<Vec<u8>, Failure> {
@@ -92,7 +92,7 @@ fn bytes_of(path: &Path, place: &str) -> Result<Vec<u8>, Failure> {
     Ok(bytes)
 }
 
-fn of_npy(place: &str, bytes: &[u8]) -> Result<(Array2<f32>, Held), Failure> {
+fn of_npy(place: &str, bytes: &[u8]) -> Result<(Array2<f32>, FileContent), Failure> {
     let array = npy::read_f32(bytes).map_err(|e: NpyError| Failure::of(place, e.kind(), &e))?;
     let refused = || {
         let is_turned = matches!(array.shape[..], [MOTION_DIM | POSE_DIM, n] if n > 0);
@@ -111,8 +111,8 @@ fn of_npy(place: &str, bytes: &[u8]) -> Result<(Array2<f32>, Held), Failure> {
     let values = Array2::from_shape_vec((n_frames, n_channels), array.values)
         .map_err(|e| Failure::new(FailureKind::Shape, place, format!("{place}: {e}")))?;
     Ok(match n_channels {
-        MOTION_DIM => (values, Held::Channels),
-        _ => (of_poses(values.view()), Held::Poses),
+        MOTION_DIM => (values, FileContent::Channels),
+        _ => (of_poses(values.view()), FileContent::Poses),
     })
 }
 
@@ -125,13 +125,14 @@ fn of_csv(place: &str, bytes: Vec<u8>) -> Result<Array2<f32>, Failure> {
     exchange::read_csv(&text).map_err(|e| refused(&e))
 }
 
-fn of_parquet(place: &str, bytes: Vec<u8>) -> Result<(Array2<f32>, Held), Failure> {
+fn of_parquet(place: &str, bytes: Vec<u8>) -> Result<(Array2<f32>, FileContent), Failure> {
     let refused = |reason: &dyn std::fmt::Display| {
         Failure::new(FailureKind::ParquetFormat, place, format!("{place}: {reason}"))
     };
     let mut wanted = vec![FRAME];
     wanted.extend(CHANNEL_NAMES);
-    let columns = number_columns(bytes.into(), &wanted).map_err(|e: LooseError| refused(&e))?;
+    let columns =
+        number_columns(bytes.into(), &wanted).map_err(|e: NumberColumnsError| refused(&e))?;
     if let Some(frame) = columns.get(FRAME) {
         let first = frame.first().copied().unwrap_or(0.0);
         let wrong = frame.iter().zip(0..).find(|&(&x, t)| x != first + f64::from(t));
@@ -160,7 +161,11 @@ fn of_parquet(place: &str, bytes: Vec<u8>) -> Result<(Array2<f32>, Held), Failur
     let values = Array2::from_shape_fn((n_frames, taken.len()), |(t, i)| {
         columns[CHANNEL_NAMES[taken[i]]][t] as f32
     });
-    Ok(if is_whole { (values, Held::Channels) } else { (of_poses(values.view()), Held::Poses) })
+    Ok(if is_whole {
+        (values, FileContent::Channels)
+    } else {
+        (of_poses(values.view()), FileContent::Poses)
+    })
 }
 
 /// Returns all channels of poses, `[T, 7]` → `[T, 25]`: what follows from poses is derived by forward
