@@ -333,8 +333,9 @@ beats                       0              0       0        1
 failures                    0              0       0        1
 training_log                0              0       0        1
 onnx_checks                 0              0       0        1
-generations                 0              0       0        1
+generations                 0              0       0        2
 generated                   0              0       0        1
+decoded                     0              0       0        1
 sanity_checks               0              0       0        1
 metrics                     0              0       0        1
 ";
@@ -388,7 +389,7 @@ fn an_unknown_table_comes_with_the_nearest_and_all_others() {
         let start = format!("table \"{table}\" not found; nearest: {nearest}");
         assert!(sentence.starts_with(&start), "{sentence}");
         let all = "; a store has phrases, motion, features, extractions, beats, failures, \
-                   training_log, onnx_checks, generations, generated, sanity_checks, metrics";
+                   training_log, onnx_checks, generations, generated, decoded, sanity_checks, metrics";
         assert!(sentence.ends_with(all), "{sentence}");
     }
 }
