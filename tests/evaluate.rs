@@ -137,6 +137,7 @@ fn put(store: &Path, name: &str, motions: &[Motion]) {
             control_error_deg: None,
             generate_s: 0.1,
             real_time_factor: 0.01,
+            settings: None,
             time: TimestampUs(1_700_000_000_000_000),
         });
         let hash = "h".to_owned();

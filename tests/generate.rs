@@ -8,7 +8,8 @@ use std::process::Command;
 use std::time::Duration;
 
 use motiongen::motion::npy::write as npy;
-use motiongen::store::tables::{GENERATED, GenerationRow};
+use motiongen::store::Row as _;
+use motiongen::store::tables::{DECODED, GENERATED, GenerationRow};
 use ndarray::Array2;
 
 use crate::support::{Dir, Output, confined, failures, finish, motiongen, rows, run, write};
@@ -49,26 +50,34 @@ fn generate(store: &Path, more: &[&str]) -> Output {
     output
 }
 
-/// The parts of generated motion: names and bytes.
+/// The parts of generated and decoded motion: names and bytes.
 ///
 /// A process killed while it writes a part leaves a file whose name begins with a dot, which no reader
 /// lists and a later run sweeps away when it is a day old.
 fn parts(store: &Path) -> BTreeMap<String, Vec<u8>> {
-    let Ok(entries) = std::fs::read_dir(store.join(GENERATED)) else { return BTreeMap::new() };
-    entries
-        .map(|entry| entry.expect("an entry").path())
-        .map(|path| (path.file_name().expect("a name").to_string_lossy().into_owned(), path))
-        .filter(|(name, _)| !name.starts_with(".partial-"))
-        .map(|(name, path)| (name, std::fs::read(path).expect("a part")))
-        .collect()
+    let of_table = |table: &'static str| {
+        let entries = std::fs::read_dir(store.join(table)).into_iter().flatten();
+        entries
+            .map(|entry| entry.expect("an entry").path())
+            .map(|path| (path.file_name().expect("a name").to_string_lossy().into_owned(), path))
+            .filter(|(name, _)| !name.starts_with(".partial-"))
+            .map(move |(name, path)| {
+                (format!("{table}/{name}"), std::fs::read(path).expect("a part"))
+            })
+    };
+    of_table(GENERATED).chain(of_table(DECODED)).collect()
 }
 
-/// All generated frames as the query says them: by motion and frame, every number in full.
-fn frames(store: &Path) -> String {
-    let sql = "select * from generated order by generation, frame";
-    let output = run(["query", "--store", &store.display().to_string(), sql, "--format", "csv"]);
+/// All frames of a table as the query says them: by motion and frame, every number in full.
+fn frames_of(store: &Path, table: &str, condition: &str) -> String {
+    let sql = format!("select * from {table} where {condition} order by generation, frame");
+    let output = run(["query", "--store", &store.display().to_string(), &sql, "--format", "csv"]);
     assert_eq!(output.code, 0, "{output:?}");
     output.stdout
+}
+
+fn frames(store: &Path) -> [String; 2] {
+    [GENERATED, DECODED].map(|table| frames_of(store, table, "sample >= 0"))
 }
 
 fn generations(store: &Path) -> Vec<GenerationRow> {
@@ -163,6 +172,93 @@ fn shards_threads_and_a_kill_change_no_byte() {
         rows
     };
     assert_eq!(without_times(&killed), without_times(&one));
+}
+
+#[test]
+fn decoded_motion_is_kept_as_raw_motion_is() {
+    let dir = Dir::new();
+    let store = modelled(&dir);
+    // The best of two: the decoded frames must be those of the candidate that was kept.
+    generate(&store, &["--run=usual", "--best-of=2"]);
+    let of = |table: &str, run: &str| frames_of(&store, table, &format!("run = '{run}'"));
+    assert_eq!(
+        of(DECODED, "usual").lines().count(),
+        of(GENERATED, "usual").lines().count(),
+        "a row for every frame"
+    );
+    assert_ne!(of(DECODED, "usual"), of(GENERATED, "usual"));
+    generate(&store, &["--run=rough", "--raw"]);
+    assert_eq!(of(DECODED, "rough"), of(GENERATED, "rough"));
+    let selected: Vec<String> = generations(&store)
+        .into_iter()
+        .filter(|row| row.run == "usual" && row.selected && row.candidate == 0)
+        .map(|row| row.phrase_id)
+        .collect();
+    assert!((1..16).contains(&selected.len()), "either candidate is the best of some phrases");
+    for phrase in selected {
+        // The first candidate has the noise of the only one.
+        let named = |run: &str| format!("run = '{run}' and phrase_id = '{phrase}'");
+        let usual = frames_of(&store, DECODED, &named("usual")).replace("usual", "rough");
+        assert_eq!(usual, frames_of(&store, GENERATED, &named("rough")), "{phrase}");
+    }
+}
+
+#[test]
+fn settings_are_kept_and_a_run_of_release_0_1_has_none() {
+    let dir = Dir::new();
+    let store = modelled(&dir);
+    let constraints = dir.write("c.toml", "[start]\nposition_y = 0.5\n").display().to_string();
+    generate(&store, &["--run=old", "--guidance=2.5", "--constraints", &constraints, "--soft"]);
+    let settings: Vec<serde_json::Value> = generations(&store)
+        .iter()
+        .map(|row| serde_json::from_str(row.settings.as_deref().expect("settings")).expect("JSON"))
+        .collect();
+    assert!(settings.iter().all(|other| *other == settings[0]));
+    let said = &settings[0];
+    assert_eq!(said["sampler"]["n_steps"], 4);
+    assert_eq!(said["sampler"]["spacing"], "trailing");
+    assert_eq!((&said["guidance"], &said["soft"]), (&2.5.into(), &true.into()));
+    assert_eq!((&said["overlap_frames"], &said["best_of"]), (&7.into(), &1.into()));
+    assert_eq!(said["postprocess"]["coherence"], "derive");
+    assert_eq!(said["constraints"].as_str().map(str::len), Some(64), "a digest");
+    assert!(said.get("seed").is_none() && said.get("weights").is_none(), "{said}");
+
+    // The same rows as release 0.1 wrote them: version 1, without the column.
+    let rows = generations(&store);
+    let batch = GenerationRow::to_batch(&rows);
+    let known = batch.schema_ref().index_of("settings").expect("the column");
+    let others: Vec<usize> = (0..batch.num_columns()).filter(|i| *i != known).collect();
+    let batch = batch.project(&others).expect("columns");
+    for entry in std::fs::read_dir(store.join("commits/generate")).expect("commits") {
+        let path = entry.expect("an entry").path();
+        let text = std::fs::read_to_string(&path).expect("a commit");
+        let mut commit: serde_json::Value = serde_json::from_str(&text).expect("JSON");
+        for part in commit["parts"].as_array_mut().expect("parts") {
+            if part["table"] == "generations" {
+                part["schema_version"] = 1.into();
+                let path = store.join(part["path"].as_str().expect("a path"));
+                let file = std::fs::File::create(path).expect("the part");
+                let mut writer =
+                    parquet::arrow::ArrowWriter::try_new(file, batch.schema(), None).expect("made");
+                writer.write(&batch).expect("written");
+                writer.close().expect("closed");
+            }
+        }
+        std::fs::write(&path, commit.to_string()).expect("written");
+    }
+    let read = generations(&store);
+    let without: Vec<GenerationRow> =
+        rows.into_iter().map(|row| GenerationRow { settings: None, ..row }).collect();
+    assert_eq!(read, without);
+    // It is not made again, and a run of today stands beside it.
+    let flags = ["--run=old", "--guidance=2.5", "--constraints", &constraints, "--soft"];
+    let again = generate(&store, &flags);
+    assert!(again.stdout.contains("  nothing to do: 16 motions are up to date"), "{again:?}");
+    generate(&store, &["--run=new"]);
+    let sql =
+        "select run, count(*) n, count(settings) known from generations group by run order by run";
+    let output = run(["query", "--store", &store.display().to_string(), sql, "--format", "csv"]);
+    assert_eq!(output.stdout, "run,n,known\nnew,16,16\nold,16,0\n", "{output:?}");
 }
 
 #[test]

@@ -86,6 +86,7 @@ fn generation(run: &str, phrase: &str, sample: i32, candidate: i32) -> Generatio
         control_error_deg: None,
         generate_s: 1.0,
         real_time_factor: 0.5,
+        settings: None,
         time: TimestampUs(0),
     }
 }

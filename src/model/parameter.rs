@@ -92,6 +92,32 @@ impl ParameterList {
         self.iter().map(|(id, parameter)| (parameter.name.as_str(), id)).collect()
     }
 
+    /// Returns the list with layers that begin at zero drawn like all others of their kind:
+    /// [`Init::fan_in`] of weight and bias. Norms and single vectors keep their zeros.
+    ///
+    /// A network whose last layer begins at zero says the same for every input until it has learned
+    /// something; with this list its first weights are a random function of the input.
+    #[must_use]
+    pub fn without_zero_layers(mut self) -> Self {
+        let is_zero = |parameter: &&Parameter| {
+            parameter.role == Role::Weight && parameter.init == Init::Zeros
+        };
+        let layer = |parameter: &Parameter| {
+            let inputs = parameter.shape.iter().skip(1).product();
+            let name = parameter.name.strip_suffix("weight").unwrap_or(&parameter.name);
+            (format!("{name}bias"), Init::fan_in(inputs))
+        };
+        let biases: BTreeMap<String, Init> = self.0.iter().filter(is_zero).map(layer).collect();
+        for parameter in &mut self.0 {
+            let (of_bias, of_weight) =
+                (biases.get(&parameter.name), is_zero(&&*parameter).then(|| layer(parameter).1));
+            if let Some(init) = of_bias.copied().or(of_weight) {
+                parameter.init = init;
+            }
+        }
+        self
+    }
+
     /// Returns the number of parameters, each a tensor.
     pub fn len(&self) -> usize {
         self.0.len()
@@ -138,5 +164,32 @@ impl<'a> Scope<'a> {
     ) -> ParameterId {
         let name = self.at(name).path;
         self.list.add(Parameter { name, shape: shape.to_vec(), init, role })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn layers_that_begin_at_zero_are_drawn_and_nothing_else_changes() {
+        let mut list = ParameterList::default();
+        let mut root = Scope::root(&mut list);
+        let mut make = |name: &str, shape: &[usize], init, role| {
+            root.parameter(name, shape, init, role);
+        };
+        make("in.weight", &[3, 5], Init::fan_in(5), Role::Weight);
+        make("norm.bias", &[3], Init::Zeros, Role::Vector);
+        make("null_context", &[7], Init::Zeros, Role::Vector);
+        make("out.conv.weight", &[2, 3, 3], Init::Zeros, Role::Weight);
+        make("out.conv.bias", &[2], Init::Zeros, Role::Vector);
+        let drawn = list.clone().without_zero_layers();
+        let inits: Vec<Init> = drawn.iter().map(|(_, parameter)| parameter.init).collect();
+        let third = Init::Uniform { bound: 1.0 / 3.0 };
+        assert_eq!(inits, [Init::fan_in(5), Init::Zeros, Init::Zeros, third, third]);
+        let names = |list: &ParameterList| -> Vec<(String, Vec<usize>)> {
+            list.iter().map(|(_, p)| (p.name.clone(), p.shape.clone())).collect()
+        };
+        assert_eq!(names(&drawn), names(&list));
     }
 }

@@ -43,6 +43,7 @@ kinds! {
     ChannelLimit = "channel_limit",
     /// A constraint that the track cannot keep.
     Constraint = "constraint",
+    CsvFormat = "csv_format",
     DuplicateId = "duplicate_id",
     EmptyFile = "empty_file",
     /// What runs a model stopped.
@@ -61,6 +62,7 @@ kinds! {
     NotAFile = "not_a_file",
     NpyFormat = "npy_format",
     NpzFormat = "npz_format",
+    ParquetFormat = "parquet_format",
     /// The program itself broke on the phrase: a defect of ours, kept from stopping the job.
     Panic = "panic",
     Pickle = "pickle",

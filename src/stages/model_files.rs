@@ -186,6 +186,36 @@ impl OpenModel {
         engine.context("while starting threads")
     }
 
+    /// Makes the engine of our own interpreter with the networks' first weights, of seed 0, as if nothing had
+    /// been learned.
+    ///
+    /// The UNet's last convolution begins at zero, so that a fresh network predicts the same for every input
+    /// and what is sampled from it hardly moves. Here layers that begin at zero are drawn like all others of
+    /// their kind ([`ParameterList::without_zero_layers`]). The decoder has its first weights as well; the
+    /// scales of channels and features are the model's.
+    ///
+    /// # Errors
+    /// When the system gives no threads.
+    pub fn untrained(
+        &self,
+        n_workers: NonZeroUsize,
+        n_threads: NonZeroUsize,
+    ) -> anyhow::Result<EagerEngine> {
+        let card = &self.card;
+        let first = |list: ParameterList| Parameters::new(list.without_zero_layers(), 0);
+        let (unet, list) = UNet1D::new(&card.unet);
+        let unet_parameters = first(list);
+        let (decoder, list) = MotionDecoder::new(&card.decoder);
+        let engine = EagerEngine::new(
+            (unet, unet_parameters),
+            (decoder, first(list)),
+            card.unet.style_dim > 0,
+            card.feature_scale.clone(),
+            (n_workers, n_threads),
+        );
+        engine.context("while starting threads")
+    }
+
     fn parameters(
         &self,
         name: &'static str,

@@ -12,6 +12,7 @@ mod frames;
 mod item;
 mod local;
 mod location;
+mod number_columns;
 mod part;
 mod patience;
 mod prepared;
@@ -33,6 +34,9 @@ pub use frames::FrameSpool;
 pub use item::ItemTables;
 pub use local::{replace_file, temporary_beside, write_file};
 pub use location::{Listed, Location, Put};
+#[cfg(test)]
+pub use number_columns::tests::parquet_of;
+pub use number_columns::{NumberColumnsError, number_columns};
 pub use part::{FinishedPart, Label, PartWriter};
 pub use patience::Patience;
 pub use prepared::prepared;

@@ -162,7 +162,7 @@ rows! {
 
 rows! {
     "One row per motion that generate sampled, kept or not; measured times differ from run to run, nothing else does."
-    GenerationRow in "generations" version 1 sorted by [generation, candidate]
+    GenerationRow in "generations" version 2 reads 1 sorted by [generation, candidate]
     {
         generation: String, "", "The motion: `RUN/PHRASE/SAMPLE`.";
         run: String, "", "Name of the generation (--run), by default that of the model.";
@@ -190,6 +190,7 @@ rows! {
         control_error_deg: Option<f64>, "°", "Largest angle from a constraint on the orientation.";
         generate_s: f64, "s", "Time that sampling, decoding and post-processing took.";
         real_time_factor: f64, "", "That time over the length of the motion.";
+        settings: Option<String>, "JSON", "What determines the motion beside its music, the model's weights and the seed: sampler, guidance, candidates, style, overlap, priming, post-processing, and of constraints the digest. None where release 0.1 made it.";
         time: TimestampUs, "", "When it was made.";
     }
 }
@@ -302,6 +303,16 @@ pub fn generated() -> TableSchema {
     table
 }
 
+/// Name of the table of decoded motion.
+pub const DECODED: &str = "decoded";
+
+/// Returns the schema of `decoded`: the columns of [`generated`].
+pub fn decoded() -> TableSchema {
+    let description =
+        "One row per frame of a kept motion as it was decoded, before post-processing.";
+    TableSchema { name: DECODED, description, ..generated() }
+}
+
 /// Name of the feature table.
 pub const FEATURES: &str = "features";
 
@@ -378,6 +389,7 @@ pub fn all() -> Vec<TableSchema> {
         OnnxCheckRow::schema(),
         GenerationRow::schema(),
         generated(),
+        decoded(),
         SanityCheckRow::schema(),
         MetricRow::schema(),
         VerdictRow::schema(),

@@ -1,5 +1,7 @@
 //! `evaluate`: motion becomes numbers and verdicts that can be queried, beside those of what it is compared with.
 
+mod baselines;
+mod foreign;
 mod job;
 mod measure;
 mod motions;

@@ -34,6 +34,8 @@ pub struct Music<'a> {
 pub struct Made {
     /// \[T, 25\]
     pub frames: Array2<f32>,
+    /// The same motion as it was decoded, before post-processing, \[T, 25\].
+    pub decoded: Array2<f32>,
     pub rows: Vec<GenerationRow>,
     pub seconds: f64,
 }
@@ -90,7 +92,7 @@ impl Maker<'_> {
             bar_phase(&times_s, beats)
         });
         let priming = self.priming(music)?;
-        let mut best: Option<(f64, usize, Array2<f32>)> = None;
+        let mut best: Option<Candidate> = None;
         let mut rows = Vec::with_capacity(self.settings.best_of);
         for candidate in 0..self.settings.best_of {
             let begun = Instant::now();
@@ -102,7 +104,7 @@ impl Maker<'_> {
                 self.sample(music, seed, constraints.as_ref(), priming.as_ref(), watcher)?;
             let velocity_error =
                 derivative_error(decoded.view(), Channel::Position, Channel::Velocity);
-            let mut frames = decoded;
+            let mut frames = decoded.clone();
             let bars = phase.as_deref().filter(|_| music.begins_bar);
             let postprocess = &self.settings.postprocess;
             process(postprocess, &mut frames, bars);
@@ -139,13 +141,14 @@ impl Maker<'_> {
             rows.push(self.row(music, n_frames, &found));
             // The first of equals, so that one candidate more changes nothing else.
             let value = score.total.unwrap_or(f64::NEG_INFINITY);
-            if best.as_ref().is_none_or(|(known, ..)| value > *known) {
-                best = Some((value, candidate, frames));
+            if best.as_ref().is_none_or(|known| value > known.value) {
+                best = Some(Candidate { value, candidate, frames, decoded });
             }
         }
-        let (_, selected, frames) = best.expect("at least one candidate is sampled");
-        rows[selected].selected = true;
-        Ok(Made { frames, rows, seconds: started.elapsed().as_secs_f64() })
+        let Candidate { candidate, frames, decoded, .. } =
+            best.expect("at least one candidate is sampled");
+        rows[candidate].selected = true;
+        Ok(Made { frames, decoded, rows, seconds: started.elapsed().as_secs_f64() })
     }
 
     fn constraints(&self, music: &Music) -> Result<Option<Constraints>, Failure> {
@@ -242,9 +245,18 @@ impl Maker<'_> {
             control_error_deg: found.control[1],
             generate_s: found.generate_s,
             real_time_factor: found.generate_s / frames_to_s(n_frames).max(f64::MIN_POSITIVE),
+            settings: Some(settings.to_row().to_json()),
             time: TimestampUs::now(),
         }
     }
+}
+
+/// The best candidate so far.
+struct Candidate {
+    value: f64,
+    candidate: usize,
+    frames: Array2<f32>,
+    decoded: Array2<f32>,
 }
 
 /// What was found of a candidate.

@@ -1,10 +1,11 @@
-//! `generate`: music becomes motion, in the tables `generated` and `generations`, or in files.
+//! `generate`: music becomes motion, in the tables `generated`, `decoded` and `generations`, or in files.
 
 mod constraints_file;
 mod files;
 mod maker;
 mod outputs;
 mod params;
+mod settings;
 mod tracks;
 
 use std::collections::BTreeMap;
@@ -29,7 +30,9 @@ use params::Settings;
 pub use params::{Params, SamplerName, Tracks};
 
 pub(in crate::stages) use files::listen;
-pub(in crate::stages) use maker::generation_id;
+pub(in crate::stages) use maker::{generation_id, seed_of};
+pub(in crate::stages) use params::PostProcessParams;
+pub(in crate::stages) use settings::MotionSettings;
 pub(in crate::stages) use tracks::{beats_in_bars, beats_of, url_of};
 
 /// The stage.
@@ -40,7 +43,7 @@ impl Stage for Generate {
     const ABOUT: &'static str = "make motion for music of any length";
     const CONTRACT: Contract = Contract {
         reads: "models/MODEL; phrases, features, extractions, beats, or audio files",
-        writes: "generated, generations, failures, or files",
+        writes: "generated, decoded, generations, failures, or files",
     };
     type Params = Params;
 

@@ -4,10 +4,12 @@ use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
 use anyhow::{bail, ensure};
-use serde::Serialize;
+use clap::{Args as _, FromArgMatches as _};
+use serde::{Deserialize, Serialize};
 
 use super::constraints_file::Asked;
 use super::outputs::Format;
+use super::settings::{MotionSettings, OUTPUT_VERSION};
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
 use crate::generation::{ModelCard, OVERLAP_FRAMES};
 use crate::motion::postprocess::{Coherence, Hemisphere, PostProcessConfig, SavitzkyGolay};
@@ -18,9 +20,6 @@ use crate::stages::ClientParams;
 use crate::stages::model_files::EngineParams;
 use crate::stages::motion_source::read_motion;
 use crate::store::{Shard, digest};
-
-/// Raised when generate writes something else for the same model, music and settings.
-const OUTPUT_VERSION: u32 = 2;
 
 /// The samplers by the names of the flag.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
@@ -181,6 +180,13 @@ pub struct PostProcessParams {
 }
 
 impl PostProcessParams {
+    /// Returns what is done unless the user says otherwise.
+    pub fn usual() -> Self {
+        let command = Self::augment_args(clap::Command::new("usual"));
+        Self::from_arg_matches(&command.get_matches_from(["usual"]))
+            .expect("invariant: every flag of post-processing has a default")
+    }
+
     /// Returns the configuration, for a model whose motion is as fast as `range`.
     ///
     /// # Errors
@@ -218,7 +224,7 @@ impl PostProcessParams {
 }
 
 /// How sampling begins from the library's motion.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Prime {
     /// Steps of the diffusion that are left to sample, out of all that were trained.
     pub n_left: usize,
@@ -329,43 +335,39 @@ impl Settings {
         }
     }
 
-    /// Returns the digest of everything but the music that determines motions.
-    pub fn digest(&self, weights: &str) -> String {
-        // A struct is written in the order of its fields in every build; a map of serde_json is not.
-        #[derive(Serialize)]
-        struct Digested<'a> {
-            output_version: u32,
-            weights: &'a str,
-            sampler: &'a SamplerConfig,
-            guidance: f64,
-            seed: u64,
-            best_of: usize,
-            style: Option<[f32; STYLE_DIM]>,
-            overlap_frames: usize,
-            #[serde(skip_serializing_if = "Option::is_none")]
-            prime: Option<&'a Prime>,
-            postprocess: &'a PostProcessConfig,
-            constraints: Option<String>,
-            constraint_strength: f64,
-            soft: bool,
-        }
-        let digested = Digested {
+    /// Returns the settings as `generations` keeps them: without seed and weights, and of constraints the
+    /// digest.
+    pub fn to_row(&self) -> MotionSettings {
+        MotionSettings {
             output_version: OUTPUT_VERSION,
-            weights,
-            sampler: &self.sampler,
+            weights: None,
+            sampler: self.sampler.clone(),
             guidance: self.guidance,
-            seed: self.seed,
+            seed: None,
             best_of: self.best_of,
             style: self.style,
             overlap_frames: self.overlap_frames,
-            prime: self.prime.as_ref(),
-            postprocess: &self.postprocess,
-            constraints: self.constraints.as_ref().map(|asked| format!("{asked:?}")),
+            prime: self.prime.clone(),
+            postprocess: self.postprocess.clone(),
+            constraints: self.constraints_text().map(|text| digest(text.as_bytes())),
             constraint_strength: self.constraint_strength,
             soft: self.soft,
+        }
+    }
+
+    /// Returns the digest of everything but the music that determines motions.
+    pub fn digest(&self, weights: &str) -> String {
+        let settings = MotionSettings {
+            weights: Some(weights.to_owned()),
+            seed: Some(self.seed),
+            constraints: self.constraints_text(),
+            ..self.to_row()
         };
-        let text = serde_json::to_string(&digested).expect("numbers and texts become JSON");
-        digest(text.as_bytes())
+        settings.digest()
+    }
+
+    fn constraints_text(&self) -> Option<String> {
+        self.constraints.as_ref().map(|asked| format!("{asked:?}"))
     }
 }
 

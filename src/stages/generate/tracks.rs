@@ -293,6 +293,8 @@ fn commit(
                 ];
                 let part = commit.part(tables::GENERATED, tables::generated)?;
                 part.write_labelled_frames(&id, &labels, made.frames.view())?;
+                let part = commit.part(tables::DECODED, tables::decoded)?;
+                part.write_labelled_frames(&id, &labels, made.decoded.view())?;
                 generations.extend(made.rows);
             }
             Err(failure) => failures.push(FailureRow {

@@ -333,6 +333,7 @@ fn extension(path: &str) -> Option<&str> {
     name.rsplit_once('.').map(|(_, extension)| extension)
 }
 
-fn is_audio(extension: &str) -> bool {
+/// Returns whether files that end so are audio.
+pub fn is_audio(extension: &str) -> bool {
     AUDIO_EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension))
 }

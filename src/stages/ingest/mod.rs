@@ -17,6 +17,7 @@ use crate::store::{
 };
 
 use super::failure::{Failure, write_failures};
+pub(in crate::stages) use layout::is_audio;
 pub use layout::{Layout, Plan, Planned, Role, plan};
 pub use phrase::{Rules, content_hash_of_audio};
 pub(in crate::stages) use phrase::{read_beats, read_bvh, read_trajectory};
