@@ -176,3 +176,14 @@ pub fn of_model(
     let model = model.to_owned();
     Ok(card.provenance.learned_from.ok_or(NotKnown::NotListed { model }))
 }
+
+/// Returns whether the store has the model that made a motion, with the same weights.
+///
+/// # Errors
+/// [`StoreError`] when the store cannot be read.
+pub fn has_weights(store: &Location, model: &str, weights: &str) -> Result<bool, StoreError> {
+    let path = format!("{}/{}", folder_of(model), file_names::CARD);
+    let bytes = if is_model_name(model) { store.read_if_there(&path)? } else { None };
+    let card = bytes.and_then(|bytes| ModelCard::read(&bytes, &store.url_of(&path)).ok());
+    Ok(card.is_some_and(|card| weights_digest(&card) == weights))
+}

@@ -49,15 +49,18 @@ pub struct EngineParams {
 impl EngineParams {
     /// Returns the folder of the cache.
     pub fn cache(&self) -> PathBuf {
-        let variable = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty());
-        let below = |folder: PathBuf| folder.join("motiongen");
-        self.model_cache.clone().unwrap_or_else(|| {
-            variable("XDG_CACHE_HOME")
-                .map(|folder| below(folder.into()))
-                .or_else(|| variable("HOME").map(|home| below(PathBuf::from(home).join(".cache"))))
-                .unwrap_or_else(|| below(std::env::temp_dir()))
-        })
+        self.model_cache.clone().unwrap_or_else(default_model_cache)
     }
+}
+
+/// Returns the folder in which models are kept as this machine's processor likes them, unless another is named.
+pub fn default_model_cache() -> PathBuf {
+    let variable = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty());
+    let below = |folder: PathBuf| folder.join("motiongen");
+    variable("XDG_CACHE_HOME")
+        .map(|folder| below(folder.into()))
+        .or_else(|| variable("HOME").map(|home| below(PathBuf::from(home).join(".cache"))))
+        .unwrap_or_else(|| below(std::env::temp_dir()))
 }
 
 /// A model whose files are at hand on this machine.

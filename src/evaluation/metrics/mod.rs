@@ -120,3 +120,9 @@ fn mean_over(
     let by_song = sums.into_iter().map(|(song, (sum, n))| (song, sum / n)).collect();
     (clustered_mean_estimate(&values, &songs), by_song)
 }
+
+/// Returns a variant with the stage of the making of motion that it is of: `strict_raw`, `raw`; plain without one.
+fn staged(variant: &str, stage: &str) -> String {
+    let parts = [variant, stage].into_iter().filter(|part| !part.is_empty());
+    parts.collect::<Vec<_>>().join("_")
+}

@@ -20,7 +20,7 @@ use super::super::measured::Measured;
 use super::super::reference_statistics::{FeatureSet, ReferenceStatistics};
 use super::super::sanity::CheckSet;
 use super::super::window_range::Posture;
-use super::{Danced, Number, SEED, mean_over};
+use super::{Danced, Number, SEED, mean_over, staged};
 use crate::motion::CHANNEL_NAMES;
 
 /// Windows, evenly among all, whose pairs are compared: every one with every other.
@@ -66,7 +66,7 @@ pub fn soundness_numbers(
             danced.iter().map(|item| (item.motion.passes(set, holds), item.song)).unzip();
         clustered_share_estimate(&is_true, &songs)
     };
-    let variant = |name: &str| format!("{name} {stage}").trim().to_owned();
+    let variant = |name: &str| staged(name, stage);
     let checks = "share of windows that pass every check of the set that post-processing does not make true";
     let mut numbers = Vec::new();
     for (name, set) in [("reference", CheckSet::Reference), ("strict", CheckSet::Strict)] {

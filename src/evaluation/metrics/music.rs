@@ -12,7 +12,7 @@ use super::super::coupling::{
 };
 use super::super::interval::{Estimate, clustered_mean_estimate, mean_estimate};
 use super::super::locking::{BarLocking, Passage, r2_at, wrong_tempi};
-use super::{Danced, MusicWindow, Number, SEED, mean_over};
+use super::{Danced, MusicWindow, Number, SEED, mean_over, staged};
 
 /// Wrong tempi that locking is held against.
 pub const N_WRONG_TEMPI: usize = 199;
@@ -250,8 +250,7 @@ pub fn phase_numbers(danced: &[Danced], origin: PhaseOrigin, stage: &str) -> Vec
     };
     let number = |metric: &'static str, variant: &str, unit, needs_own_phase, value: Value| {
         let (estimate, by_song) = mean(needs_own_phase, value);
-        let variant = format!("{variant} {stage}");
-        Number::new(metric, variant.trim(), unit, estimate.non_negative(), protocol)
+        Number::new(metric, staged(variant, stage), unit, estimate.non_negative(), protocol)
             .with_songs(by_song)
     };
     vec![

@@ -19,7 +19,7 @@ pub(super) fn tests(evidence: &Evidence) -> Vec<Test> {
     };
     let mut tests = Vec::new();
     if evidence.has_raw {
-        tests.push(test("decoded", "as decoded", "strict raw"));
+        tests.push(test("decoded", "as decoded", "strict_raw"));
         tests.push(test("post_processed", "after post-processing", "strict"));
     } else {
         tests.push(test("as_given", "as it is", "strict"));

@@ -18,7 +18,7 @@ fn by_song(metric: &'static str, variant: &str, songs: &[f64]) -> Number {
 fn good() -> Vec<Number> {
     let mut numbers = vec![
         number("pass_rate", "strict", 0.95),
-        number("pass_rate", "strict raw", 0.9),
+        number("pass_rate", "strict_raw", 0.9),
         number("jerk_ratio", "", 1.1),
         number("fid_k", "axes", 0.8),
         number("fid_g", "", 1.2),
@@ -93,7 +93,7 @@ fn good_motion_wins_and_each_fault_loses_its_verdict() {
     assert_eq!(outcomes(&[], &SHIFTED), []);
     let lost = |change: Number| outcomes(&[change], &SHIFTED);
     let cases = [
-        (number("pass_rate", "strict raw", 0.79), "sound", "decoded"),
+        (number("pass_rate", "strict_raw", 0.79), "sound", "decoded"),
         (number("pass_rate", "strict", 0.5), "sound", "post_processed"),
         (number("speed_ratio", "y", 0.6), "like_real", "speed_y"),
         (number("jerk_ratio", "", 4.0), "like_real", "jerk"),

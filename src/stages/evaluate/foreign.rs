@@ -27,6 +27,7 @@ use ndarray::Array2;
 
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::plot::nearest::nearest;
+use crate::store::digest;
 use names::Names;
 
 /// Files that match nothing which are told the nearest names: each costs a look at every phrase.
@@ -186,22 +187,30 @@ pub fn read(dir: &Path, phrases: &[Phrase]) -> anyhow::Result<ForeignMotions> {
 }
 
 impl ForeignMotions {
-    /// Reads the files one after another: `each` is given every motion, and files that hold none become
-    /// failures.
-    ///
-    /// # Errors
-    /// What `each` says.
-    pub fn visit<E>(
-        &mut self,
-        mut each: impl FnMut(ForeignMotion) -> Result<(), E>,
-    ) -> Result<(), E> {
-        for file in &self.files {
-            match file.read() {
-                Ok(motion) => each(motion)?,
-                Err(failure) => self.failures.push((file.path.clone(), failure)),
-            }
-        }
-        Ok(())
+    /// Keeps the `n` files whose names have the smallest digests, which is no order that names have.
+    pub fn keep(&mut self, n: usize) {
+        let name = |file: &ForeignFile| format!("{}/{}", file.phrase_id, file.sample);
+        self.files.sort_by_cached_key(|file| digest(name(file).as_bytes()));
+        self.files.truncate(n);
+        self.files.sort_by(|a, b| (&a.phrase_id, a.sample).cmp(&(&b.phrase_id, b.sample)));
+    }
+}
+
+/// A file that holds no motion, or none for a phrase.
+#[derive(Debug)]
+pub struct Refused {
+    /// Its path below the folder.
+    pub name: String,
+    pub failure: Failure,
+}
+
+impl Refused {
+    /// Names files by their paths below a folder.
+    pub fn all(folder: &Path, files: impl IntoIterator<Item = (PathBuf, Failure)>) -> Vec<Self> {
+        let name = |path: &Path| {
+            path.strip_prefix(folder).unwrap_or(path).to_string_lossy().into_owned()
+        };
+        files.into_iter().map(|(path, failure)| Self { name: name(&path), failure }).collect()
     }
 }
 

@@ -1,6 +1,7 @@
 //! `evaluate`: motion becomes numbers and verdicts that can be queried, beside those of what it is compared with.
 
 mod baselines;
+mod evaluand;
 mod foreign;
 mod job;
 mod measure;
@@ -12,38 +13,27 @@ mod splits;
 mod subjects;
 mod truth;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::io::{self, Write};
 use std::path::PathBuf;
 use std::time::Instant;
 
-use anyhow::{Context as _, bail};
-use ndarray::Array2;
+use anyhow::Context as _;
 
-use super::motion_source::generated_frames;
-use super::{Contract, Progress, Stage, Summary, learned};
-use crate::evaluation::holds_by_construction;
-use crate::evaluation::metrics::PhaseOrigin;
-use crate::generation::LearnedFrom;
-use crate::motion::postprocess::PostProcessConfig;
+use super::failure::write_failures;
+use super::{Contract, Progress, Stage, Summary};
 use crate::report::{self, Report};
-use crate::store::tables::{self, GenerationRow, SanityCheckRow};
-use crate::store::{self, Location, Snapshot, StoreError, digest};
-use crate::units::frames_to_s;
+use crate::store::tables::SanityCheckRow;
+use crate::store::{self, Location};
 
-use job::{Evaluated, Job, Motion, Stage as MadeAt};
-use measure::{MAX_KEPT_FRAMES, MeasuredMotion, stride_for};
-use motions::{Phrases, is_held_out};
+use evaluand::Evaluand;
+use foreign::Refused;
+use job::Stage as MadeAt;
 pub use params::{Params, RequiredVerdict};
-use rows::{Known, Rows, RunName};
-use splits::MusicSplit;
-use truth::Truth;
+use rows::{Known, Rows};
 
 /// The name under which sanity checks are committed; numbers and verdicts have the stage's.
 const CHECKS: &str = "evaluate-checks";
-
-/// Songs whose activity is read; that of others counts as its mean.
-const MAX_HEARD_SONGS: usize = 500;
 
 /// The stage.
 pub struct Evaluate;
@@ -72,7 +62,7 @@ impl Stage for Evaluate {
             run: &run,
             params_hash: &params.digest(params.quick),
             whole_hash: &params.digest(false),
-            input_hash: &subject.input_hash(&data_hash),
+            input_hash: &subject.input_hash(&data_hash)?,
         };
         let n_wanted = if params.quick { 1 } else { rows::STAGES.len() };
         let mut is_up_to_date = !params.force;
@@ -84,7 +74,7 @@ impl Stage for Evaluate {
         } else {
             store.sweep()?;
             let found = subject.evaluate(&store, &params, &data_hash, progress)?;
-            known.commit_checks(&found)?;
+            known.commit_checks(&found, &subject.refused)?;
             if !params.quick {
                 known.commit_numbers(&found)?;
             }
@@ -109,6 +99,7 @@ impl Stage for Evaluate {
             store: store.to_string(),
             n_motions: subject.motions.len(),
             length_s: subject.length_s(),
+            refused: std::mem::take(&mut subject.refused),
             run,
             is_up_to_date,
             has_metrics: !found.metrics.is_empty(),
@@ -117,234 +108,6 @@ impl Stage for Evaluate {
             took_s: started.elapsed().as_secs_f64(),
         }))
     }
-}
-
-/// What is evaluated.
-struct Evaluand {
-    run: String,
-    model: String,
-    phrases: Phrases,
-    motions: Vec<Motion>,
-    /// What generate said of them, in the same order.
-    generations: Vec<GenerationRow>,
-    /// How they were processed; of 0.1 what was the default.
-    postprocess: PostProcessConfig,
-    /// Candidates that each motion was chosen from, at most.
-    n_candidates: usize,
-    /// What is to be known beside the numbers.
-    notes: Vec<String>,
-}
-
-impl Evaluand {
-    /// Reads what the user wants to be evaluated.
-    fn read(store: &Location, params: &Params) -> anyhow::Result<Self> {
-        let Some(run) = &params.run else { bail!("give --run NAME or --motions DIR") };
-        let generations = motions::of_run(store, run, params.num_samples.map(Into::into))?;
-        let phrases = Phrases::read(store, |rows| {
-            let with_motion = rows.values().filter(|row| row.has_motion);
-            let truth = with_motion.map(|row| row.phrase_id.clone());
-            generations.iter().map(|row| row.phrase_id.clone()).chain(truth).collect()
-        })?;
-        let (splits, notes) = splits_of(store, &phrases, &generations)?;
-        let motions = generations
-            .iter()
-            .zip(splits)
-            .map(|(row, split)| Motion {
-                phrase_id: row.phrase_id.clone(),
-                sample: row.sample,
-                split,
-                misses: [row.control_error_mm, row.control_error_deg],
-            })
-            .collect();
-        Ok(Self {
-            run: run.clone(),
-            model: generations[0].model.clone(),
-            phrases,
-            motions,
-            generations,
-            postprocess: PostProcessConfig::default(),
-            n_candidates: 1,
-            notes,
-        })
-    }
-
-    /// Reads the frames of a motion.
-    fn frames(&self, store: &Location, i: usize) -> anyhow::Result<Array2<f32>> {
-        let motion = &self.motions[i];
-        let sample = usize::try_from(motion.sample).unwrap_or(0);
-        generated_frames(store, &self.run, &motion.phrase_id, sample)
-    }
-
-    fn length_s(&self) -> f64 {
-        let n_frames: i64 = self.generations.iter().map(|row| row.n_frames).sum();
-        frames_to_s(usize::try_from(n_frames).unwrap_or(0))
-    }
-
-    /// Returns a digest of the motions, of the splits that they are in, and of real motion.
-    fn input_hash(&self, data_hash: &str) -> String {
-        let mut text = data_hash.to_owned();
-        for (row, motion) in self.generations.iter().zip(&self.motions) {
-            text.push_str(&format!(
-                "\n{} {} {} {} {}",
-                row.generation,
-                row.candidate,
-                row.weights,
-                row.time.0,
-                motion.split.name()
-            ));
-        }
-        digest(text.as_bytes())
-    }
-
-    /// Measures the motions, and all that they are compared with.
-    fn evaluate(
-        &mut self,
-        store: &Location,
-        params: &Params,
-        data_hash: &str,
-        progress: &dyn Progress,
-    ) -> anyhow::Result<Rows> {
-        let truth = match params.quick {
-            true => None,
-            false => truth::read(store, data_hash, params.threads, progress)?,
-        };
-        if let Some(truth) = &truth {
-            self.hear(store, truth)?;
-        }
-        let has_phase = self.phrases.has_beats();
-        let holds = |check: &str| holds_by_construction(check, &self.postprocess, has_phase);
-        let job = Job {
-            params,
-            store,
-            motions: &self.motions,
-            phrases: &self.phrases,
-            truth: truth.as_ref(),
-            holds: &holds,
-            phase: if self.postprocess.relock_phase {
-                PhaseOrigin::Relocked
-            } else {
-                PhaseOrigin::Own
-            },
-            has_raw: true,
-            has_network: params.baseline_windows > 0,
-            sampled_split: None,
-        };
-        let evaluated = self.measured(store, &job, progress)?;
-        let name = RunName { run: &self.run, model: &self.model };
-        let mut rows = Rows::default();
-        for (motion, found) in self.motions.iter().zip(&evaluated) {
-            let (id, sample) = (motion.phrase_id.as_str(), motion.sample);
-            if let Some(decoded) = &found.decoded {
-                let none = |_: &str| false;
-                let raw = rows::checks(name, id, sample, MadeAt::Raw, &decoded.checks, &none);
-                rows.checks.extend(raw);
-            }
-            let is = rows::checks(name, id, sample, MadeAt::Final, &found.is.checks, &holds);
-            rows.checks.extend(is);
-        }
-        if !params.quick {
-            let found = job.numbers(&evaluated, &[], progress)?;
-            rows.add(name, found, &|song| self.phrases.song_name(song));
-        }
-        Ok(rows)
-    }
-
-    /// Reads the activity of the songs that were danced to, and of those with held-out real motion.
-    fn hear(&mut self, store: &Location, truth: &Truth) -> Result<(), StoreError> {
-        let held_out = truth.phrases.iter().filter(|phrase| is_held_out(phrase.split));
-        let ids = self.motions.iter().map(|motion| motion.phrase_id.as_str());
-        let songs = self.phrases.songs_of(ids.chain(held_out.map(|phrase| phrase.id.as_str())));
-        let songs: BTreeSet<String> = songs.into_iter().take(MAX_HEARD_SONGS).collect();
-        let mut heard: Vec<(String, Array2<f32>)> = Vec::new();
-        Snapshot::take(store, tables::features())?.visit_items(&songs, |id, features| {
-            heard.push((id.to_owned(), features));
-            Ok::<_, StoreError>(())
-        })?;
-        for (id, features) in heard {
-            self.phrases.add_features(&id, features.view());
-        }
-        Ok(())
-    }
-
-    /// Reads and measures the motions of a run.
-    fn measured(
-        &self,
-        store: &Location,
-        job: &Job,
-        progress: &dyn Progress,
-    ) -> anyhow::Result<Vec<Evaluated>> {
-        let n_frames: i64 = self.generations.iter().map(|row| row.n_frames).sum();
-        let stride = stride_for(usize::try_from(n_frames).unwrap_or(MAX_KEPT_FRAMES));
-        let measurer = job.measurer(stride);
-        let places: BTreeMap<&str, usize> =
-            self.generations.iter().map(|row| row.generation.as_str()).zip(0..).collect();
-        let names: BTreeSet<String> =
-            self.generations.iter().map(|row| row.generation.clone()).collect();
-        progress.start("evaluate", "motions", self.motions.len() as u64);
-        let read = |schema| -> Result<Vec<Option<MeasuredMotion>>, StoreError> {
-            let table = Snapshot::take(store, schema)?;
-            measurer.run(self.motions.len(), |give| {
-                table.visit_items(&names, |name, frames: Array2<f32>| {
-                    if let Some(&i) = places.get(name) {
-                        give(i, frames);
-                        progress.advance(1);
-                    }
-                    Ok::<_, StoreError>(())
-                })
-            })
-        };
-        let is = read(tables::generated())?;
-        progress.finish();
-        let missing = self.generations.iter().zip(&is).find(|(_, found)| found.is_none());
-        if let Some((row, _)) = missing {
-            bail!(
-                "store {store} has no frames of {}, though it lists the motion; run motiongen generate \
-                 again with --force",
-                row.generation
-            );
-        }
-        let evaluated =
-            is.into_iter().flatten().map(|is| Evaluated { is, decoded: None }).collect();
-        Ok(evaluated)
-    }
-}
-
-/// Returns what the model that made each motion had to do with its music, as the card says, and a note where that is
-/// not known.
-fn splits_of(
-    store: &Location,
-    phrases: &Phrases,
-    generations: &[GenerationRow],
-) -> anyhow::Result<(Vec<MusicSplit>, Vec<String>)> {
-    let mut models: BTreeMap<(&str, &str), Option<LearnedFrom>> = BTreeMap::new();
-    let mut notes = Vec::new();
-    for row in generations {
-        let key = (row.model.as_str(), row.weights.as_str());
-        if models.contains_key(&key) {
-            continue;
-        }
-        let learned_from = match learned::of_model(store, key.0, key.1)? {
-            Ok(learned_from) => Some(learned_from),
-            Err(why) => {
-                notes.push(format!(
-                    "Nobody knows which of these songs model {} learned from: {why}.",
-                    row.model
-                ));
-                None
-            }
-        };
-        models.insert(key, learned_from);
-    }
-    let split = |row: &GenerationRow| -> MusicSplit {
-        let learned_from = models.get(&(row.model.as_str(), row.weights.as_str()));
-        match (learned_from, phrases.row(&row.phrase_id)) {
-            (Some(Some(learned_from)), Some(phrase)) => {
-                learned_from.split_of(phrase.song_hash.as_deref(), &phrase.content_hash)
-            }
-            _ => MusicSplit::Unknown,
-        }
-    };
-    Ok((generations.iter().map(split).collect(), notes))
 }
 
 /// A required verdict that was not won, and how it ended.
@@ -389,6 +152,8 @@ struct EvaluateSummary {
     length_s: f64,
     is_up_to_date: bool,
     has_metrics: bool,
+    /// Files that hold no motion, and why.
+    refused: Vec<Refused>,
     missed: Vec<Missed>,
     not_won: Vec<NotWon>,
     report: Report,
@@ -414,6 +179,8 @@ impl Summary for EvaluateSummary {
         for (set, share, least, _) in &self.missed {
             writeln!(out, "  {set} checks: {share:.3} of the motions pass all, below {least}")?;
         }
+        let refused = self.refused.iter().map(|refused| (&refused.name, &refused.failure));
+        write_failures(out, refused, Some(store))?;
         if let Some(page) = &self.page {
             writeln!(out, "  report {}", page.display())?;
         }
@@ -434,5 +201,6 @@ impl Summary for EvaluateSummary {
 
     fn n_failed(&self) -> u64 {
         self.missed.iter().map(|(.., n)| *n as u64).sum::<u64>() + self.not_won.len() as u64
+            + self.refused.len() as u64
     }
 }

@@ -6,6 +6,7 @@ use anyhow::bail;
 
 use ndarray::ArrayView2;
 
+use super::foreign;
 use crate::audio::BLOCKS;
 use crate::evaluation::locking::since_start;
 use crate::evaluation::metrics::Music;
@@ -51,6 +52,20 @@ pub fn of_run(store: &Location, run: &str, n: Option<usize>) -> anyhow::Result<V
     Ok(rows)
 }
 
+/// Whether generate made motions of a run's name.
+///
+/// # Errors
+/// [`StoreError`].
+pub fn has_run(store: &Location, run: &str) -> Result<bool, StoreError> {
+    let table = Snapshot::take(store, GenerationRow::schema())?;
+    let mut is_there = false;
+    table.rows_where(|row: &GenerationRow| {
+        is_there |= row.run == run;
+        false
+    })?;
+    Ok(is_there)
+}
+
 /// What the store says of phrases: their songs and beats.
 pub struct Phrases {
     rows: HashMap<String, PhraseRow>,
@@ -62,18 +77,21 @@ pub struct Phrases {
 }
 
 impl Phrases {
-    /// Reads the phrases of a store, and the beats of `wanted`.
+    /// Reads the phrases of a store, and the beats of those that were danced to and of those with real motion.
     ///
     /// # Errors
     /// [`StoreError`].
-    pub fn read(
+    pub fn read<'a>(
         store: &Location,
-        wanted: impl FnOnce(&HashMap<String, PhraseRow>) -> BTreeSet<String>,
+        danced_to: impl IntoIterator<Item = &'a str>,
     ) -> Result<Self, StoreError> {
         let rows: Vec<PhraseRow> = Snapshot::take(store, PhraseRow::schema())?.rows()?;
         let songs: BTreeSet<String> = rows.iter().map(song_of).map(str::to_owned).collect();
+        let with_motion = rows.iter().filter(|row| row.has_motion);
+        let mut wanted: BTreeSet<String> = with_motion.map(|row| row.phrase_id.clone()).collect();
+        wanted.extend(danced_to.into_iter().map(str::to_owned));
         let rows = rows.into_iter().map(|row| (row.phrase_id.clone(), row)).collect();
-        let beats = beats_of(store, &wanted(&rows))?;
+        let beats = beats_of(store, &wanted)?;
         let songs = songs.into_iter().zip(0..).collect();
         Ok(Self { rows, songs, beats, activities: HashMap::new() })
     }
@@ -81,6 +99,18 @@ impl Phrases {
     /// Returns what the table says of a phrase.
     pub fn row(&self, phrase_id: &str) -> Option<&PhraseRow> {
         self.rows.get(phrase_id)
+    }
+
+    /// Returns the phrases that motion of another program can be for, in order of name.
+    pub fn foreign_phrases(&self) -> Vec<foreign::Phrase<'_>> {
+        let mut found: BTreeMap<&str, foreign::Phrase> = BTreeMap::new();
+        #[expect(clippy::iter_over_hash_type, reason = "collected into a map that is in order")]
+        for (id, row) in &self.rows {
+            let n_frames = row.n_feature_frames.and_then(|n| usize::try_from(n).ok());
+            let n_frames = n_frames.or(Some((row.duration_s * FPS) as usize));
+            found.insert(id, foreign::Phrase { id, url: url_of(row), n_frames });
+        }
+        found.into_values().collect()
     }
 
     /// Whether some phrase has beats.

@@ -1,10 +1,13 @@
 //! What was found, as rows of tables, and the tables' commits.
 
+use super::foreign::Refused;
 use super::job::{Found, Stage as MadeAt};
 use super::{CHECKS, Evaluate};
 use crate::evaluation::{Check, CheckSet};
 use crate::stages::Stage as _;
-use crate::store::tables::{MetricRow, SanityCheckRow, SongMetricRow, VerdictRow};
+use crate::store::tables::{
+    FailureRow, MetricRow, SanityCheckRow, SongMetricRow, VerdictRow,
+};
 use crate::store::{
     Commit, Item as Settled, Ledger, Location, Row, Snapshot, StoreError, TimestampUs,
 };
@@ -202,8 +205,36 @@ impl Known<'_> {
     ///
     /// # Errors
     /// [`StoreError`].
-    pub fn commit_checks(&self, rows: &Rows) -> Result<(), StoreError> {
-        self.commit(CHECKS, |commit| write(commit, &rows.checks))
+    pub fn commit_checks(&self, rows: &Rows, refused: &[Refused]) -> Result<(), StoreError> {
+        self.commit(CHECKS, |commit, ledger| {
+            write(commit, &rows.checks)?;
+            let item = |refused: &Refused| format!("{}/{}", self.run, refused.name);
+            let mut failures: Vec<FailureRow> = Vec::new();
+            for refused in refused {
+                let failure = Some(refused.failure.digest());
+                let id = item(refused);
+                failures.push(FailureRow {
+                    stage: Evaluate::NAME.to_owned(),
+                    phrase_id: id.clone(),
+                    source: refused.failure.path.clone(),
+                    kind: refused.failure.kind.name().to_owned(),
+                    message: refused.failure.message.clone(),
+                    time: TimestampUs::now(),
+                });
+                let (fingerprint, input_hash) = (String::new(), self.input_hash.to_owned());
+                commit.settle(Settled { id, fingerprint, input_hash, failure }, ledger);
+            }
+            failures.sort_by(|a, b| a.phrase_id.cmp(&b.phrase_id));
+            // Files that were refused before and are sound now, or gone, leave the table.
+            let prefix = format!("{}/", self.run);
+            let gone = ledger.failed(ITEMS_FROM).into_iter().filter(|id| {
+                id.starts_with(&prefix) && failures.iter().all(|row| row.phrase_id != **id)
+            });
+            for id in gone {
+                commit.settle(Settled::forgotten(id), ledger);
+            }
+            write(commit, &failures)
+        })
     }
 
     /// Writes numbers and verdicts, in one commit.
@@ -211,7 +242,7 @@ impl Known<'_> {
     /// # Errors
     /// [`StoreError`].
     pub fn commit_numbers(&self, rows: &Rows) -> Result<(), StoreError> {
-        self.commit(Evaluate::NAME, |commit| {
+        self.commit(Evaluate::NAME, |commit, _| {
             write(commit, &rows.metrics)?;
             write(commit, &rows.verdicts)?;
             write(commit, &rows.songs)
@@ -221,11 +252,11 @@ impl Known<'_> {
     fn commit(
         &self,
         stage: &'static str,
-        write: impl FnOnce(&mut Commit) -> Result<(), StoreError>,
+        write: impl FnOnce(&mut Commit, &Ledger) -> Result<(), StoreError>,
     ) -> Result<(), StoreError> {
         let ledger = Ledger::read(self.store, stage)?;
         let mut commit = Commit::new(self.store, stage, self.params_hash, ITEMS_FROM);
-        write(&mut commit)?;
+        write(&mut commit, &ledger)?;
         let item = Settled {
             id: self.run.to_owned(),
             fingerprint: self.input_hash.to_owned(),

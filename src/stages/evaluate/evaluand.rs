@@ -1,0 +1,506 @@
+//! What is evaluated: the motions of a run of generate, or those of any program.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+use anyhow::{Context as _, bail, ensure};
+use ndarray::{Array2, s};
+
+use super::baselines::{self, Baseline, MusicWindow, RunSettings};
+use super::foreign::{self, ForeignMotions, Refused};
+use super::job::{Evaluated, Job, Motion, SampledWindow, Stage as MadeAt};
+use super::measure::{MAX_KEPT_FRAMES, MeasuredMotion, stride_for};
+use super::motions::{self, Phrases, is_held_out};
+use super::params::Params;
+use super::rows::{self, Rows, RunName};
+use super::splits::{MusicSplit, telling};
+use super::subjects::Subject;
+use super::truth::{self, Truth};
+use crate::evaluation::holds_by_construction;
+use crate::evaluation::metrics::PhaseOrigin;
+use crate::evaluation::window::window_starts;
+use crate::generation::LearnedFrom;
+use crate::motion::postprocess::PostProcessConfig;
+use crate::stages::generate::MotionSettings;
+use crate::stages::learned;
+use crate::stages::model_files::{OpenModel, default_model_cache};
+use crate::stages::motion_source::generated_frames;
+use crate::stages::Progress;
+use crate::store::tables::{self, GenerationRow};
+use crate::store::{Location, Snapshot, StoreError, digest};
+use crate::units::frames_to_s;
+
+/// Songs whose activity is read; that of others counts as its mean.
+const MAX_HEARD_SONGS: usize = 500;
+
+/// What is evaluated.
+pub struct Evaluand {
+    pub run: String,
+    pub model: String,
+    pub phrases: Phrases,
+    pub motions: Vec<Motion>,
+    /// What generate said of them, in the same order; none of motions of another program.
+    pub generations: Vec<GenerationRow>,
+    /// Candidates that each motion was chosen from, at most.
+    pub n_candidates: usize,
+    /// What is to be known beside the numbers.
+    pub notes: Vec<String>,
+    /// Files that hold no motion.
+    pub refused: Vec<Refused>,
+    /// Lengths of the motions, frames.
+    n_frames: Vec<usize>,
+    /// How motions were processed; nothing was done to those of another program.
+    postprocess: PostProcessConfig,
+    /// Files of motions of another program.
+    files: Option<ForeignMotions>,
+    /// Whether motions say a phase.
+    has_phase: bool,
+}
+
+impl Evaluand {
+    /// Reads what the user wants to be evaluated.
+    ///
+    /// # Errors
+    /// When the store cannot be read, or one sentence where there are no motions.
+    pub fn read(store: &Location, params: &Params) -> anyhow::Result<Self> {
+        match (&params.run, &params.motions) {
+            (Some(run), _) => Self::of_run(store, run, params.num_samples.map(Into::into)),
+            (None, Some(folder)) => Self::of_folder(store, folder, params),
+            (None, None) => bail!("give --run NAME, or --motions DIR for those of another program"),
+        }
+    }
+
+    fn of_run(store: &Location, run: &str, most: Option<usize>) -> anyhow::Result<Self> {
+        let generations = motions::of_run(store, run, most)?;
+        let phrases =
+            Phrases::read(store, generations.iter().map(|row| row.phrase_id.as_str()))?;
+        let (splits, notes) = splits_of(store, &phrases, &generations)?;
+        let motions = generations
+            .iter()
+            .zip(splits)
+            .map(|(row, split)| Motion {
+                phrase_id: row.phrase_id.clone(),
+                sample: row.sample,
+                split,
+                misses: [row.control_error_mm, row.control_error_deg],
+            })
+            .collect();
+        let settings = |row: &GenerationRow| -> Option<MotionSettings> {
+            row.settings.as_ref().and_then(|text| serde_json::from_str(text).ok())
+        };
+        let settings: Vec<MotionSettings> = generations.iter().filter_map(settings).collect();
+        Ok(Self {
+            run: run.to_owned(),
+            model: generations[0].model.clone(),
+            phrases,
+            motions,
+            n_candidates: settings.iter().map(|settings| settings.best_of).max().unwrap_or(1),
+            notes,
+            refused: Vec::new(),
+            n_frames: generations
+                .iter()
+                .map(|row| usize::try_from(row.n_frames).unwrap_or(0))
+                .collect(),
+            postprocess: settings.into_iter().next().map(|s| s.postprocess).unwrap_or_default(),
+            generations,
+            files: None,
+            has_phase: true,
+        })
+    }
+
+    /// Reads the names of the files of a folder; motions are read when they are measured.
+    fn of_folder(store: &Location, folder: &Path, params: &Params) -> anyhow::Result<Self> {
+        let named = |path: &Path| path.file_name().map(|name| name.to_string_lossy().into_owned());
+        let absolute = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
+        let Some(run) = params.name.clone().or_else(|| named(&absolute)) else {
+            bail!("--motions {} has no name; give one with --name", folder.display());
+        };
+        crate::stages::train::session::check_run_name(&run)
+            .with_context(|| format!("--name {run}"))?;
+        let known = motions::has_run(store, &run)?;
+        ensure!(
+            !known,
+            "store {store} has a run \"{run}\" of generate, whose evaluation this one would replace; give \
+             another --name"
+        );
+        let all = Phrases::read(store, [])?;
+        let mut files = foreign::read(folder, &all.foreign_phrases())?;
+        if let Some(n) = params.num_samples {
+            files.keep(n.get());
+        }
+        let phrases =
+            Phrases::read(store, files.files.iter().map(|file| file.phrase_id.as_str()))?;
+        let mut refused = Refused::all(folder, std::mem::take(&mut files.failures));
+        // A look at every file, so that what holds no motion is known before the others are measured.
+        let (mut motions, mut n_frames, mut notes) = (Vec::new(), Vec::new(), Vec::new());
+        let mut has_phase = true;
+        let mut derived: BTreeMap<&'static str, usize> = BTreeMap::new();
+        let mut read = Vec::new();
+        for file in std::mem::take(&mut files.files) {
+            match file.read() {
+                Ok(motion) => {
+                    motions.push(Motion {
+                        phrase_id: file.phrase_id.clone(),
+                        sample: i32::try_from(file.sample).unwrap_or(i32::MAX),
+                        split: MusicSplit::Unknown,
+                        misses: [None; 2],
+                    });
+                    n_frames.push(motion.frames.nrows());
+                    has_phase &= motion.has_phase;
+                    if let Some(what) = motion.content.derived() {
+                        *derived.entry(what).or_default() += 1;
+                    }
+                    notes.extend(motion.note);
+                    read.push(file);
+                }
+                Err(failure) => refused.extend(Refused::all(folder, [(file.path, failure)])),
+            }
+        }
+        files.files = read;
+        ensure!(
+            !motions.is_empty(),
+            "--motions {} has no file that holds a motion for a phrase of the store: {}",
+            folder.display(),
+            refused.first().map_or_else(|| "it is empty".to_owned(), |r| r.failure.message.clone())
+        );
+        notes.truncate(MAX_NOTES);
+        notes.extend(derived.into_iter().map(|(what, n)| format!("Of {n} files {what}.")));
+        notes.push(
+            "Nobody knows which of these songs the motions were learned from, since another program made them."
+                .to_owned(),
+        );
+        Ok(Self {
+            run,
+            model: String::new(),
+            phrases,
+            motions,
+            generations: Vec::new(),
+            n_candidates: 1,
+            notes,
+            refused,
+            n_frames,
+            postprocess: PostProcessConfig::nothing(),
+            files: Some(files),
+            has_phase,
+        })
+    }
+
+    /// Returns the length of all motions together, s.
+    pub fn length_s(&self) -> f64 {
+        frames_to_s(self.n_frames.iter().sum())
+    }
+
+    /// Reads the frames of a motion.
+    ///
+    /// # Errors
+    /// One sentence where it is not there any more.
+    pub fn frames(&self, store: &Location, i: usize) -> anyhow::Result<Array2<f32>> {
+        if let Some(files) = &self.files {
+            let file = files.files.get(i).context("motions changed while they were evaluated")?;
+            return match file.read() {
+                Ok(motion) => Ok(motion.frames),
+                Err(failure) => bail!(failure.message),
+            };
+        }
+        let motion = &self.motions[i];
+        let sample = usize::try_from(motion.sample).unwrap_or(0);
+        generated_frames(store, &self.run, &motion.phrase_id, sample)
+    }
+
+    /// Returns a digest of the motions, of the splits that they are in, and of real motion.
+    ///
+    /// # Errors
+    /// When a file cannot be read.
+    pub fn input_hash(&self, data_hash: &str) -> anyhow::Result<String> {
+        let mut text = data_hash.to_owned();
+        for (row, motion) in self.generations.iter().zip(&self.motions) {
+            text.push_str(&format!(
+                "\n{} {} {} {} {}",
+                row.generation,
+                row.candidate,
+                row.weights,
+                row.time.0,
+                motion.split.name()
+            ));
+        }
+        for file in self.files.iter().flat_map(|files| &files.files) {
+            let bytes = std::fs::read(&file.path)
+                .with_context(|| format!("while reading {}", file.path.display()))?;
+            text.push_str(&format!("\n{} {} {}", file.phrase_id, file.sample, digest(&bytes)));
+        }
+        for refused in &self.refused {
+            text.push_str(&format!("\n{} {}", refused.name, refused.failure.message));
+        }
+        Ok(digest(text.as_bytes()))
+    }
+
+    /// Measures the motions, and all that they are compared with.
+    ///
+    /// # Errors
+    /// When the store cannot be read, or motions changed meanwhile.
+    pub fn evaluate(
+        &mut self,
+        store: &Location,
+        params: &Params,
+        data_hash: &str,
+        progress: &dyn Progress,
+    ) -> anyhow::Result<Rows> {
+        let truth = match params.quick {
+            true => None,
+            false => truth::read(store, data_hash, params.threads, progress)?,
+        };
+        if let Some(truth) = &truth {
+            self.hear(store, truth)?;
+        }
+        let told = telling(self.motions.iter().map(|motion| motion.split));
+        let sampled = match (params.quick, told) {
+            (false, Some(split)) => self.sampled(store, params, truth.as_ref(), split, progress)?,
+            _ => None,
+        };
+        let has_music = self.phrases.has_beats();
+        let holds = |check: &str| holds_by_construction(check, &self.postprocess, has_music);
+        let job = Job {
+            params,
+            store,
+            motions: &self.motions,
+            phrases: &self.phrases,
+            truth: truth.as_ref(),
+            holds: &holds,
+            phase: match (self.has_phase, self.postprocess.relock_phase) {
+                (false, _) => PhaseOrigin::Absent,
+                (true, true) => PhaseOrigin::Relocked,
+                (true, false) => PhaseOrigin::Own,
+            },
+            has_raw: self.files.is_none(),
+            has_network: self.files.is_none(),
+            sampled_split: told,
+        };
+        let evaluated = self.measured(store, &job, progress)?;
+        let name = RunName { run: &self.run, model: &self.model };
+        let mut rows = Rows::default();
+        for (motion, found) in self.motions.iter().zip(&evaluated) {
+            let (id, sample) = (motion.phrase_id.as_str(), motion.sample);
+            if let Some(decoded) = &found.decoded {
+                let none = |_: &str| false;
+                let raw = rows::checks(name, id, sample, MadeAt::Raw, &decoded.checks, &none);
+                rows.checks.extend(raw);
+            }
+            let is = rows::checks(name, id, sample, MadeAt::Final, &found.is.checks, &holds);
+            rows.checks.extend(is);
+        }
+        if !params.quick {
+            let sampled = sampled.unwrap_or_default();
+            let found = job.numbers(&evaluated, &sampled, progress)?;
+            rows.add(name, found, &|song| self.phrases.song_name(song));
+        }
+        Ok(rows)
+    }
+
+    /// Reads the activity of the songs that were danced to, and of those with held-out real motion.
+    fn hear(&mut self, store: &Location, truth: &Truth) -> Result<(), StoreError> {
+        let held_out = truth.phrases.iter().filter(|phrase| is_held_out(phrase.split));
+        let ids = self.motions.iter().map(|motion| motion.phrase_id.as_str());
+        let songs = self.phrases.songs_of(ids.chain(held_out.map(|phrase| phrase.id.as_str())));
+        let songs: BTreeSet<String> = songs.into_iter().take(MAX_HEARD_SONGS).collect();
+        let mut heard: Vec<(String, Array2<f32>)> = Vec::new();
+        Snapshot::take(store, tables::features())?.visit_items(&songs, |id, features| {
+            heard.push((id.to_owned(), features));
+            Ok::<_, StoreError>(())
+        })?;
+        for (id, features) in heard {
+            self.phrases.add_features(&id, features.view());
+        }
+        Ok(())
+    }
+
+    /// Samples the untrained network, and the trained one without music, for windows of the music of a split; none,
+    /// and a note, where the model is not there.
+    fn sampled(
+        &mut self,
+        store: &Location,
+        params: &Params,
+        truth: Option<&Truth>,
+        split: MusicSplit,
+        progress: &dyn Progress,
+    ) -> anyhow::Result<Option<Vec<SampledWindow>>> {
+        let most = params.baseline_windows;
+        let (Some(row), true) = (self.generations.first(), most > 0) else { return Ok(None) };
+        let is_there = learned::has_weights(store, &row.model, &row.weights)?;
+        if !is_there {
+            self.notes.push(format!(
+                "Store {store} has no model \"{}\" with the weights that the motions were made with, so that its \
+                 untrained network could not be sampled as a baseline.",
+                row.model
+            ));
+            return Ok(None);
+        }
+        let model = OpenModel::of_store(store, &row.model, &default_model_cache())?;
+        let settings = RunSettings::of_run(row, &model.card)?;
+        let length = truth.map_or(model.card.window_frames, |truth| truth.statistics.window_frames);
+        let windows = self.music_windows(store, split, length, most)?;
+        let request = baselines::Request {
+            store,
+            model: &model,
+            settings: &settings,
+            seed: BASELINE_SEED,
+            windows: &windows,
+            threads: params.threads,
+        };
+        let mut sampled = Vec::new();
+        for (baseline, subject) in
+            [(Baseline::Untrained, Subject::Untrained), (Baseline::NoMusic, Subject::NoMusic)]
+        {
+            let motions = baselines::sample(baseline, &request, progress)?;
+            sampled.extend(windows.iter().zip(motions).map(|(window, motion)| SampledWindow {
+                subject,
+                phrase_id: window.phrase_id.clone(),
+                first_frame: window.first_frame,
+                frames: motion.frames,
+            }));
+        }
+        Ok(Some(sampled))
+    }
+
+    /// Returns up to `most` windows of the music of a split, evenly among all of up to as many phrases.
+    fn music_windows(
+        &self,
+        store: &Location,
+        split: MusicSplit,
+        length: usize,
+        most: usize,
+    ) -> Result<Vec<MusicWindow>, StoreError> {
+        let of_split = self.motions.iter().filter(|motion| motion.split == split);
+        let ids: BTreeSet<&str> = of_split.map(|motion| motion.phrase_id.as_str()).collect();
+        let mut order: Vec<&str> = ids.into_iter().collect();
+        order.sort_by_cached_key(|id| digest(id.as_bytes()));
+        order.truncate(most);
+        let names: BTreeSet<String> = order.iter().map(|id| (*id).to_owned()).collect();
+        let mut all: BTreeMap<String, Vec<MusicWindow>> = BTreeMap::new();
+        Snapshot::take(store, tables::features())?.visit_items(
+            &names,
+            |id, features: Array2<f32>| {
+                let n_frames = features.nrows();
+                let phase = self.phrases.music(id, n_frames).map(|music| {
+                    music.bars.iter().map(|bars| bars.rem_euclid(1.0)).collect::<Vec<f64>>()
+                });
+                let window = |first: usize| MusicWindow {
+                    phrase_id: id.to_owned(),
+                    first_frame: first,
+                    features: features.slice(s![first..first + length, ..]).to_owned(),
+                    phase: phase.as_ref().map(|phase| phase[first..first + length].to_vec()),
+                };
+                let windows = window_starts(n_frames, length).map(window).collect();
+                all.insert(id.to_owned(), windows);
+                Ok::<_, StoreError>(())
+            },
+        )?;
+        let all: Vec<MusicWindow> = all.into_values().flatten().collect();
+        let n = most.min(all.len());
+        Ok((0..n).map(|i| all[i * all.len() / n].clone()).collect())
+    }
+
+    /// Reads and measures the motions, as they are and as they were decoded.
+    fn measured(
+        &self,
+        store: &Location,
+        job: &Job,
+        progress: &dyn Progress,
+    ) -> anyhow::Result<Vec<Evaluated>> {
+        let stride = stride_for(self.n_frames.iter().sum::<usize>().max(1).min(usize::MAX / 2));
+        debug_assert!(stride >= 1 && MAX_KEPT_FRAMES > 0);
+        let measurer = job.measurer(stride);
+        progress.start("evaluate", "motions", self.motions.len() as u64);
+        if let Some(files) = &self.files {
+            let found = measurer.run(files.files.len(), |give| {
+                for (i, file) in files.files.iter().enumerate() {
+                    let motion = file.read().map_err(|failure| anyhow::anyhow!(failure.message))?;
+                    give(i, motion.frames);
+                    progress.advance(1);
+                }
+                anyhow::Ok(())
+            })?;
+            progress.finish();
+            return Ok(found
+                .into_iter()
+                .flatten()
+                .map(|is| Evaluated { is, decoded: None })
+                .collect());
+        }
+        let places: BTreeMap<&str, usize> =
+            self.generations.iter().map(|row| row.generation.as_str()).zip(0..).collect();
+        let names: BTreeSet<String> =
+            self.generations.iter().map(|row| row.generation.clone()).collect();
+        let read = |schema, advances: bool| -> Result<Vec<Option<MeasuredMotion>>, StoreError> {
+            let table = Snapshot::take(store, schema)?;
+            measurer.run(self.motions.len(), |give| {
+                table.visit_items(&names, |name, frames: Array2<f32>| {
+                    if let Some(&i) = places.get(name) {
+                        give(i, frames);
+                        progress.advance(u64::from(advances));
+                    }
+                    Ok::<_, StoreError>(())
+                })
+            })
+        };
+        let decoded = read(tables::decoded(), false)?;
+        let is = read(tables::generated(), true)?;
+        progress.finish();
+        let missing = self.generations.iter().zip(&is).find(|(_, found)| found.is_none());
+        if let Some((row, _)) = missing {
+            bail!(
+                "store {store} has no frames of {}, though it lists the motion; run motiongen generate \
+                 again with --force",
+                row.generation
+            );
+        }
+        Ok(is
+            .into_iter()
+            .flatten()
+            .zip(decoded)
+            .map(|(is, decoded)| Evaluated { is, decoded })
+            .collect())
+    }
+}
+
+/// Notes on single files that are told; the table of failures has all that were refused.
+const MAX_NOTES: usize = 5;
+/// Seed of the noise of baselines, so that two evaluations sample the same.
+const BASELINE_SEED: u64 = 2026;
+
+/// Returns what the model that made each motion had to do with its music, as the card says, and a note where that is
+/// not known.
+fn splits_of(
+    store: &Location,
+    phrases: &Phrases,
+    generations: &[GenerationRow],
+) -> anyhow::Result<(Vec<MusicSplit>, Vec<String>)> {
+    let mut models: BTreeMap<(&str, &str), Option<LearnedFrom>> = BTreeMap::new();
+    let mut notes = Vec::new();
+    for row in generations {
+        let key = (row.model.as_str(), row.weights.as_str());
+        if models.contains_key(&key) {
+            continue;
+        }
+        let learned_from = match learned::of_model(store, key.0, key.1)? {
+            Ok(learned_from) => Some(learned_from),
+            Err(why) => {
+                notes.push(format!(
+                    "Nobody knows which of these songs model {} learned from: {why}.",
+                    row.model
+                ));
+                None
+            }
+        };
+        models.insert(key, learned_from);
+    }
+    let split = |row: &GenerationRow| -> MusicSplit {
+        let learned_from = models.get(&(row.model.as_str(), row.weights.as_str()));
+        match (learned_from, phrases.row(&row.phrase_id)) {
+            (Some(Some(learned_from)), Some(phrase)) => {
+                learned_from.split_of(phrase.song_hash.as_deref(), &phrase.content_hash)
+            }
+            _ => MusicSplit::Unknown,
+        }
+    };
+    Ok((generations.iter().map(split).collect(), notes))
+}
