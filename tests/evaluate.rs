@@ -307,8 +307,9 @@ fn evaluating_again_does_nothing_and_with_force_finds_the_same() {
     let compared = evaluate(&store, "locked", &["--force", "--against=other"]);
     assert!(
         compared.stdout.contains(
-            "compared with other, 168 numbers: 148 equal, 20 not measured\n  weights: other weights of \
-             there, locked weights o here\n"
+            "compared with other, 168 numbers: 148 equal, 20 not measured\n  No number is paired song by \
+             song, so that none is called better or worse\n  weights: other weights of there, locked \
+             weights o here\n"
         ),
         "{compared:?}"
     );

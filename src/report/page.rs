@@ -111,8 +111,11 @@ fn picture(out: &mut String, motion: &Worst) {
 mod tests {
     use proptest::prelude::*;
 
-    use super::super::example::{example, metric};
-    use super::super::{Against, CheckLine, Metric, Outcome, Paired, Verdict, VerdictTest};
+    use super::super::example::{example, metric, with_interval};
+    use super::super::names::SUBJECTS;
+    use super::super::{
+        Against, BY_CONSTRUCTION, CheckLine, Metric, Outcome, Paired, Verdict, VerdictTest,
+    };
     use super::*;
 
     #[test]
@@ -162,7 +165,18 @@ mod tests {
     #[ignore = "writes a file"]
     fn example_page_to_look_at() {
         let file = std::env::var_os("MOTIONGEN_PAGE").expect("MOTIONGEN_PAGE names a file");
-        std::fs::write(file, page(&example())).expect("written");
+        let mut report = example();
+        for (i, (subject, _)) in SUBJECTS.into_iter().enumerate() {
+            let x = 0.1 + 0.1 * i as f64;
+            let of = |name, value| metric(subject, "held_out", name, "", value);
+            let coupled = with_interval(of("coupling_ratio", Some(x)), x - 0.05, x + 0.05);
+            let relocked = Metric {
+                protocol: format!("the phase was relocked, {BY_CONSTRUCTION}"),
+                ..of("phase_error", None)
+            };
+            report.metrics.extend([coupled, relocked, of("share_upright", Some(1.1 - x))]);
+        }
+        std::fs::write(file, page(&report)).expect("written");
     }
 
     #[test]
