@@ -30,7 +30,8 @@ use crate::stages::plot::nearest::nearest;
 use crate::store::digest;
 use names::Names;
 
-/// Files that match nothing which are told the nearest names: each costs a look at every phrase.
+/// Failures up to which a file that matches nothing is told the nearest names: each costs a look at every
+/// phrase.
 const MAX_NEAREST: usize = 100;
 /// Share of its music's length by which a motion may be longer or shorter without a note.
 const LENGTH_TOLERANCE: f64 = 0.1;
@@ -135,18 +136,16 @@ pub fn read(dir: &Path, phrases: &[Phrase]) -> anyhow::Result<ForeignMotions> {
     );
     paths.sort();
     let names = Names::new(phrases);
-    let mut n_unmatched = 0;
     let mut taken: BTreeMap<(usize, usize), PathBuf> = BTreeMap::new();
     for path in paths {
         let name = names::name_below(dir, &path);
         let Some((phrase, sample)) = names.find(&name) else {
-            let near = if n_unmatched < MAX_NEAREST {
+            let near = if found.failures.len() < MAX_NEAREST {
                 let all = phrases.iter().map(|phrase| phrase.id.to_owned());
                 format!("; nearest: {}", nearest(&name, all))
             } else {
                 String::new()
             };
-            n_unmatched += 1;
             let message = format!(
                 "{}: is named after no phrase of the store{near}; name it PHRASE.npy, or PHRASE.0.npy, \
                  PHRASE.1.npy and so on for several motions of one phrase",
