@@ -42,10 +42,16 @@ pub enum StoreError {
     Manifest { place: String, reason: String },
 
     #[error(
-        "table {table}: {place} has schema version {found}, this program reads version {supported}; \
-         {remedy}"
+        "table {table}: {place} has schema version {found}, this program reads {supported}; {remedy}"
     )]
-    SchemaVersion { table: String, place: String, found: u32, supported: u32, remedy: &'static str },
+    SchemaVersion {
+        table: String,
+        place: String,
+        found: u32,
+        /// The versions that are read, such as `version 2`.
+        supported: String,
+        remedy: &'static str,
+    },
 
     #[error("table {table}: {place} is not a readable Parquet part")]
     Parquet {

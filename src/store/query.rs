@@ -1,6 +1,6 @@
 //! SQL over the tables of a store: the one file that knows polars.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write;
 use std::str::FromStr;
 
@@ -12,7 +12,7 @@ use polars::sql::{SQLContext, extract_table_identifiers};
 use super::commit::{LivePart, live_parts};
 use super::location::{Kind, Location};
 use super::reader::check_version;
-use super::schema::{ColumnType, TableSchema};
+use super::schema::{Column as TableColumn, ColumnType, TableSchema};
 use super::tables;
 use super::{ClientOptions, StoreError};
 
@@ -69,7 +69,7 @@ pub struct TableInfo {
 ///
 /// # Errors
 /// [`StoreError::Query`] in the user's terms: an unknown column or table comes with the nearest
-/// names; [`StoreError::SchemaVersion`] when a part is of another version.
+/// names; [`StoreError::SchemaVersion`] when a part is of a version that is not read.
 pub fn query(store: &Location, sql: &str, options: &ClientOptions) -> Result<Answer, StoreError> {
     let verb = sql.split_whitespace().next().unwrap_or_default().to_lowercase();
     if CHANGING.contains(&verb.as_str()) {
@@ -199,23 +199,49 @@ fn scan(
         check_version(store, schema, part)?;
     }
     let failed = |e: PolarsError| StoreError::Query(first_line(&e));
-    // Whole parts are scanned together; a part with superseded rows gets a filter of its own.
+    // Whole parts of one version are scanned together; a part with superseded rows gets a filter of its own.
     let (whole, partial): (Vec<_>, Vec<_>) = live.iter().partition(|l| l.superseded.is_empty());
+    let mut by_version: BTreeMap<u32, Vec<&LivePart>> = BTreeMap::new();
+    for part in whole {
+        by_version.entry(part.part.schema_version).or_default().push(part);
+    }
     let mut frames = Vec::new();
-    if !whole.is_empty() {
-        frames.push(scan_parts(store, &whole, options)?);
+    for (version, parts) in by_version {
+        frames.push(completed(scan_parts(store, &parts, options)?, schema, version)?);
     }
     for part in partial {
         let item = schema.item_column();
         let superseded = Series::new(item.into(), part.superseded.as_slice());
         let dead = col(item).is_in(lit(superseded).implode(false), false);
-        frames.push(scan_parts(store, &[part], options)?.filter(dead.not()));
+        let frame = scan_parts(store, &[part], options)?.filter(dead.not());
+        frames.push(completed(frame, schema, part.part.schema_version)?);
     }
     match frames.len() {
         0 => Ok(empty(schema).lazy()),
         1 => Ok(frames.remove(0)),
         _ => concat(frames, UnionArgs::default()).map_err(failed),
     }
+}
+
+/// Returns the rows of parts of a version that is read, with nulls in the nullable columns that are newer.
+fn completed(
+    mut frame: LazyFrame,
+    schema: &TableSchema,
+    version: u32,
+) -> Result<LazyFrame, StoreError> {
+    if version >= schema.version {
+        return Ok(frame);
+    }
+    let found = frame.collect_schema().map_err(|e| StoreError::Query(first_line(&e)))?;
+    let column = |column: &TableColumn| {
+        let name = column.name.as_ref();
+        if found.contains(name) || !column.nullable {
+            col(name)
+        } else {
+            lit(NULL).cast(data_type(column.column_type)).alias(name)
+        }
+    };
+    Ok(frame.select(schema.columns.iter().map(column).collect::<Vec<_>>()))
 }
 
 fn scan_parts(
@@ -249,21 +275,21 @@ fn scan_parts(
 }
 
 fn empty(schema: &TableSchema) -> DataFrame {
-    let columns = schema.columns.iter().map(|c| {
-        let data_type = match c.column_type {
-            ColumnType::Utf8 => DataType::String,
-            ColumnType::Boolean => DataType::Boolean,
-            ColumnType::Int32 => DataType::Int32,
-            ColumnType::Int64 => DataType::Int64,
-            ColumnType::Float32 => DataType::Float32,
-            ColumnType::Float64 => DataType::Float64,
-            ColumnType::TimestampUs => {
-                DataType::Datetime(TimeUnit::Microseconds, Some(TimeZone::UTC))
-            }
-        };
-        Field::new(c.name.as_ref().into(), data_type)
-    });
+    let columns =
+        schema.columns.iter().map(|c| Field::new(c.name.as_ref().into(), data_type(c.column_type)));
     DataFrame::empty_with_schema(&columns.collect())
+}
+
+fn data_type(column_type: ColumnType) -> DataType {
+    match column_type {
+        ColumnType::Utf8 => DataType::String,
+        ColumnType::Boolean => DataType::Boolean,
+        ColumnType::Int32 => DataType::Int32,
+        ColumnType::Int64 => DataType::Int64,
+        ColumnType::Float32 => DataType::Float32,
+        ColumnType::Float64 => DataType::Float64,
+        ColumnType::TimestampUs => DataType::Datetime(TimeUnit::Microseconds, Some(TimeZone::UTC)),
+    }
 }
 
 /// Says what is wrong with a statement in terms of the store's tables.

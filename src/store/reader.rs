@@ -45,8 +45,8 @@ impl Snapshot {
     /// Takes a snapshot of a table; a table that nobody has written is empty.
     ///
     /// # Errors
-    /// [`StoreError::SchemaVersion`] when a part is of another version; [`StoreError`] when the
-    /// commits cannot be read.
+    /// [`StoreError::SchemaVersion`] when a part is of a version that is not read; [`StoreError`] when
+    /// the commits cannot be read.
     pub fn take(store: &Location, schema: TableSchema) -> Result<Self, StoreError> {
         let parts = live_parts(store)?.remove(schema.name).unwrap_or_default();
         Self::new(store, schema, parts, None)
@@ -124,6 +124,7 @@ impl Snapshot {
             };
             batches.map(move |batch| {
                 let batch = batch.map_err(failed)?;
+                let batch = self.schema.completed(batch, live.part.schema_version);
                 self.check_columns(&batch, &live.part.path)?;
                 without(&batch, column, &live.superseded).map_err(failed)
             })
@@ -202,7 +203,7 @@ pub(super) fn check_version(
     live: &LivePart,
 ) -> Result<(), StoreError> {
     let found = live.part.schema_version;
-    if found == schema.version {
+    if schema.reads(found) {
         return Ok(());
     }
     let remedy = if found > schema.version {
@@ -212,7 +213,8 @@ pub(super) fn check_version(
     };
     let place = store.url_of(&live.part.path);
     let table = schema.name.to_owned();
-    Err(StoreError::SchemaVersion { table, place, found, supported: schema.version, remedy })
+    let supported = schema.readable();
+    Err(StoreError::SchemaVersion { table, place, found, supported, remedy })
 }
 
 /// Returns the rows whose item is not among `superseded`.

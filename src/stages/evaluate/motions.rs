@@ -8,7 +8,8 @@ use crate::evaluation::locking::since_start;
 use crate::evaluation::metrics::Music;
 use crate::motion::bar_phase;
 use crate::motion::phase::unwrapped;
-use crate::stages::generate::{beats_in_bars, beats_of, url_of};
+use crate::stages::beats::{self, PhraseBeats};
+use crate::stages::generate::url_of;
 use crate::stages::plot::nearest::nearest;
 use crate::store::tables::{GenerationRow, PhraseRow};
 use crate::store::{Location, Row as _, Snapshot, StoreError, digest};
@@ -54,7 +55,7 @@ pub struct Phrases {
     songs: BTreeMap<String, usize>,
     /// Songs that something was learned from.
     learned: BTreeSet<String>,
-    beats: HashMap<String, Vec<f64>>,
+    beats: HashMap<String, PhraseBeats>,
 }
 
 impl Phrases {
@@ -75,7 +76,8 @@ impl Phrases {
         };
         let learned = rows.iter().filter(is_learned).map(song_of).map(str::to_owned).collect();
         let rows = rows.into_iter().map(|row| (row.phrase_id.clone(), row)).collect();
-        let beats = beats_of(store, &wanted(&rows))?;
+        let wanted = wanted(&rows);
+        let beats = beats::of_phrases(store, |id| wanted.contains(id))?;
         let songs = songs.into_iter().zip(0..).collect();
         Ok(Self { rows, songs, learned, beats })
     }
@@ -98,8 +100,7 @@ impl Phrases {
     /// Returns the music of the frames of a phrase, from its beats; none for too few of them.
     pub fn music(&self, phrase_id: &str, n_frames: usize) -> Option<Music> {
         let row = self.rows.get(phrase_id)?;
-        let numbered = self.beats.get(phrase_id).map(Vec::as_slice).unwrap_or_default();
-        let beats = beats_in_bars(numbered, row)?;
+        let beats = self.beats.get(phrase_id)?.in_bars(row)?;
         let times_s: Vec<f64> = (0..n_frames).map(frames_to_s).collect();
         let bars = unwrapped(&bar_phase(&times_s, &beats));
         Some(Music {

@@ -30,7 +30,7 @@ pub use params::{Params, SamplerName, Tracks};
 
 pub(in crate::stages) use files::listen;
 pub(in crate::stages) use maker::generation_id;
-pub(in crate::stages) use tracks::{beats_in_bars, beats_of, url_of};
+pub(in crate::stages) use tracks::url_of;
 
 /// The stage.
 pub struct Generate;
