@@ -102,6 +102,8 @@ pub fn commit_beats(store: &Path, phrase: &str, n_beats: i32) {
             beat,
             frame: 15 * beat,
             time_s: f64::from(beat) / 2.0,
+            number: None,
+            source: Some("tracker".to_owned()),
         })
         .collect();
     let schema = BeatRow::schema;

@@ -76,9 +76,9 @@ pub struct Beats {
 impl Beats {
     /// Beats at `times_s`, numbered from 1 in each bar when `numbers` are given.
     ///
-    /// Without `beats_per_bar` a bar has as many beats as the highest number, else 4. Errors:
-    /// [`BeatsError`] for fewer than two beats, times not finite, negative or not increasing,
-    /// numbers missing, out of range or without a downbeat.
+    /// Without `beats_per_bar` a bar has as many beats as the highest number, else 4. Beats of an excerpt
+    /// may be numbered without a downbeat among them. Errors: [`BeatsError`] for fewer than two beats,
+    /// times not finite, negative or not increasing, numbers missing or out of range.
     pub fn new(
         times_s: Vec<f64>,
         numbers: Option<Vec<i64>>,
@@ -116,7 +116,8 @@ impl Beats {
     /// Reads a beats file: one beat per line, `time_s` or `time_s beat_number`, `#` comments.
     ///
     /// Blank lines are skipped. Errors: [`BeatsError::Line`] with the line number and its first
-    /// 40 characters, [`BeatsError::TooLong`], and those of [`Beats::new`].
+    /// 40 characters, [`BeatsError::TooLong`], [`BeatsError::NoDownbeat`] where beats are numbered and none
+    /// is 1, and those of [`Beats::new`].
     pub fn parse(text: &str) -> Result<Self, BeatsError> {
         let text = text.strip_prefix('\u{feff}').unwrap_or(text);
         let mut times_s: Vec<f64> = Vec::new();
@@ -155,8 +156,11 @@ impl Beats {
             }
             times_s.push(time_s);
         }
+        let has_downbeat = numbers.is_empty() || numbers.contains(&1);
         let numbers = (!numbers.is_empty()).then_some(numbers);
-        Self::new(times_s, numbers, None)
+        let beats = Self::new(times_s, numbers, None)?;
+        // The highest number would be a guess at the bar.
+        if has_downbeat { Ok(beats) } else { Err(BeatsError::NoDownbeat) }
     }
 
     /// Beat times, s, strictly increasing, at least two.
@@ -190,10 +194,14 @@ impl Beats {
         median(&mut intervals).unwrap_or(1.0)
     }
 
-    /// Index of the first downbeat; the first beat when beats carry no numbers.
-    pub(super) fn first_downbeat(&self) -> usize {
-        let numbers = self.numbers.as_deref().unwrap_or_default();
-        numbers.iter().position(|&n| n == 1).unwrap_or(0)
+    /// Index of the first downbeat; the first beat when beats carry no numbers. Where no beat is numbered 1,
+    /// the downbeat before the first beat, counted back from its number.
+    pub(super) fn first_downbeat(&self) -> i64 {
+        let Some(numbers) = &self.numbers else { return 0 };
+        match numbers.iter().position(|&n| n == 1) {
+            Some(i) => i as i64,
+            None => 1 - numbers.first().copied().unwrap_or(1),
+        }
     }
 }
 
@@ -205,9 +213,6 @@ fn check_numbers(numbers: &[i64], n_times: usize, highest: u32) -> Result<(), Be
         if !(1..=i64::from(highest)).contains(&number) {
             return Err(BeatsError::Number { index, number, highest });
         }
-    }
-    if !numbers.contains(&1) {
-        return Err(BeatsError::NoDownbeat);
     }
     Ok(())
 }
@@ -317,6 +322,18 @@ mod tests {
     }
 
     #[test]
+    fn beats_of_an_excerpt_are_counted_from_their_first_number() {
+        let beats = Beats::new(vec![0.25, 0.75], Some(vec![3, 4]), Some(5)).unwrap();
+        let phase = bar_phase(&[0.25, 0.5, 0.75, 1.25, 1.75], &beats);
+        let want = [0.4, 0.5, 0.6, 0.8, 0.0];
+        assert!(phase.iter().zip(want).all(|(p, w)| (p - w).abs() < 1e-12), "{phase:?}");
+        // The whole song says the same of these times.
+        let song = Beats::new(vec![0.0, 0.25, 0.75, 1.25, 1.75], Some(vec![2, 3, 4, 5, 1]), None);
+        let of_song = bar_phase(&[0.25, 0.5, 0.75, 1.25, 1.75], &song.unwrap());
+        assert!(phase.iter().zip(of_song).all(|(p, w)| (p - w).abs() < 1e-12));
+    }
+
+    #[test]
     fn a_given_bar_length_wins() {
         let beats = Beats::new(vec![0.0, 1.0], None, Some(3)).unwrap();
         assert_eq!(beats.beats_per_bar_source(), BeatsPerBarSource::Given);
@@ -346,6 +363,7 @@ mod tests {
             "beats hold 1 beats, expected at least 2; a tempo needs two beat times"
         );
         assert_eq!(Beats::parse("0 2\n1 3\n"), Err(BeatsError::NoDownbeat));
+        assert!(matches!(Beats::parse("0 2\n"), Err(BeatsError::TooFew { found: 1 })));
         assert_eq!(
             Beats::new(vec![0.0, 2.0, 1.0], None, None).unwrap_err().to_string(),
             "beat 2 is at 1 s after 2 s; \

@@ -1,5 +1,6 @@
 //! Stages: what the user runs. Each has a contract, parameters, a run and a summary.
 
+pub mod beats;
 pub mod evaluate;
 pub mod export;
 pub mod extract;

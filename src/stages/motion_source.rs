@@ -7,11 +7,12 @@ use anyhow::{anyhow, bail, ensure};
 use ndarray::Array2;
 
 use super::Stage as _;
+use super::beats;
 use super::generate::generation_id;
 use super::ingest::{Ingest, read_beats, read_trajectory};
 use super::plot::nearest::nearest;
 use crate::motion::{Trajectory, exchange, npy};
-use crate::store::tables::{self, BeatRow, FailureRow, GenerationRow, PhraseRow};
+use crate::store::tables::{self, FailureRow, GenerationRow, PhraseRow};
 use crate::store::{ClientOptions, ItemTables, Location, Row as _, Snapshot, StoreError};
 
 /// Most motions that one page shows.
@@ -116,9 +117,7 @@ impl MotionParams {
                 (phrase.to_owned(), vec![Shown { name: phrase.to_owned(), motion, facts }])
             }
         };
-        let mut beats: Vec<BeatRow> = rows.rows()?;
-        beats.sort_by_key(|beat| beat.beat);
-        let beats_s = beats.into_iter().map(|beat| beat.time_s).collect();
+        let beats_s = beats::of_item(&rows)?.times_s().to_vec();
         Ok(Subject { title, shown, beats_s, phrase: known })
     }
 }

@@ -69,7 +69,7 @@ pub struct TableInfo {
 ///
 /// # Errors
 /// [`StoreError::Query`] in the user's terms: an unknown column or table comes with the nearest
-/// names; [`StoreError::SchemaVersion`] when a part is of another version.
+/// names; [`StoreError::SchemaVersion`] when a part is of a version that is not read.
 pub fn query(store: &Location, sql: &str, options: &ClientOptions) -> Result<Answer, StoreError> {
     let verb = sql.split_whitespace().next().unwrap_or_default().to_lowercase();
     if CHANGING.contains(&verb.as_str()) {
@@ -199,31 +199,49 @@ fn scan(
         check_version(store, schema, part)?;
     }
     let failed = |e: PolarsError| StoreError::Query(first_line(&e));
-    // Whole parts are scanned together; a part with superseded rows gets a filter of its own.
+    // Whole parts of one version are scanned together; a part with superseded rows gets a filter of its own.
     let (whole, partial): (Vec<_>, Vec<_>) = live.iter().partition(|l| l.superseded.is_empty());
     let mut by_version: BTreeMap<u32, Vec<&LivePart>> = BTreeMap::new();
     for part in whole {
         by_version.entry(part.part.schema_version).or_default().push(part);
     }
-    let read = |version: u32, parts: &[&LivePart]| {
-        let frame = scan_parts(store, parts, options)?;
-        if version == schema.version { Ok(frame) } else { completed(frame, schema).map_err(failed) }
-    };
     let mut frames = Vec::new();
     for (version, parts) in by_version {
-        frames.push(read(version, &parts)?);
+        frames.push(completed(scan_parts(store, &parts, options)?, schema, version)?);
     }
     for part in partial {
         let item = schema.item_column();
         let superseded = Series::new(item.into(), part.superseded.as_slice());
         let dead = col(item).is_in(lit(superseded).implode(false), false);
-        frames.push(read(part.part.schema_version, &[part])?.filter(dead.not()));
+        let frame = scan_parts(store, &[part], options)?.filter(dead.not());
+        frames.push(completed(frame, schema, part.part.schema_version)?);
     }
     match frames.len() {
         0 => Ok(empty(schema).lazy()),
         1 => Ok(frames.remove(0)),
         _ => concat(frames, UnionArgs::default()).map_err(failed),
     }
+}
+
+/// Returns the rows of parts of a version that is read, with nulls in the nullable columns that are newer.
+fn completed(
+    mut frame: LazyFrame,
+    schema: &TableSchema,
+    version: u32,
+) -> Result<LazyFrame, StoreError> {
+    if version >= schema.version {
+        return Ok(frame);
+    }
+    let found = frame.collect_schema().map_err(|e| StoreError::Query(first_line(&e)))?;
+    let column = |column: &TableColumn| {
+        let name = column.name.as_ref();
+        if found.contains(name) || !column.nullable {
+            col(name)
+        } else {
+            lit(NULL).cast(data_type(column.column_type)).alias(name)
+        }
+    };
+    Ok(frame.select(schema.columns.iter().map(column).collect::<Vec<_>>()))
 }
 
 fn scan_parts(
@@ -256,23 +274,10 @@ fn scan_parts(
     LazyFrame::scan_parquet_sources(sources, args).map_err(|e| StoreError::Query(first_line(&e)))
 }
 
-/// Adds the nullable columns that parts of an older version lack, null in every row.
-fn completed(mut frame: LazyFrame, schema: &TableSchema) -> PolarsResult<LazyFrame> {
-    let known = frame.collect_schema()?;
-    let columns: Vec<Expr> = schema
-        .columns
-        .iter()
-        .map(|c| match c.nullable && !known.contains(c.name.as_ref()) {
-            true => lit(NULL).cast(data_type(c.column_type)).alias(c.name.as_ref()),
-            false => col(c.name.as_ref()),
-        })
-        .collect();
-    Ok(frame.select(columns))
-}
-
 fn empty(schema: &TableSchema) -> DataFrame {
-    let field = |c: &TableColumn| Field::new(c.name.as_ref().into(), data_type(c.column_type));
-    DataFrame::empty_with_schema(&schema.columns.iter().map(field).collect())
+    let columns =
+        schema.columns.iter().map(|c| Field::new(c.name.as_ref().into(), data_type(c.column_type)));
+    DataFrame::empty_with_schema(&columns.collect())
 }
 
 fn data_type(column_type: ColumnType) -> DataType {

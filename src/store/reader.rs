@@ -4,8 +4,8 @@ use std::collections::BTreeSet;
 use std::ops::Range;
 use std::sync::Arc;
 
-use arrow_array::{Array as _, BooleanArray, RecordBatch, StringArray, new_null_array};
-use arrow_schema::{ArrowError, Schema};
+use arrow_array::{Array as _, BooleanArray, RecordBatch, StringArray};
+use arrow_schema::ArrowError;
 use bytes::Bytes;
 use futures::future::BoxFuture;
 use futures::{FutureExt as _, StreamExt as _, TryFutureExt as _};
@@ -45,8 +45,8 @@ impl Snapshot {
     /// Takes a snapshot of a table; a table that nobody has written is empty.
     ///
     /// # Errors
-    /// [`StoreError::SchemaVersion`] when a part is of another version; [`StoreError`] when the
-    /// commits cannot be read.
+    /// [`StoreError::SchemaVersion`] when a part is of a version that is not read; [`StoreError`] when
+    /// the commits cannot be read.
     pub fn take(store: &Location, schema: TableSchema) -> Result<Self, StoreError> {
         let parts = live_parts(store)?.remove(schema.name).unwrap_or_default();
         Self::new(store, schema, parts, None)
@@ -128,10 +128,8 @@ impl Snapshot {
                 Err(e) => Box::new(std::iter::once(Err(e))),
             };
             batches.map(move |batch| {
-                let mut batch = batch.map_err(failed)?;
-                if live.part.schema_version < self.schema.version {
-                    batch = completed(&batch, &self.schema).map_err(failed)?;
-                }
+                let batch = batch.map_err(failed)?;
+                let batch = self.schema.completed(batch, live.part.schema_version);
                 self.check_columns(&batch, &live.part.path)?;
                 without(&batch, column, &live.superseded).map_err(failed)
             })
@@ -210,7 +208,7 @@ pub(super) fn check_version(
     live: &LivePart,
 ) -> Result<(), StoreError> {
     let found = live.part.schema_version;
-    if schema.is_read(found) {
+    if schema.reads(found) {
         return Ok(());
     }
     let remedy = if found > schema.version {
@@ -220,20 +218,8 @@ pub(super) fn check_version(
     };
     let place = store.url_of(&live.part.path);
     let table = schema.name.to_owned();
-    Err(StoreError::SchemaVersion { table, place, found, supported: schema.version, remedy })
-}
-
-/// Adds the nullable columns that a part of an older version lacks, null in every row.
-fn completed(batch: &RecordBatch, schema: &TableSchema) -> Result<RecordBatch, ParquetError> {
-    let (mut fields, mut columns) =
-        (batch.schema_ref().fields().to_vec(), batch.columns().to_vec());
-    for field in schema.arrow().fields() {
-        if field.is_nullable() && batch.column_by_name(field.name()).is_none() {
-            columns.push(new_null_array(field.data_type(), batch.num_rows()));
-            fields.push(Arc::clone(field));
-        }
-    }
-    Ok(RecordBatch::try_new(Arc::new(Schema::new(fields)), columns)?)
+    let supported = schema.readable();
+    Err(StoreError::SchemaVersion { table, place, found, supported, remedy })
 }
 
 /// Returns the rows whose item is not among `superseded`.

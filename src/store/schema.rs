@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use arrow_array::{
     Array, ArrayRef, BooleanArray, Float32Array, Float64Array, Int32Array, Int64Array, RecordBatch,
-    StringArray, TimestampMicrosecondArray,
+    StringArray, TimestampMicrosecondArray, new_null_array,
 };
 use arrow_schema::{DataType, Field, Schema, SchemaRef, TimeUnit};
 
@@ -13,10 +13,11 @@ use arrow_schema::{DataType, Field, Schema, SchemaRef, TimeUnit};
 #[derive(Clone, Debug, PartialEq)]
 pub struct TableSchema {
     pub name: &'static str,
-    /// Raised when a column changes; parts of another version are refused, not guessed at, down to `reads`.
+    /// Raised when a column changes; parts of versions that are not read are refused, not guessed at.
     pub version: u32,
-    /// Oldest version whose parts are read: it lacks nothing but nullable columns, which are null in its rows.
-    pub reads: u32,
+    /// The oldest version that is read: since then only nullable columns were added, which are null in older
+    /// parts.
+    pub oldest_version: u32,
     /// What one row is.
     pub description: &'static str,
     pub columns: Vec<Column>,
@@ -92,8 +93,35 @@ impl TableSchema {
     }
 
     /// Returns whether parts of a version are read.
-    pub fn is_read(&self, version: u32) -> bool {
-        (self.reads..=self.version).contains(&version)
+    pub fn reads(&self, version: u32) -> bool {
+        (self.oldest_version..=self.version).contains(&version)
+    }
+
+    /// Names the versions that are read, as messages do: `version 1` or `versions 1 to 3`.
+    pub fn readable(&self) -> String {
+        if self.oldest_version < self.version {
+            format!("versions {} to {}", self.oldest_version, self.version)
+        } else {
+            format!("version {}", self.version)
+        }
+    }
+
+    /// Returns a batch of a part of a version that is read, with nulls in the nullable columns that are newer
+    /// than the part. A column that is missing for another reason stays missing.
+    pub(super) fn completed(&self, batch: RecordBatch, version: u32) -> RecordBatch {
+        if version >= self.version {
+            return batch;
+        }
+        let (mut fields, mut columns) =
+            (batch.schema().fields().to_vec(), batch.columns().to_vec());
+        for field in self.arrow().fields() {
+            if field.is_nullable() && batch.column_by_name(field.name()).is_none() {
+                columns.push(new_null_array(field.data_type(), batch.num_rows()));
+                fields.push(Arc::clone(field));
+            }
+        }
+        RecordBatch::try_new(Arc::new(Schema::new(fields)), columns)
+            .expect("invariant: a whole batch, and nulls of its length")
     }
 
     /// Returns the Arrow schema of the table's parts.
@@ -231,15 +259,12 @@ pub trait Row: Sized {
     fn from_batch(batch: &RecordBatch) -> Option<Vec<Self>>;
 }
 
-/// Declares a table and its row type at once, so that neither can drift from the other. `version 3 reads 2` reads
-/// parts of version 2, too: what they lack is nullable.
+/// Declares a table and its row type at once, so that neither can drift from the other. `version 3 reads 2` says
+/// that parts of version 2 are read, too: all that was added since then is nullable.
 macro_rules! rows {
-    (@oldest $version:literal) => { $version };
-    (@oldest $version:literal $oldest:literal) => { $oldest };
     (
         $description:literal
-        $row:ident in $name:literal version $version:literal $(reads $oldest:literal)?
-        sorted by [$($sort:ident),+]
+        $row:ident in $name:literal version $version:literal $(reads $oldest:literal)? sorted by [$($sort:ident),+]
         { $($field:ident: $type:ty, $unit:literal, $meaning:literal;)+ }
     ) => {
         #[doc = $description]
@@ -254,7 +279,7 @@ macro_rules! rows {
                 TableSchema {
                     name: $name,
                     version: $version,
-                    reads: $crate::store::schema::rows!(@oldest $version $($oldest)?),
+                    oldest_version: [$($oldest,)? $version][0],
                     description: $description,
                     columns: vec![$(Column {
                         name: stringify!($field).into(),
@@ -287,3 +312,58 @@ macro_rules! rows {
     };
 }
 pub(crate) use rows;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    rows! {
+        "As it was."
+        OldRow in "things" version 2 sorted by [id]
+        {
+            id: String, "", "Name.";
+            length_m: f64, "m", "Length.";
+        }
+    }
+
+    rows! {
+        "With two columns more, one of them in the middle."
+        NewRow in "things" version 4 reads 2 sorted by [id]
+        {
+            id: String, "", "Name.";
+            colour: Option<String>, "", "Colour.";
+            length_m: f64, "m", "Length.";
+            weight_kg: Option<i32>, "kg", "Weight.";
+        }
+    }
+
+    #[test]
+    fn an_older_batch_is_read_with_nulls_where_nothing_was() {
+        let (old, new) = (OldRow::schema(), NewRow::schema());
+        assert_eq!((old.oldest_version, new.oldest_version), (2, 2));
+        assert_eq!(
+            (0..6).map(|v| new.reads(v)).collect::<Vec<_>>(),
+            [false, false, true, true, true, false]
+        );
+        assert_eq!(
+            (old.readable(), new.readable()),
+            ("version 2".into(), "versions 2 to 4".into())
+        );
+        let batch = OldRow::to_batch(&[
+            OldRow { id: "a".into(), length_m: 1.5 },
+            OldRow { id: "b".into(), length_m: -2.0 },
+        ]);
+        assert_eq!(NewRow::from_batch(&batch), None);
+        let of =
+            |id: &str, length_m| NewRow { id: id.into(), colour: None, length_m, weight_kg: None };
+        let rows = NewRow::from_batch(&new.completed(batch.clone(), 2));
+        assert_eq!(rows, Some(vec![of("a", 1.5), of("b", -2.0)]));
+        // A part of this version has all its columns, or is broken.
+        assert_eq!(NewRow::from_batch(&new.completed(batch.clone(), 4)), None);
+        // What may not be null is not made up.
+        let short = batch.project(&[0]).expect("one column");
+        let completed = new.completed(short, 2);
+        assert_eq!(NewRow::from_batch(&completed), None);
+        assert_eq!(completed.column_by_name("length_m").map(|c| c.len()), None);
+    }
+}

@@ -81,7 +81,7 @@ rows! {
         tuning: Option<f64>, "1/36 octave", "Deviation from A440 with which the chroma was made, from -0.5 to below 0.5.";
         tuning_source: Option<String>, "", "`estimated` or `given` (by --tuning).";
         tempo_bpm: Option<f64>, "beats/min", "Tempo of the beat tracker, 1800 / whole frames; none without onsets.";
-        n_beats: i32, "beats", "Rows of the phrase in `beats`.";
+        n_beats: i32, "beats", "Beats that the tracker found, or that the feature file has; they are in `beats` unless the phrase has a beat list.";
         audio_codec: Option<String>, "", "Codec that was decoded.";
         sample_rate_hz: Option<i32>, "Hz", "Sample rate of the file.";
         n_channels: Option<i32>, "channels", "Channels of the file.";
@@ -89,13 +89,15 @@ rows! {
 }
 
 rows! {
-    "One row per beat."
-    BeatRow in "beats" version 1 sorted by [phrase_id, beat]
+    "One row per beat: those of the beat list where a phrase has one, else those that extract found."
+    BeatRow in "beats" version 2 reads 1 sorted by [phrase_id, beat]
     {
         phrase_id: String, "", "The phrase, as in `phrases`.";
         beat: i32, "beats", "Index within the phrase, from 0.";
         frame: i32, "frames", "The nearest frame of the phrase.";
         time_s: f64, "s", "Time of the beat; frame / 30 where the beat tracker found it. In a constructed phrase, from its begin, and beyond the first and last beat of the song at its median interval.";
+        number: Option<i32>, "beats", "Number in the bar, 1 on the downbeat; none where nobody knows.";
+        source: Option<String>, "", "Where the beat came from: `beats_file` (ingest read the beat list), `features` (`beat_times` of a feature file) or `tracker` (found in the audio); of a constructed phrase, where those of its song came from. None in rows that release 0.1 wrote.";
     }
 }
 
@@ -369,7 +371,7 @@ fn frame_table(
     TableSchema {
         name,
         version: 1,
-        reads: 1,
+        oldest_version: 1,
         description,
         columns: ids.into_iter().chain(channels).collect(),
         sorted_by: &["phrase_id", "frame"],

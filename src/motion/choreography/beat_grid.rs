@@ -37,7 +37,7 @@ impl BeatGrid {
             Ok(i) => times_s[i],
         };
         let beats_per_bar = i64::from(beats.beats_per_bar());
-        let downbeat = beats.first_downbeat() as i64;
+        let downbeat = beats.first_downbeat();
         // The last beat at or before 0, then back to its downbeat.
         let at_zero = match times_s.partition_point(|&t| t <= 0.0) {
             0 => (-times_s[0] / interval_s).floor() as i64,

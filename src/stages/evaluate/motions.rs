@@ -13,7 +13,8 @@ use crate::evaluation::metrics::Music;
 use crate::motion::bar_phase;
 use crate::motion::choreography::activity;
 use crate::motion::phase::unwrapped;
-use crate::stages::generate::{beats_in_bars, beats_of, url_of};
+use crate::stages::beats::{self, PhraseBeats};
+use crate::stages::generate::url_of;
 use crate::stages::plot::nearest::nearest;
 use crate::store::tables::{GenerationRow, PhraseRow};
 use crate::store::{Location, Row as _, Snapshot, StoreError, digest};
@@ -71,7 +72,7 @@ pub struct Phrases {
     rows: HashMap<String, PhraseRow>,
     /// Number of each song.
     songs: BTreeMap<String, usize>,
-    beats: HashMap<String, Vec<f64>>,
+    beats: HashMap<String, PhraseBeats>,
     /// Activity of the frames of songs, by their file.
     activities: HashMap<String, Vec<f64>>,
 }
@@ -91,7 +92,7 @@ impl Phrases {
         let mut wanted: BTreeSet<String> = with_motion.map(|row| row.phrase_id.clone()).collect();
         wanted.extend(danced_to.into_iter().map(str::to_owned));
         let rows = rows.into_iter().map(|row| (row.phrase_id.clone(), row)).collect();
-        let beats = beats_of(store, &wanted)?;
+        let beats = beats::of_phrases(store, |id| wanted.contains(id))?;
         let songs = songs.into_iter().zip(0..).collect();
         Ok(Self { rows, songs, beats, activities: HashMap::new() })
     }
@@ -167,8 +168,7 @@ impl Phrases {
     /// Returns the music of `n_frames` frames of a phrase, from its beats; none for too few of them.
     pub fn music(&self, phrase_id: &str, n_frames: usize) -> Option<Music> {
         let row = self.rows.get(phrase_id)?;
-        let numbered = self.beats.get(phrase_id).map(Vec::as_slice).unwrap_or_default();
-        let beats = beats_in_bars(numbered, row)?;
+        let beats = self.beats.get(phrase_id)?.in_bars(row)?;
         let times_s: Vec<f64> = (0..n_frames).map(frames_to_s).collect();
         let bars = unwrapped(&bar_phase(&times_s, &beats));
         Some(Music {
@@ -189,6 +189,9 @@ impl Phrases {
     /// motion's own phase alone.
     pub fn music_of_real(&self, phrase_id: &str, phase: &[f64]) -> Option<Music> {
         let from_beats = self.music(phrase_id, phase.len())?;
+        if self.beats.get(phrase_id).is_some_and(PhraseBeats::is_numbered) {
+            return Some(from_beats);
+        }
         let bars = since_start(&unwrapped(phase), self.start_frames(phrase_id));
         Some(Music { bars, is_of_motion: true, ..from_beats })
     }

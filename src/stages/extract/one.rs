@@ -7,6 +7,7 @@ use ndarray::{Array2, s};
 
 use crate::audio::recording::{Encoding, MAX_HELD_SAMPLES, Options, Recording};
 use crate::audio::{BLOCKS, FEATURE_DIM, Tuning};
+use crate::stages::beats::BeatSource;
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::feature_file::read_features;
 use crate::store::{Content, SourceFile, StoreError, digest, digest_of};
@@ -31,6 +32,14 @@ pub enum Origin {
 }
 
 impl Origin {
+    /// Returns where beats that come with the features came from.
+    pub fn beat_source(self) -> BeatSource {
+        match self {
+            Origin::Audio => BeatSource::Tracker,
+            Origin::FeatureFile => BeatSource::Features,
+        }
+    }
+
     pub fn name(self) -> &'static str {
         match self {
             Origin::Audio => "audio",

@@ -12,6 +12,7 @@ use super::one::{Extracted, Origin, extract, needed_bytes};
 use super::pool::{self, Budget, lock};
 use super::{Done, Extract, Job};
 use crate::stages::Stage as _;
+use crate::stages::beats::{self, BeatSource};
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::ingest::content_hash_of_audio;
 use crate::store::tables::{self, BeatRow, ExtractionRow, FailureRow, PhraseRow};
@@ -43,6 +44,21 @@ struct Task {
     origin: Origin,
     url: String,
     size_bytes: u64,
+    /// Whether the table has the beats of its beat list, so that no others are written.
+    has_listed_beats: bool,
+}
+
+impl Task {
+    /// Returns what tells whether the phrase has to be done again beside its content: with release 0.1, beats
+    /// were written for all phrases.
+    fn fingerprint(&self) -> String {
+        let content_hash = &self.row.content_hash;
+        if self.has_listed_beats {
+            format!("{content_hash} with the beats of its list")
+        } else {
+            content_hash.clone()
+        }
+    }
 }
 
 type Outcome = Result<Extracted, Failure>;
@@ -70,7 +86,8 @@ pub fn run(job: &Job<'_>, target: &Target<'_>) -> anyhow::Result<Done> {
     let names: BTreeSet<String> = rows.iter().map(|row| row.phrase_id.clone()).collect();
     // Constructed phrases have features of their song, without a file of their own.
     let n_phrases = rows.iter().filter(|row| !row.is_constructed()).count() as u64;
-    let mut tasks = plan(rows);
+    let listed = with_listed_beats(target.store, &rows)?;
+    let mut tasks = plan(rows, &listed);
     let mut done = Done { n_without: n_phrases - tasks.len() as u64, ..Done::default() };
     tasks.retain(|task| target.shard.takes(&task.row.phrase_id));
     let n_mine = tasks.len();
@@ -91,8 +108,23 @@ pub fn run(job: &Job<'_>, target: &Target<'_>) -> anyhow::Result<Done> {
     Ok(done.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner))
 }
 
+/// Returns the phrases of whose beat lists ingest wrote the beats; release 0.1 did not.
+fn with_listed_beats(store: &Location, rows: &[PhraseRow]) -> Result<BTreeSet<String>, StoreError> {
+    let with_list: BTreeSet<&str> = rows
+        .iter()
+        .filter(|row| row.beats_url.is_some())
+        .map(|row| row.phrase_id.as_str())
+        .collect();
+    if with_list.is_empty() {
+        return Ok(BTreeSet::new());
+    }
+    let known = beats::of_phrases(store, |id| with_list.contains(id))?;
+    let listed = known.into_iter().filter(|(_, b)| b.source() == Some(BeatSource::BeatsFile));
+    Ok(listed.map(|(id, _)| id).collect())
+}
+
 /// Returns the phrases that can have features, with their batches.
-fn plan(rows: Vec<PhraseRow>) -> Vec<Task> {
+fn plan(rows: Vec<PhraseRow>, listed: &BTreeSet<String>) -> Vec<Task> {
     let with_input = |row: PhraseRow| {
         let input = match (&row.audio_url, &row.features_url) {
             (Some(url), _) => Some((Origin::Audio, url.clone(), row.audio_bytes)),
@@ -101,7 +133,8 @@ fn plan(rows: Vec<PhraseRow>) -> Vec<Task> {
         };
         let (origin, url, size_bytes) = input?;
         let size_bytes = size_bytes.and_then(|n| u64::try_from(n).ok()).unwrap_or(0);
-        Some(Task { batch: 0, row, origin, url, size_bytes })
+        let has_listed_beats = listed.contains(&row.phrase_id);
+        Some(Task { batch: 0, row, origin, url, size_bytes, has_listed_beats })
     };
     let mut tasks: Vec<Task> = rows.into_iter().filter_map(with_input).collect();
     let total_s: f64 = tasks.iter().map(|task| task.row.duration_s).sum();
@@ -132,6 +165,7 @@ fn is_settled(task: &Task, ledger: &Ledger, params_hash: &str) -> bool {
             known.params_hash == params_hash
                 && known.item.succeeded()
                 && known.item.input_hash == task.row.content_hash
+                && known.item.fingerprint == task.fingerprint()
         })
 }
 
@@ -277,9 +311,11 @@ impl Writer<'_> {
             let id = self.name_for(id, &outcome, &mut commit);
             let failure = outcome.as_ref().err().map(Failure::digest);
             let input_hash = task.row.content_hash.clone();
+            let fingerprint = task.fingerprint();
             let unchanged = self.ledger.get(&id).is_some_and(|known| {
                 known.params_hash == self.target.params_hash
                     && known.item.input_hash == input_hash
+                    && known.item.fingerprint == fingerprint
                     && known.item.failure == failure
             });
             if unchanged && !(self.target.force && failure.is_none()) {
@@ -290,7 +326,9 @@ impl Writer<'_> {
                     let part = commit.part(tables::FEATURES, tables::features)?;
                     part.write_frames(&id, extracted.frames.view())?;
                     extractions.push(extraction_row(&id, &task, &extracted));
-                    beats.extend(beat_rows(&id, &extracted));
+                    if !task.has_listed_beats {
+                        beats.extend(beat_rows(&id, &extracted));
+                    }
                 }
                 Err(failure) => failures.push(FailureRow {
                     stage: Extract::NAME.to_owned(),
@@ -301,7 +339,6 @@ impl Writer<'_> {
                     time: TimestampUs::now(),
                 }),
             }
-            let fingerprint = input_hash.clone();
             commit.settle(Item { id, fingerprint, input_hash, failure }, self.ledger);
         }
         if !extractions.is_empty() {
@@ -368,10 +405,6 @@ fn extraction_row(id: &str, task: &Task, extracted: &Extracted) -> ExtractionRow
 }
 
 fn beat_rows<'a>(id: &'a str, extracted: &'a Extracted) -> impl Iterator<Item = BeatRow> + 'a {
-    extracted.beats.iter().enumerate().map(|(beat, &(frame, time_s))| BeatRow {
-        phrase_id: id.to_owned(),
-        beat: beat as i32,
-        frame: frame as i32,
-        time_s,
-    })
+    let beats = extracted.beats.iter().map(|&(_, time_s)| (time_s, None));
+    beats::rows(id, beats, extracted.frames.nrows(), extracted.origin.beat_source())
 }

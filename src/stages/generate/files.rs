@@ -89,7 +89,7 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
                 source: &source,
                 features: extracted.frames.view(),
                 beats: beats.clone(),
-                begins_bar: true,
+                has_downbeats: true,
             };
             progress.say(&format!("motion for {stem}"));
             let mut watch = |frames: ArrayView2<f32>| match &mut stream {

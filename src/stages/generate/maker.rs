@@ -25,8 +25,8 @@ pub struct Music<'a> {
     /// \[T, 163\]
     pub features: ArrayView2<'a, f32>,
     pub beats: Option<Beats>,
-    /// Whether the first of the beats begins a bar.
-    pub begins_bar: bool,
+    /// Whether the downbeats are known: counted by somebody, or taken to begin with the first beat of a song.
+    pub has_downbeats: bool,
 }
 
 /// A motion that was kept, and what is known of all its candidates.
@@ -105,7 +105,7 @@ impl Maker<'_> {
             let velocity_error =
                 derivative_error(decoded.view(), Channel::Position, Channel::Velocity);
             let mut frames = decoded.clone();
-            let bars = phase.as_deref().filter(|_| music.begins_bar);
+            let bars = phase.as_deref().filter(|_| music.has_downbeats);
             let postprocess = &self.settings.postprocess;
             process(postprocess, &mut frames, bars);
             if let Some(constraints) = constraints.as_ref().filter(|_| !self.settings.soft) {

@@ -33,7 +33,7 @@ pub(in crate::stages) use files::listen;
 pub(in crate::stages) use maker::{generation_id, seed_of};
 pub(in crate::stages) use params::PostProcessParams;
 pub(in crate::stages) use settings::MotionSettings;
-pub(in crate::stages) use tracks::{beats_in_bars, beats_of, url_of};
+pub(in crate::stages) use tracks::url_of;
 
 /// The stage.
 pub struct Generate;

@@ -14,14 +14,14 @@ use ndarray::Array2;
 use super::maker::{Made, Maker, Music, generation_id};
 use super::params::Tracks;
 use super::{Done, Generate};
-use crate::motion::Beats;
+use crate::stages::beats::{self, BeatSource, PhraseBeats};
 use crate::stages::extract::pool::{self, lock};
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::{Progress, Stage as _};
-use crate::store::tables::{self, BeatRow, ExtractionRow, FailureRow, GenerationRow, PhraseRow};
+use crate::store::tables::{self, ExtractionRow, FailureRow, GenerationRow, PhraseRow};
 use crate::store::{
     Commit, Item, Label, Ledger, Location, Row as _, Shard, Snapshot, StoreError, TimestampUs,
-    batch_of,
+    batch_of, digest,
 };
 use crate::units::frames_to_s;
 
@@ -52,8 +52,24 @@ struct Task {
     batch: u64,
     row: PhraseRow,
     n_frames: usize,
+    beats: PhraseBeats,
     /// Samples that are missing.
     samples: Vec<usize>,
+}
+
+impl Task {
+    /// Returns what tells whether motions have to be made again though the phrase's files are the same. Beats that
+    /// are as release 0.1 had them leave its motions alone.
+    fn fingerprint(&self) -> String {
+        let content_hash = &self.row.content_hash;
+        let is_newer =
+            self.beats.is_numbered() || self.beats.source() == Some(BeatSource::BeatsFile);
+        if is_newer {
+            digest(format!("{content_hash}\n{}", self.beats.describe()).as_bytes())
+        } else {
+            content_hash.clone()
+        }
+    }
 }
 
 type Outcome = Result<Made, Failure>;
@@ -129,7 +145,10 @@ fn plan(
     let mut tasks: Vec<Task> = rows
         .into_iter()
         .filter(|row| is_wanted(row))
-        .map(|row| Task { batch: 0, n_frames: n_frames(&row), row, samples: Vec::new() })
+        .map(|row| {
+            let (n_frames, beats) = (n_frames(&row), PhraseBeats::default());
+            Task { batch: 0, n_frames, row, beats, samples: Vec::new() }
+        })
         .collect();
     let total_s: f64 =
         tasks.iter().map(|task| frames_to_s(task.n_frames) * target.n_samples as f64).sum();
@@ -138,8 +157,11 @@ fn plan(
     // A power of two, so that shards in powers of two hold whole batches.
     let n_batches = by_length.max(by_count).max(1).next_power_of_two();
     tasks.retain(|task| target.shard.takes(&task.row.phrase_id));
+    let ids: BTreeSet<&str> = tasks.iter().map(|task| task.row.phrase_id.as_str()).collect();
+    let mut beats = beats::of_phrases(store, |id| ids.contains(id))?;
     for task in &mut tasks {
-        let id = &task.row.phrase_id;
+        task.beats = beats.remove(&task.row.phrase_id).unwrap_or_default();
+        let (id, fingerprint) = (&task.row.phrase_id, task.fingerprint());
         task.batch = batch_of(id, n_batches);
         let is_missing = |sample: &usize| {
             target.force
@@ -147,6 +169,7 @@ fn plan(
                     known.params_hash == target.params_hash
                         && known.item.succeeded()
                         && known.item.input_hash == task.row.content_hash
+                        && known.item.fingerprint == fingerprint
                 })
         };
         task.samples = (0..target.n_samples).filter(is_missing).collect();
@@ -172,7 +195,6 @@ fn make_batch(
         Ok::<_, StoreError>(())
     })?;
     let unknown = unknown.map(|e| e.to_string());
-    let beats = beats_of(target.store, &wanted)?;
     // The longest first, so that no worker is left with it at the end.
     let mut order: Vec<(&Task, usize)> = tasks
         .iter()
@@ -190,14 +212,13 @@ fn make_batch(
             let id = &task.row.phrase_id;
             let outcome = match music.get(id) {
                 Some(features) => {
-                    let numbered = beats.get(id).map(Vec::as_slice).unwrap_or_default();
                     let music = Music {
                         phrase_id: id,
                         source: url_of(&task.row),
                         features: features.view(),
-                        beats: beats_in_bars(numbered, &task.row),
+                        beats: task.beats.in_bars(&task.row),
                         // An excerpt may begin anywhere in a bar.
-                        begins_bar: !task.row.is_constructed(),
+                        has_downbeats: task.beats.is_numbered() || !task.row.is_constructed(),
                     };
                     maker.make(&music, sample, &mut |_| Ok(()))
                 }
@@ -231,29 +252,6 @@ fn without_features(row: &PhraseRow, store: &Location, unknown: Option<&str>) ->
     Failure::new(FailureKind::NoMusic, url_of(row), message)
 }
 
-/// Returns the beats of some phrases, in order.
-pub(in crate::stages) fn beats_of(
-    store: &Location,
-    wanted: &BTreeSet<String>,
-) -> Result<HashMap<String, Vec<f64>>, StoreError> {
-    let rows: Vec<BeatRow> = Snapshot::take(store, BeatRow::schema())?.rows()?;
-    let mut found: HashMap<String, Vec<(i32, f64)>> = HashMap::new();
-    for row in rows.into_iter().filter(|row| wanted.contains(&row.phrase_id)) {
-        found.entry(row.phrase_id).or_default().push((row.beat, row.time_s));
-    }
-    let in_order = |(id, mut beats): (String, Vec<(i32, f64)>)| {
-        beats.sort_by_key(|beat| beat.0);
-        (id, beats.into_iter().map(|beat| beat.1).collect())
-    };
-    Ok(found.into_iter().map(in_order).collect())
-}
-
-/// Counts beats in bars; `None` for too few beats to tell a tempo.
-pub(in crate::stages) fn beats_in_bars(times_s: &[f64], row: &PhraseRow) -> Option<Beats> {
-    let beats_per_bar = row.beats_per_bar.and_then(|n| u32::try_from(n).ok());
-    Beats::new(times_s.to_vec(), None, beats_per_bar).ok()
-}
-
 /// Writes a batch: its motions, what is known of them, and what failed.
 fn commit(
     maker: &Maker,
@@ -262,19 +260,20 @@ fn commit(
     tasks: &[Task],
     outcomes: BTreeMap<String, Outcome>,
 ) -> anyhow::Result<()> {
-    let rows: HashMap<String, (&PhraseRow, usize)> = tasks
+    let tasks: HashMap<String, (&Task, usize)> = tasks
         .iter()
         .flat_map(|task| task.samples.iter().map(move |&sample| (task, sample)))
         .map(|(task, sample)| {
-            (generation_id(maker.run, &task.row.phrase_id, sample), (&task.row, sample))
+            (generation_id(maker.run, &task.row.phrase_id, sample), (task, sample))
         })
         .collect();
     let mut commit = Commit::new(target.store, Generate::NAME, target.params_hash, ITEMS_FROM);
     let (mut generations, mut failures) = (Vec::new(), Vec::new());
     for (id, outcome) in outcomes {
-        let (row, sample) = rows[&id];
+        let (task, sample) = tasks[&id];
+        let row = &task.row;
         let failure = outcome.as_ref().err().map(Failure::digest);
-        let input_hash = row.content_hash.clone();
+        let (fingerprint, input_hash) = (task.fingerprint(), row.content_hash.clone());
         let is_known_failure = failure.is_some()
             && ledger.get(&id).is_some_and(|known| {
                 known.params_hash == target.params_hash
@@ -306,7 +305,6 @@ fn commit(
                 time: TimestampUs::now(),
             }),
         }
-        let fingerprint = input_hash.clone();
         commit.settle(Item { id, fingerprint, input_hash, failure }, ledger);
     }
     if !generations.is_empty() {

@@ -9,10 +9,11 @@ use std::sync::{Mutex, PoisonError};
 
 use super::layout::{Planned, Role};
 use super::phrase::{Files, Phrase, Rules};
-use super::{Ingest, Refused, Tally};
+use super::{BEATS_VERSION, Ingest, Refused, Tally};
+use crate::stages::beats::{self, BeatSource};
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::{Progress, Stage as _};
-use crate::store::tables::{self, FailureRow, PhraseRow};
+use crate::store::tables::{self, BeatRow, FailureRow, PhraseRow};
 use crate::store::{
     Commit, Content, Item, Ledger, Location, Row as _, Shard, Source, SourceFile, StoreError,
     TimestampUs, batch_of, digest, split_of,
@@ -113,8 +114,7 @@ impl Job<'_> {
         let mut tally = Tally::default();
         let mut commit =
             Commit::new(self.store, Ingest::NAME, self.params_hash, self.source.location().url());
-        let mut rows = Vec::new();
-        let mut failures = Vec::new();
+        let mut rows = Rows::default();
         let readable = batch.iter().filter(|p| p.problem.is_none());
         let files = readable.flat_map(|p| p.files.iter().map(|(_, f)| f.clone())).collect();
         let mut contents = self.source.read_in_order(files);
@@ -130,17 +130,16 @@ impl Job<'_> {
                     ((*role, file.clone(), content), permit)
                 })
                 .unzip();
-            let (input_hash, outcome) = self.phrase(planned, files);
-            self.settle(planned, input_hash, outcome, &mut commit, &mut tally, |outcome| {
-                match outcome {
-                    Ok(phrase) => rows.push(phrase),
-                    Err(failure) => failures.push(failure),
-                }
-            })?;
+            let (content_hash, outcome) = self.phrase(planned, files);
+            self.settle(planned, &content_hash, outcome, &mut commit, &mut tally, &mut rows)?;
             self.progress.advance(1);
         }
-        if !rows.is_empty() {
-            commit.part(PhraseRow::schema().name, PhraseRow::schema)?.write_rows(&rows)?;
+        let Rows { phrases, beats, mut failures } = rows;
+        if !phrases.is_empty() {
+            commit.part(PhraseRow::schema().name, PhraseRow::schema)?.write_rows(&phrases)?;
+        }
+        if !beats.is_empty() {
+            commit.part(BeatRow::schema().name, BeatRow::schema)?.write_rows(&beats)?;
         }
         if !failures.is_empty() {
             // A contested name sorts elsewhere than the name that it is made from.
@@ -153,7 +152,8 @@ impl Job<'_> {
         Ok(tally)
     }
 
-    /// Reads and checks one phrase; a defect of ours costs the phrase, not the job.
+    /// Reads and checks one phrase, and returns its content hash with it; a defect of ours costs the phrase,
+    /// not the job.
     fn phrase(
         &self,
         planned: &Planned,
@@ -167,25 +167,26 @@ impl Job<'_> {
             Ok(files) => files,
             Err(failure) => return (without_content(&failure), Err(failure)),
         };
-        let input_hash = files.content_hash().to_owned();
+        let content_hash = files.content_hash().to_owned();
         let path = planned.files.first().map_or(planned.id.as_str(), |(_, file)| &file.path);
         let outcome = guarded(path, || files.check(self.rules));
-        (input_hash, outcome)
+        (content_hash, outcome)
     }
 
     /// Writes an outcome into the commit unless the store has it already.
     fn settle(
         &self,
         planned: &Planned,
-        input_hash: String,
+        content_hash: &str,
         mut outcome: Result<Phrase, Failure>,
         commit: &mut Commit<'_>,
         tally: &mut Tally,
-        mut add: impl FnMut(Result<PhraseRow, FailureRow>),
+        rows: &mut Rows,
     ) -> Result<(), StoreError> {
         let mut id = planned.id.clone();
         let contested = self.contested(&id);
-        if let Some(failure) = self.claimed_by_another_source(planned, &input_hash) {
+        let input_hash = input_hash(planned, content_hash);
+        if let Some(failure) = self.claimed_by_another_source(planned, content_hash) {
             id.clone_from(&contested);
             outcome = Err(failure);
         } else if self.is_out_of_reach(&id, &outcome) {
@@ -223,10 +224,16 @@ impl Job<'_> {
             let part = commit.part(tables::MOTION, tables::motion)?;
             part.write_frames(&id, motion.view())?;
         }
-        add(match outcome {
-            Ok(phrase) => Ok(self.phrase_row(planned, phrase)),
-            Err(failure) => Err(self.failure_row(&id, failure)),
-        });
+        match outcome {
+            Ok(phrase) => {
+                if let Some(list) = &phrase.beats {
+                    let (numbered, source) = (beats::numbered(list), BeatSource::BeatsFile);
+                    rows.beats.extend(beats::rows(&id, numbered, phrase.n_frames(), source));
+                }
+                rows.phrases.push(self.phrase_row(planned, phrase));
+            }
+            Err(failure) => rows.failures.push(self.failure_row(&id, failure)),
+        }
         commit.settle(Item { id, fingerprint, input_hash, failure }, self.ledger);
         Ok(())
     }
@@ -247,13 +254,15 @@ impl Job<'_> {
     }
 
     /// Refuses a phrase whose name the store has from elsewhere with other content.
-    fn claimed_by_another_source(&self, planned: &Planned, input_hash: &str) -> Option<Failure> {
+    fn claimed_by_another_source(&self, planned: &Planned, content_hash: &str) -> Option<Failure> {
         let known = self.ledger.get(&planned.id)?;
+        // Release 0.1 kept the content hash of every phrase.
+        let same = [content_hash, &input_hash(planned, content_hash)];
         let here = self.source.location().url();
         if self.force
             || known.origin == here
             || !known.item.succeeded()
-            || known.item.input_hash == input_hash
+            || same.contains(&known.item.input_hash.as_str())
         {
             return None;
         }
@@ -324,6 +333,29 @@ pub fn contested(id: &str, origin: &str) -> String {
     format!("{id} @ {origin}")
 }
 
+/// The rows of a batch but for motion.
+#[derive(Default)]
+struct Rows {
+    phrases: Vec<PhraseRow>,
+    beats: Vec<BeatRow>,
+    failures: Vec<FailureRow>,
+}
+
+/// Returns what a phrase's rows are made from, as its item names it: its content, and the version of what is
+/// written for a beat list.
+fn input_hash(planned: &Planned, content_hash: &str) -> String {
+    match beats_line(planned) {
+        Some(line) => digest(format!("{content_hash}\n{line}").as_bytes()),
+        None => content_hash.to_owned(),
+    }
+}
+
+/// Returns a line that only phrases with a beat list have.
+fn beats_line(planned: &Planned) -> Option<String> {
+    let has_list = planned.files.iter().any(|(role, _)| *role == Role::Beats);
+    has_list.then(|| format!("beats version {BEATS_VERSION}\n"))
+}
+
 /// Returns what the storage says of a phrase's files, without reading them.
 pub fn fingerprint(planned: &Planned) -> String {
     let lines: String = planned
@@ -332,7 +364,8 @@ pub fn fingerprint(planned: &Planned) -> String {
         .map(|(role, file)| format!("{} {} {}\n", role.name(), file.path, file.fingerprint))
         .collect();
     let problem = planned.problem.as_ref().map_or("", |p| p.message.as_str());
-    digest(format!("{lines}{problem}").as_bytes())[..32].to_owned()
+    let beats = beats_line(planned).unwrap_or_default();
+    digest(format!("{lines}{beats}{problem}").as_bytes())[..32].to_owned()
 }
 
 fn gone(file: &SourceFile) -> Result<Content, StoreError> {

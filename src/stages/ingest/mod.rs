@@ -1,4 +1,4 @@
-//! `ingest`: phrases or a music library become the tables `phrases` and `motion`.
+//! `ingest`: phrases or a music library become the tables `phrases`, `motion` and `beats`.
 
 mod batch;
 mod layout;
@@ -24,6 +24,8 @@ pub(in crate::stages) use phrase::{read_beats, read_bvh, read_trajectory};
 
 /// Raised when ingest writes something else for the same input and rules.
 const OUTPUT_VERSION: u32 = 1;
+/// Raised when ingest writes something else for a phrase with a beat list, and for no other.
+const BEATS_VERSION: u32 = 2;
 
 /// The stage.
 pub struct Ingest;
@@ -74,7 +76,7 @@ impl Stage for Ingest {
     const NAME: &'static str = "ingest";
     const ABOUT: &'static str = "bring phrases or a music library into tables";
     const CONTRACT: Contract =
-        Contract { reads: "a source of files", writes: "phrases, motion, failures" };
+        Contract { reads: "a source of files", writes: "phrases, motion, beats, failures" };
     type Params = Params;
 
     fn run(params: Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {

@@ -11,6 +11,7 @@ use crate::motion::{
     Beats, BeatsPerBarSource, Bvh, BvhError, CaptureError, ChannelLimits, Trajectory,
     TrajectoryError, convert_bvh,
 };
+use crate::stages::beats::{self, BeatSource};
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::feature_file::read_features;
 use crate::store::{Content, SourceFile, StoreError, digest, digest_of};
@@ -42,6 +43,8 @@ pub struct Phrase {
     pub n_feature_frames: Option<usize>,
     pub audio: Option<AudioHeader>,
     pub tempo: Option<Tempo>,
+    /// Those of a beat list.
+    pub beats: Option<Beats>,
     pub has_beats: bool,
 }
 
@@ -58,6 +61,12 @@ impl Phrase {
     pub fn duration_s(&self) -> f64 {
         let n_frames = self.motion.as_ref().map(Trajectory::n_frames).or(self.n_feature_frames);
         self.audio.as_ref().map_or_else(|| frames_to_s(n_frames.unwrap_or(0)), |a| a.duration_s)
+    }
+
+    /// Returns the frames of the motion, else of the features or of those that the audio will have.
+    pub fn n_frames(&self) -> usize {
+        let n_frames = self.motion.as_ref().map(Trajectory::n_frames).or(self.n_feature_frames);
+        n_frames.unwrap_or_else(|| s_to_frames(self.duration_s()).floor() as usize + 1)
     }
 }
 
@@ -116,9 +125,9 @@ impl Files {
             n_feature_frames: None,
             audio: None,
             tempo: None,
+            beats: None,
             has_beats: false,
         };
-        let mut beats: Option<Beats> = None;
         let mut motion_path = String::new();
         // Roles are sorted, so beats are known before the motion whose phase needs them.
         for (role, file, content) in self.files {
@@ -129,14 +138,14 @@ impl Files {
                     let read = read_beats(path, bytes_of(&file, content)?.as_ref())?;
                     phrase.tempo = Some(tempo_of(&read));
                     phrase.has_beats = true;
-                    beats = Some(read);
+                    phrase.beats = Some(read);
                 }
                 Role::Features => {
                     let bytes = bytes_of(&file, content)?;
                     let features = read_features(path, &bytes, |_, _, _| {})?;
                     phrase.n_feature_frames = Some(features.n_frames);
                     phrase.has_beats |= !features.beat_times_s.is_empty();
-                    let source = "features";
+                    let source = BeatSource::Features.name();
                     let tempo = |bpm| Tempo { bpm, source, beats_per_bar: None };
                     // A beat list beside the audio was written by somebody; a tracker's was not.
                     phrase.tempo = phrase.tempo.or(features.tempo_bpm.map(tempo));
@@ -146,7 +155,7 @@ impl Files {
                     let (format, motion) = if role == Role::MotionNpy {
                         ("npy", read_trajectory(path, &bytes)?)
                     } else {
-                        ("bvh", read_bvh(path, &bytes, beats.as_ref())?)
+                        ("bvh", read_bvh(path, &bytes, phrase.beats.as_ref())?)
                     };
                     motion.check(&rules.limits).map_err(|e| Failure::of(path, e.kind(), &e))?;
                     phrase.motion = Some(motion);
@@ -247,13 +256,13 @@ pub(in crate::stages) fn read_beats(path: &str, bytes: &[u8]) -> Result<Beats, F
     Beats::parse(text).map_err(|e| refuse(&e))
 }
 
-fn tempo_of(beats: &Beats) -> Tempo {
-    let source = match beats.beats_per_bar_source() {
-        BeatsPerBarSource::Given | BeatsPerBarSource::Numbers => "beats_file",
-        BeatsPerBarSource::Default => "default",
+fn tempo_of(list: &Beats) -> Tempo {
+    let source = match list.beats_per_bar_source() {
+        BeatsPerBarSource::Given | BeatsPerBarSource::Numbers => BeatSource::BeatsFile.name(),
+        BeatsPerBarSource::Default => beats::DEFAULT,
     };
-    let beats_per_bar = Some((beats.beats_per_bar(), source));
-    Tempo { bpm: beats.tempo_bpm(), source: "beats_file", beats_per_bar }
+    let beats_per_bar = Some((list.beats_per_bar(), source));
+    Tempo { bpm: list.tempo_bpm(), source: BeatSource::BeatsFile.name(), beats_per_bar }
 }
 
 /// Reads a `trajectory.npy`; its values are not looked at.

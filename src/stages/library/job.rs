@@ -17,7 +17,7 @@ use crate::stages::Progress;
 use crate::stages::extract::needed_bytes;
 use crate::stages::extract::pool::{self, Budget, lock};
 use crate::stages::failure::{guarded, query_of_failures};
-use crate::store::{ClientOptions, Ledger, Location};
+use crate::store::{Ledger, Location};
 
 /// Memory that songs under way may take while their audio is decoded.
 const MEMORY_BYTES: u64 = 2_000_000_000;
@@ -27,7 +27,6 @@ pub struct Job<'a> {
     pub store: &'a Location,
     pub ledger: Ledger,
     pub known: Known,
-    pub options: ClientOptions,
     pub params: &'a Params,
     pub progress: &'a dyn Progress,
 }
@@ -175,7 +174,7 @@ impl Job<'_> {
         let danced = guarded(&song.id, || {
             let music = {
                 let _share = budget.take(input.needed_bytes());
-                one::read(song, input, &self.options)?
+                one::read(song, input)?
             };
             Ok(writer.song(song, &music))
         });

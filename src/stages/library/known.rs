@@ -2,11 +2,13 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
-use super::songs::{BeatList, Files, Song, slug, slug_of};
+use super::songs::{Files, Song, slug, slug_of};
 use super::split::TRAIN;
 use crate::stages::Stage as _;
+use crate::stages::beats::{self, BeatSource};
 use crate::stages::extract::Extract;
-use crate::store::tables::{BeatRow, ExtractionRow, PhraseRow};
+use crate::stages::failure::{Failure, FailureKind};
+use crate::store::tables::{ExtractionRow, PhraseRow};
 use crate::store::{Ledger, Location, Row, Snapshot, StoreError};
 
 /// What a store knows.
@@ -58,24 +60,19 @@ impl Known {
             let n_frames = usize::try_from(row.n_frames).unwrap_or(0);
             extracted.insert(row.phrase_id, n_frames);
         })?;
-        let mut beats: BTreeMap<String, Vec<(i32, f64)>> = BTreeMap::new();
-        each(store, |row: BeatRow| {
-            if with_audio.contains_key(&row.phrase_id) {
-                beats.entry(row.phrase_id).or_default().push((row.beat, row.time_s));
-            }
-        })?;
+        let mut beats = beats::of_phrases(store, |id| with_audio.contains_key(id))?;
         // Other features of the same file have another digest of parameters.
         let extract = Ledger::read(store, Extract::NAME)?;
         for (id, row) in with_audio {
-            let (Some(&n_frames), Some(url)) = (extracted.get(&id), row.audio_url) else {
+            let (Some(&n_frames), Some(url)) = (extracted.get(&id), row.audio_url.clone()) else {
                 known.n_without_features += 1;
                 continue;
             };
-            let mut tracked = beats.remove(&id).unwrap_or_default();
-            tracked.sort_by_key(|beat| beat.0);
-            let size_bytes = row.beats_bytes.and_then(|n| u64::try_from(n).ok()).unwrap_or(0);
-            let beat_list =
-                row.beats_url.map(|url| BeatList { source: row.source, url, size_bytes });
+            let known_beats = beats.remove(&id).unwrap_or_default();
+            // Rows of release 0.1 do not say it; they are the tracker's where there is audio.
+            let beat_source = known_beats.source().unwrap_or(BeatSource::Tracker);
+            let unread_list =
+                row.beats_url.as_ref().filter(|_| beat_source != BeatSource::BeatsFile);
             let params_hash = extract.get(&id).map_or("", |settled| &settled.params_hash);
             let slug = slug(&id);
             let song = Song {
@@ -84,12 +81,13 @@ impl Known {
                 url,
                 fingerprint: format!("store {} {params_hash}", row.content_hash),
                 split: TRAIN,
-                problem: None,
+                problem: unread_list.map(|list| unread(&id, list)),
                 files: Files::Store {
                     n_frames,
-                    song_hash: row.song_hash,
-                    tracked_s: tracked.into_iter().map(|beat| beat.1).collect(),
-                    beat_list,
+                    song_hash: row.song_hash.clone(),
+                    beats: known_beats.in_bars(&row),
+                    n_beats: known_beats.times_s().len(),
+                    beat_source,
                 },
                 id: id.clone(),
             };
@@ -97,6 +95,15 @@ impl Known {
         }
         Ok(known)
     }
+}
+
+/// Returns why a song is left alone whose beat list was ingested by release 0.1, which kept its place alone.
+fn unread(id: &str, list: &str) -> Failure {
+    let message = format!(
+        "{id}: the store does not have the beats of {list}, which an older motiongen ingested; run ingest \
+         again, then extract and library"
+    );
+    Failure::new(FailureKind::Version, id, message)
 }
 
 /// Visits the rows of a table without holding all of them.

@@ -27,7 +27,7 @@ use songs::{Files, Song, Songs};
 use split::Share;
 
 /// Raised when library writes something else for the same inputs and parameters.
-const OUTPUT_VERSION: u32 = 1;
+const OUTPUT_VERSION: u32 = 2;
 /// Where items come from that the store itself has, as commits name it.
 const FROM_STORE: &str = "phrases";
 
@@ -115,7 +115,7 @@ impl Stage for Library {
             None => Songs::of_store(&store, &mut known)?,
         };
         prepare(&mut songs, &params)?;
-        let job = Job { store: &store, ledger, known, options, params: &params, progress };
+        let job = Job { store: &store, ledger, known, params: &params, progress };
         let mut report = Report {
             place: Place { store: store.to_string(), output: params.output.clone() },
             dry_run: params.dry_run,

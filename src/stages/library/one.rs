@@ -6,16 +6,17 @@ use std::time::Duration;
 use ndarray::{Array2, ArrayView1, s};
 use xxhash_rust::xxh3::xxh3_64_with_seed;
 
-use super::songs::{BeatList, Files, Input, Song};
+use super::songs::{Files, Input, Song};
 use super::{Rules, unreadable};
 use crate::audio::BLOCKS;
 use crate::motion::choreography::{self, BeatGrid, Repertoire, SongError, choreograph, n_phrases};
 use crate::motion::{Beats, BeatsPerBarSource};
+use crate::stages::beats::{self, BeatSource};
 use crate::stages::extract;
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::ingest::read_beats;
-use crate::store::{ClientOptions, Content, Source, SourceFile, StoreError, digest};
-use crate::units::{frames_to_s, s_to_frames};
+use crate::store::{Content, SourceFile, StoreError, digest};
+use crate::units::frames_to_s;
 
 /// Longest time for one song's features.
 const TIMEOUT: Duration = Duration::from_secs(900);
@@ -27,8 +28,7 @@ pub struct Music {
     /// [T, 163], relative to the whole song.
     pub features: Array2<f32>,
     pub beats: Beats,
-    /// `beats_file` or `beat_tracker`.
-    pub tempo_source: &'static str,
+    pub beat_source: BeatSource,
     /// Digest of the files that it was read from, or of what stands for them.
     pub input_hash: String,
     /// Digest of the audio file; none where the store does not tell it.
@@ -54,8 +54,16 @@ impl Music {
     /// Returns where the number of beats in a bar came from, as `phrases` spells it.
     pub fn beats_per_bar_source(&self) -> &'static str {
         match self.beats.beats_per_bar_source() {
-            BeatsPerBarSource::Given | BeatsPerBarSource::Numbers => "beats_file",
-            BeatsPerBarSource::Default => "default",
+            BeatsPerBarSource::Given | BeatsPerBarSource::Numbers => BeatSource::BeatsFile.name(),
+            BeatsPerBarSource::Default => beats::DEFAULT,
+        }
+    }
+
+    /// Returns where the tempo came from, as `phrases` spells it.
+    pub fn tempo_source(&self) -> &'static str {
+        match self.beat_source {
+            BeatSource::Tracker => "beat_tracker",
+            BeatSource::Features | BeatSource::BeatsFile => self.beat_source.name(),
         }
     }
 }
@@ -64,13 +72,17 @@ impl Music {
 ///
 /// # Errors
 /// A [`Failure`] that names the file.
-pub fn read(song: &Song, input: Input, options: &ClientOptions) -> Result<Music, Failure> {
+pub fn read(song: &Song, input: Input) -> Result<Music, Failure> {
     match (&song.files, input) {
-        (Files::Store { tracked_s, beat_list, song_hash, .. }, Input::Features(features)) => {
-            let list = beat_list.as_ref().map(|list| recorded_beats(list, options)).transpose()?;
-            let input_hash = digest(song.fingerprint.as_bytes());
-            let song_hash = song_hash.clone();
-            music(song, features?, tracked_s.clone(), list, Digests { input_hash, song_hash })
+        (
+            Files::Store { beats, n_beats, beat_source, song_hash, .. },
+            Input::Features(features),
+        ) => {
+            let (features, input_hash) = (features?, digest(song.fingerprint.as_bytes()));
+            let none = || no_beats(song, *n_beats, features.nrows());
+            let beats = beats.clone().ok_or_else(none)?;
+            let (beat_source, song_hash) = (*beat_source, song_hash.clone());
+            Ok(Music { features, beats, beat_source, input_hash, song_hash })
         }
         (
             Files::Folder { audio, beat_list },
@@ -94,9 +106,17 @@ pub fn read(song: &Song, input: Input, options: &ClientOptions) -> Result<Music,
                 true
             };
             let found = extract::extract(extract::Origin::Audio, audio, content, see, &rules)?;
-            let tracked_s = found.beats.iter().map(|beat| beat.1).collect();
-            let input_hash = digest(lines.as_bytes());
-            music(song, found.frames, tracked_s, list, Digests { input_hash, song_hash })
+            let (features, input_hash) = (found.frames, digest(lines.as_bytes()));
+            match list {
+                Some(beats) => {
+                    let beat_source = BeatSource::BeatsFile;
+                    Ok(Music { features, beats, beat_source, input_hash, song_hash })
+                }
+                None => {
+                    let tracked_s = found.beats.iter().map(|beat| beat.1).collect();
+                    tracked(song, features, tracked_s, Digests { input_hash, song_hash })
+                }
+            }
         }
         _ => Err(Failure::new(FailureKind::Unreadable, &song.id, "was not read")),
     }
@@ -108,45 +128,20 @@ struct Digests {
     song_hash: Option<String>,
 }
 
-fn music(
+/// Returns a song with the beats that were found in its audio.
+fn tracked(
     song: &Song,
     features: Array2<f32>,
     tracked_s: Vec<f64>,
-    list: Option<Beats>,
     Digests { input_hash, song_hash }: Digests,
 ) -> Result<Music, Failure> {
-    let tempo_source = if list.is_some() { "beats_file" } else { "beat_tracker" };
-    let beats = match list {
-        Some(beats) => beats,
-        None => {
-            let (n_beats, duration_s) = (tracked_s.len(), frames_to_s(features.nrows()));
-            let none = |_| refused(song, &SongError::NoBeats { n_beats, duration_s });
-            Beats::new(tracked_s, None, None).map_err(none)?
-        }
-    };
-    Ok(Music { features, beats, tempo_source, input_hash, song_hash })
+    let (n_beats, n_frames) = (tracked_s.len(), features.nrows());
+    let beats = Beats::new(tracked_s, None, None).map_err(|_| no_beats(song, n_beats, n_frames))?;
+    Ok(Music { features, beats, beat_source: BeatSource::Tracker, input_hash, song_hash })
 }
 
-/// Reads the beat list beside the audio of a phrase of the store.
-fn recorded_beats(list: &BeatList, options: &ClientOptions) -> Result<Beats, Failure> {
-    let failed = |e: StoreError| unreadable(&list.url, &e);
-    let source = Source::open(&list.source, options, None).map_err(failed)?;
-    let gone = || StoreError::NotFound { place: list.url.clone(), hint: "" };
-    let file = source.recorded(&list.url, list.size_bytes, "").ok_or_else(gone).map_err(failed)?;
-    let content = source.read_in_order(vec![file.clone()]).next();
-    let (content, _permit) = content.ok_or_else(gone).map_err(failed)?;
-    let bytes = small_bytes(&file, content)?;
-    if bytes.len() as u64 != list.size_bytes {
-        let message = format!(
-            "{}: has {} bytes but had {} when it was looked at; run ingest again, then extract and \
-             library",
-            file.path,
-            bytes.len(),
-            list.size_bytes
-        );
-        return Err(Failure::new(FailureKind::Changed, &file.path, message));
-    }
-    read_beats(&file.path, &bytes)
+fn no_beats(song: &Song, n_beats: usize, n_frames: usize) -> Failure {
+    refused(song, &SongError::NoBeats { n_beats, duration_s: frames_to_s(n_frames) })
 }
 
 fn small_bytes(
@@ -248,11 +243,6 @@ fn beats_of(grid: &BeatGrid, first: usize, n_frames: usize) -> (Numbered, Number
     };
     let later = beats[end..].iter().position(|beat| beat.number == 1).map_or(0, |i| i + 1);
     (numbered(&beats[begin..end]), numbered(&beats[end..end + later]))
-}
-
-/// Returns the nearest frame of a phrase to a time in it.
-pub fn nearest_frame(time_s: f64, n_frames: usize) -> usize {
-    (s_to_frames(time_s).round() as usize).min(n_frames.saturating_sub(1))
 }
 
 /// Returns the column of a feature that has one.

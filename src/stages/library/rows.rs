@@ -1,7 +1,8 @@
 //! A constructed phrase as rows of `phrases` and `beats`.
 
-use super::one::{Constructed, Music, nearest_frame};
+use super::one::{Constructed, Music};
 use super::songs::Song;
+use crate::stages::beats;
 use crate::store::digest;
 use crate::store::tables::{BeatRow, CONSTRUCTED, PhraseRow};
 use crate::units::frames_to_s;
@@ -36,7 +37,7 @@ pub fn phrase_row(song: &Song, music: &Music, phrase: &Constructed) -> PhraseRow
         n_feature_frames: Some(n_frames as i64),
         split: song.split.to_owned(),
         tempo_bpm: Some(music.beats.tempo_bpm()),
-        tempo_source: Some(music.tempo_source.to_owned()),
+        tempo_source: Some(music.tempo_source().to_owned()),
         beats_per_bar: Some(music.beats.beats_per_bar() as i32),
         beats_per_bar_source: Some(music.beats_per_bar_source().to_owned()),
     }
@@ -53,11 +54,7 @@ fn content_hash(phrase: &Constructed) -> String {
 }
 
 /// Returns the rows of a phrase's beats.
-pub fn beat_rows(phrase: &Constructed) -> impl Iterator<Item = BeatRow> + '_ {
-    phrase.beats.iter().enumerate().map(|(beat, &(time_s, _))| BeatRow {
-        phrase_id: phrase.id.clone(),
-        beat: beat as i32,
-        frame: nearest_frame(time_s, phrase.motion.nrows()) as i32,
-        time_s,
-    })
+pub fn beat_rows<'a>(music: &Music, phrase: &'a Constructed) -> impl Iterator<Item = BeatRow> + 'a {
+    let numbered = phrase.beats.iter().map(|&(time_s, number)| (time_s, Some(i64::from(number))));
+    beats::rows(&phrase.id, numbered, phrase.motion.nrows(), music.beat_source)
 }

@@ -7,6 +7,8 @@ use anyhow::bail;
 use ndarray::Array2;
 
 use super::Known;
+use crate::motion::Beats;
+use crate::stages::beats::BeatSource;
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::ingest::{Layout, Role, plan};
 use crate::store::{
@@ -38,26 +40,20 @@ pub struct Song {
 /// Where a song's data lie.
 #[derive(Clone, Debug)]
 pub enum Files {
-    /// Features in the store; beats there, too, or in a beat list beside the audio.
+    /// Features and beats in the store.
     Store {
         n_frames: usize,
         /// Digest of the audio file, as ingest recorded it.
         song_hash: Option<String>,
-        tracked_s: Vec<f64>,
-        beat_list: Option<BeatList>,
+        /// None where there are too few to tell a tempo.
+        beats: Option<Beats>,
+        n_beats: usize,
+        beat_source: BeatSource,
     },
     Folder {
         audio: SourceFile,
         beat_list: Option<SourceFile>,
     },
-}
-
-/// A beat list that ingest saw.
-#[derive(Clone, Debug)]
-pub struct BeatList {
-    pub source: String,
-    pub url: String,
-    pub size_bytes: u64,
 }
 
 /// What was read of a song.

@@ -135,7 +135,7 @@ impl Writer<'_> {
             let part = commit.part(tables::FEATURES, tables::features)?;
             part.write_frames(&phrase.id, phrase.features.view())?;
             phrases.push(phrase_row(song, music, &phrase));
-            beats.extend(beat_rows(&phrase));
+            beats.extend(beat_rows(music, &phrase));
             let (fingerprint, input_hash) = (fingerprint.clone(), input_hash.clone());
             items.push(Item { id: phrase.id, fingerprint, input_hash, failure: None });
             Ok::<(), Refusal>(())
@@ -156,13 +156,15 @@ impl Writer<'_> {
     }
 
     /// Records a song that failed. Its phrases leave the store, except where its files are only out of
-    /// reach just now.
+    /// reach just now, or its rows too old.
     ///
     /// # Errors
     /// [`StoreError`] of the store.
     pub fn failed_song(&self, song: &Song, failure: &Failure) -> Result<(), StoreError> {
-        let is_out_of_reach =
-            matches!(failure.kind, FailureKind::Unreadable | FailureKind::DuplicateId);
+        let is_out_of_reach = matches!(
+            failure.kind,
+            FailureKind::Unreadable | FailureKind::DuplicateId | FailureKind::Version
+        );
         let old = if is_out_of_reach { Vec::new() } else { self.former(song, &BTreeSet::new()) };
         self.failures(self.origin, &[(&song.id, &song.url, failure)], old)
     }

@@ -10,10 +10,11 @@ use crate::audio::recording::{MAX_HELD_SAMPLES, Options, Recording};
 use crate::audio::spectral::MEL_RANGE_HZ;
 use crate::audio::{Tuning, mel};
 use crate::plot::{self, FeaturesPlot, Panel};
+use crate::stages::beats::{self, BeatSource};
 use crate::stages::extract::Extract;
 use crate::stages::failure::{Failure, guarded};
 use crate::stages::{ClientParams, Stage as _, Summary};
-use crate::store::tables::{self, BeatRow, ExtractionRow, FailureRow, PhraseRow};
+use crate::store::tables::{self, ExtractionRow, FailureRow, PhraseRow};
 use crate::store::{ItemTables, Location, Row as _, Snapshot, StoreError};
 use crate::units::frames_to_s;
 
@@ -147,13 +148,17 @@ fn from_store(store: &Location, phrase: &str, tuning: Option<Tuning>) -> anyhow:
              {wanted}; leave the flag out, or draw the audio file itself with --audio"
         );
     }
-    let mut beats = rows.rows::<BeatRow>()?;
-    beats.sort_by_key(|beat| beat.beat);
+    let beats = beats::of_item(&rows)?;
+    // The tempo goes with the beats.
+    let tempo_bpm = match beats.source() {
+        Some(BeatSource::BeatsFile) => rows.rows::<PhraseRow>()?.pop().and_then(|p| p.tempo_bpm),
+        _ => extraction.and_then(|e| e.tempo_bpm),
+    };
     Ok(Subject {
         title: phrase.to_owned(),
         frames,
-        tempo_bpm: extraction.and_then(|e| e.tempo_bpm),
-        beat_times_s: beats.into_iter().map(|beat| beat.time_s).collect(),
+        tempo_bpm,
+        beat_times_s: beats.times_s().to_vec(),
     })
 }
 
