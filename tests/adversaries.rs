@@ -68,8 +68,18 @@ fn takes(dir: &Dir, store: &Path, folder: &Path) -> Vec<String> {
     let length = format!("--phrase-frames={TAKE_FRAMES}");
     let hop = format!("--hop-frames={TAKE_FRAMES}");
     let output = run([
-        "library", "--quiet", "--store", &place, "--songs", &music, "--captures", &captures, &length, &hop,
-        "--takes=3", "--seed=11",
+        "library",
+        "--quiet",
+        "--store",
+        &place,
+        "--songs",
+        &music,
+        "--captures",
+        &captures,
+        &length,
+        &hop,
+        "--takes=3",
+        "--seed=11",
     ]);
     // Songs that are shorter than a take are failures.
     assert_eq!(output.code, 1, "{output:?}");
@@ -113,11 +123,8 @@ fn takes(dir: &Dir, store: &Path, folder: &Path) -> Vec<String> {
 }
 
 fn write_array(path: &Path, array: &Array2<f32>) {
-    let shape: Vec<usize> = if array.ncols() == 1 {
-        vec![array.nrows()]
-    } else {
-        vec![array.nrows(), array.ncols()]
-    };
+    let shape: Vec<usize> =
+        if array.ncols() == 1 { vec![array.nrows()] } else { vec![array.nrows(), array.ncols()] };
     let values: Vec<f32> = array.iter().copied().collect();
     std::fs::write(path, motiongen::motion::npy::write(&shape, &values)).expect("written");
 }
@@ -164,7 +171,14 @@ fn real_motion_wins_and_every_fault_is_named() {
     for (case, lost, won) in CASES {
         let motions = cases.join(case).display().to_string();
         let output = run([
-            "evaluate", "--quiet", "--store", &place, "--motions", &motions, "--require", "all",
+            "evaluate",
+            "--quiet",
+            "--store",
+            &place,
+            "--motions",
+            &motions,
+            "--require",
+            "all",
         ]);
         let found = outcomes(&store, case);
         for verdict in VERDICTS {

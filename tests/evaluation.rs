@@ -7,10 +7,10 @@ use motiongen::evaluation::beats::{
 };
 use motiongen::evaluation::body::{part, poses};
 use motiongen::evaluation::consistency::consistency;
-use motiongen::evaluation::coupling::{CoupledPassage, Coupling, CouplingSums};
 use motiongen::evaluation::control::{
     ControlErrors, control_errors, position_error_mm, rotation_error_deg, spread_mm,
 };
+use motiongen::evaluation::coupling::{CoupledPassage, Coupling, CouplingSums};
 use motiongen::evaluation::distribution::channel_distances;
 use motiongen::evaluation::diversity::{diversity, mean_distance, multimodality};
 use motiongen::evaluation::frechet::{Gaussian, frechet_distance};
@@ -330,11 +330,8 @@ fn the_coefficient_is_a_regression_on_what_was_constructed() {
 #[test]
 fn bounds_of_windows_are_numpys() {
     let golden = golden();
-    let found: Vec<Posture> = golden
-        .motions
-        .iter()
-        .map(|row| posture(row.frames().view()).expect("finite"))
-        .collect();
+    let found: Vec<Posture> =
+        golden.motions.iter().map(|row| posture(row.frames().view()).expect("finite")).collect();
     for (found, wanted) in found.iter().zip(&golden.postures) {
         assert_near("speed", found.speed_m_s, wanted.speed_m_s);
         assert_near("turn rate", found.turn_rate_rad_s, wanted.turn_rate_rad_s);
@@ -348,8 +345,7 @@ fn bounds_of_windows_are_numpys() {
     let numbers = |range: &WindowRange| {
         let [low, high] = range.height_m;
         let [from, to] = range.jerk_m_s3;
-        let others =
-            [range.speed_m_s, range.turn_rate_rad_s, range.tilt_rad, range.turning_rad_s];
+        let others = [range.speed_m_s, range.turn_rate_rad_s, range.tilt_rad, range.turning_rad_s];
         [&others[..], &[low, high, from, to]].concat()
     };
     assert_eq!(range.n_windows, wanted.n_windows);

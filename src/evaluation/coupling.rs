@@ -112,9 +112,7 @@ impl Harmonics {
             self.n += 1;
             self.sum += v;
             self.square += v * v;
-            for (h, (wave, product)) in
-                self.waves.iter_mut().zip(&mut self.products).enumerate()
-            {
+            for (h, (wave, product)) in self.waves.iter_mut().zip(&mut self.products).enumerate() {
                 let (sine, cosine) = (TAU * (h + 1) as f64 * bars.fract()).sin_cos();
                 *wave = [wave[0] + cosine, wave[1] - sine];
                 *product = [product[0] + v * cosine, product[1] - v * sine];
@@ -267,10 +265,7 @@ pub fn consistency_p(songs: &[Harmonics], seed: u64) -> Option<f64> {
             let rotation = rotations();
             for (h, (sum, w)) in sums.iter_mut().zip(song).enumerate() {
                 let (sine, cosine) = (TAU * (h + 1) as f64 * rotation).sin_cos();
-                *sum = [
-                    sum[0] + w[0] * cosine - w[1] * sine,
-                    sum[1] + w[0] * sine + w[1] * cosine,
-                ];
+                *sum = [sum[0] + w[0] * cosine - w[1] * sine, sum[1] + w[0] * sine + w[1] * cosine];
             }
         }
         sums.iter().map(|[re, im]| re * re + im * im).sum()
@@ -291,9 +286,8 @@ fn rotation_test(
     // Rounding must not make a rotation of a tie less than the tie.
     let threshold = own - 1e-12 * own.abs();
     let mut draws = Draws::new(seed);
-    let n_as_high = (0..N_ROTATIONS)
-        .filter(|_| total(&mut || draws.uniform()) >= threshold)
-        .count();
+    let n_as_high =
+        (0..N_ROTATIONS).filter(|_| total(&mut || draws.uniform()) >= threshold).count();
     own.is_finite().then(|| (1 + n_as_high) as f64 / (1 + N_ROTATIONS) as f64)
 }
 

@@ -52,7 +52,12 @@ impl Estimate {
     /// Cuts the number and its interval off at the bounds of what can be; the interval covers as often as before.
     pub fn within(self, low: f64, high: f64) -> Self {
         let cut = |x: Option<f64>| x.map(|x| x.clamp(low, high));
-        Self { value: cut(self.value), ci_low: cut(self.ci_low), ci_high: cut(self.ci_high), ..self }
+        Self {
+            value: cut(self.value),
+            ci_low: cut(self.ci_low),
+            ci_high: cut(self.ci_high),
+            ..self
+        }
     }
 
     /// Cuts off what is below 0, for numbers that cannot be.
@@ -90,7 +95,9 @@ pub fn mean_and_deviation(values: &[f64]) -> Option<(f64, f64)> {
 pub fn mean_estimate(values: &[f64]) -> Estimate {
     let n = values.len();
     match (mean_and_deviation(values), values) {
-        (Some((mean, s)), _) => Estimate::around(mean, t_quantile(n - 1) * s / (n as f64).sqrt(), n),
+        (Some((mean, s)), _) => {
+            Estimate::around(mean, t_quantile(n - 1) * s / (n as f64).sqrt(), n)
+        }
         (None, &[single]) => Estimate::plain(Some(single), n),
         (None, _) => Estimate::plain(None, n),
     }
@@ -171,8 +178,8 @@ fn wilson(share: f64, n_effective: f64, z: f64, n: usize) -> Estimate {
     }
     let z2 = z * z;
     let middle = share + z2 / (2.0 * n_effective);
-    let half = z
-        * (share * (1.0 - share) / n_effective + z2 / (4.0 * n_effective * n_effective)).sqrt();
+    let half =
+        z * (share * (1.0 - share) / n_effective + z2 / (4.0 * n_effective * n_effective)).sqrt();
     let scale = 1.0 + z2 / n_effective;
     let bound = |x: f64| Some((x / scale).clamp(0.0, 1.0));
     Estimate { value: Some(share), ci_low: bound(middle - half), ci_high: bound(middle + half), n }

@@ -131,7 +131,11 @@ impl WindowRange {
                 ),
             }
         };
-        let within = |name, what: &str, unit: &str, value: Option<[f64; 2]>, [low, high]: [f64; 2]| {
+        let within = |name,
+                      what: &str,
+                      unit: &str,
+                      value: Option<[f64; 2]>,
+                      [low, high]: [f64; 2]| {
             let [lowest, highest] = value.unwrap_or([f64::NAN; 2]);
             // The end that is farther out, or nearer to its bound.
             let (value, threshold) = match low - lowest > highest - high {
@@ -152,7 +156,14 @@ impl WindowRange {
         };
         let degrees = 1.0_f64.to_degrees();
         [
-            below("speed", "highest speed", "m/s", posture.map(|w| w.speed_m_s), self.speed_m_s, 1.0),
+            below(
+                "speed",
+                "highest speed",
+                "m/s",
+                posture.map(|w| w.speed_m_s),
+                self.speed_m_s,
+                1.0,
+            ),
             below(
                 "turn_rate",
                 "highest turn rate",
@@ -171,7 +182,13 @@ impl WindowRange {
                 self.turning_rad_s,
                 1.0,
             ),
-            within("jerk_range", "mean jerk", "m/s³", posture.map(|w| [w.jerk_m_s3; 2]), self.jerk_m_s3),
+            within(
+                "jerk_range",
+                "mean jerk",
+                "m/s³",
+                posture.map(|w| [w.jerk_m_s3; 2]),
+                self.jerk_m_s3,
+            ),
         ]
     }
 
@@ -251,9 +268,6 @@ mod tests {
         nan[[7, 0]] = f32::NAN;
         assert_eq!(failed(&nan), RANGE_CHECKS);
         let message = &range().checks(posture(high.view()).as_ref())[3].message;
-        assert_eq!(
-            message,
-            "height: 1.400 m, 0.900 to 1.100 m in 99.5 % of 41 training windows"
-        );
+        assert_eq!(message, "height: 1.400 m, 0.900 to 1.100 m in 99.5 % of 41 training windows");
     }
 }

@@ -20,9 +20,8 @@ fn song(n_frames: usize, bar_s: f64, start_bars: f64) -> Song {
 impl Song {
     /// Vertical velocity of a body at h(φ + `shift`, a), by the constructing function itself.
     fn rise(&self, bar_s: f64, shift_bars: f64) -> Vec<f64> {
-        let height = |t: usize| {
-            rise_m((self.bars[t] + shift_bars).fract(), self.activity[t], bar_s, 4)
-        };
+        let height =
+            |t: usize| rise_m((self.bars[t] + shift_bars).fract(), self.activity[t], bar_s, 4);
         (1..self.bars.len()).map(|t| FPS * (height(t) - height(t - 1))).collect()
     }
 

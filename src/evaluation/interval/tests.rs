@@ -55,7 +55,8 @@ fn a_share_stays_between_nothing_and_all() {
     near(share_estimate(0, 7), [0.0, 0.0, 1.0 - 1.0 / (1.0 + 1.96 * 1.96 / 7.0)]);
     assert_eq!(share_estimate(0, 0), Estimate::plain(None, 0));
     // Songs whose windows are all alike are so many items, here two, and t(1) = 12.7062 tells next to nothing.
-    let alike = clustered_share_estimate(&[true, true, true, false, false, false], &[0, 0, 0, 1, 1, 1]);
+    let alike =
+        clustered_share_estimate(&[true, true, true, false, false, false], &[0, 0, 0, 1, 1, 1]);
     near(alike, [0.5, 0.001_54, 0.998_46]);
     // All pass: as many items as songs, and t(2) = 4.3027.
     let all = clustered_share_estimate(&[true; 9], &[0, 0, 0, 1, 1, 1, 2, 2, 2]);
@@ -186,7 +187,8 @@ fn numbers_of_sets_hold_the_truth_as_often_as_they_say() {
                 let (mut sum, mut n) = (0.0, 0);
                 for i in (0..n_songs).filter(|i| Some(*i) != left_out) {
                     for j in (0..i).filter(|j| Some(*j) != left_out) {
-                        for (a, b) in all[i].iter().flat_map(|a| all[j].iter().map(move |b| (a, b))) {
+                        for (a, b) in all[i].iter().flat_map(|a| all[j].iter().map(move |b| (a, b)))
+                        {
                             sum += distance(a, b);
                             n += 1;
                         }

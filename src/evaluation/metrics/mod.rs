@@ -4,7 +4,9 @@ mod motion;
 mod music;
 mod ratio;
 
-pub use motion::{MotionContext, channel_numbers, control_numbers, motion_numbers, soundness_numbers};
+pub use motion::{
+    MotionContext, channel_numbers, control_numbers, motion_numbers, soundness_numbers,
+};
 pub use music::{
     MusicContext, N_WRONG_TEMPI, PhaseOrigin, music_numbers, phase_numbers, shifted_numbers,
     song_harmonics,

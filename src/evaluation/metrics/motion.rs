@@ -12,8 +12,7 @@ use super::super::diversity::{
 };
 use super::super::frechet::{Gaussian, frechet_distance};
 use super::super::interval::{
-    Estimate, clustered_mean_estimate, clustered_share_estimate, jackknife_estimate,
-    share_estimate,
+    Estimate, clustered_mean_estimate, clustered_share_estimate, jackknife_estimate, share_estimate,
 };
 use super::super::kinetic::CHUNK_FRAMES;
 use super::super::measured::Measured;
@@ -54,25 +53,20 @@ pub fn motion_numbers(danced: &[Danced], context: &MotionContext) -> Vec<Number>
 
 /// Measures the share of windows that pass all checks of a set, and means of what the checks look at.
 ///
-/// `holds` tells the checks that post-processing makes true, which do not count. `stage` is added to the variants,
-/// where it is not empty.
-pub fn soundness_numbers(
-    danced: &[Danced],
-    holds: &dyn Fn(&str) -> bool,
-    stage: &str,
-) -> Vec<Number> {
+/// `stage` is added to the variants, where it is not empty.
+pub fn soundness_numbers(danced: &[Danced], stage: &str) -> Vec<Number> {
     let passed = |set: CheckSet| {
         let (is_true, songs): (Vec<bool>, Vec<usize>) =
-            danced.iter().map(|item| (item.motion.passes(set, holds), item.song)).unzip();
+            danced.iter().map(|item| (item.motion.passes(set), item.song)).unzip();
         clustered_share_estimate(&is_true, &songs)
     };
     let variant = |name: &str| staged(name, stage);
-    let checks = "share of windows that pass every check of the set that post-processing does not make true";
+    let checks = "share of windows that pass every check of the set";
     let mut numbers = Vec::new();
     for (name, set) in [("reference", CheckSet::Reference), ("strict", CheckSet::Strict)] {
         let share = passed(set);
         let (_, by_song) =
-            mean_over(danced, |item| Some(f64::from(u8::from(item.motion.passes(set, holds)))));
+            mean_over(danced, |item| Some(f64::from(u8::from(item.motion.passes(set)))));
         numbers
             .push(Number::new("pass_rate", variant(name), "", share, checks).with_songs(by_song));
     }
@@ -101,10 +95,8 @@ pub fn soundness_numbers(
         ("share_turning", "turning"),
         ("share_jerk", "jerk_range"),
     ] {
-        let (is_true, songs): (Vec<bool>, Vec<usize>) = danced
-            .iter()
-            .filter_map(|item| Some((item.motion.passed(check)?, item.song)))
-            .unzip();
+        let (is_true, songs): (Vec<bool>, Vec<usize>) =
+            danced.iter().filter_map(|item| Some((item.motion.passed(check)?, item.song))).unzip();
         let share = clustered_share_estimate(&is_true, &songs);
         let share = if is_true.is_empty() { Estimate::plain(None, 0) } else { share };
         numbers.push(Number::new(metric, variant(""), "", share, windows));
@@ -124,9 +116,10 @@ fn posture_numbers(danced: &[Danced]) -> Vec<Number> {
         ("turn_rate", "", "rad/s", |p| p.turning_rad_s),
     ];
     let (speed, by_song) = mean_over(danced, |item| item.motion.mean_speed_m_s);
-    let mut numbers =
-        vec![Number::new("mean_speed", "", "m/s", speed.non_negative(), "of positions")
-            .with_songs(by_song)];
+    let mut numbers = vec![
+        Number::new("mean_speed", "", "m/s", speed.non_negative(), "of positions")
+            .with_songs(by_song),
+    ];
     for (metric, variant, unit, part) in parts {
         let (mean, by_song) = mean_over(danced, |item| item.motion.posture.as_ref().map(part));
         let protocol = "of positions and orientations, mean over windows";
@@ -204,7 +197,8 @@ fn shift_number(danced: &[Danced]) -> Number {
     };
     let n = songs.iter().map(Vec::len).sum();
     let estimate = jackknife_estimate(songs.len(), n, shift).non_negative();
-    let protocol = "root mean square over 24 features of how far their mean is from the training split's";
+    let protocol =
+        "root mean square over 24 features of how far their mean is from the training split's";
     Number::new("feature_shift", "", "deviations", estimate, protocol)
 }
 

@@ -84,8 +84,10 @@ fn coupling_numbers(danced: &[Danced], coupling: Option<&Coupling>) -> Vec<Numbe
         songs.iter().filter_map(|(song, sums)| Some((*song, sums.coefficient(0.0)?))).collect();
     let values: Vec<f64> = by_song.values().copied().collect();
     let sums: Vec<CouplingSums> = songs.into_values().collect();
-    let protocol =
-        format!("vertical velocity of positions on the {} coupling, mean over songs", coupling.name());
+    let protocol = format!(
+        "vertical velocity of positions on the {} coupling, mean over songs",
+        coupling.name()
+    );
     let rotated = format!(
         "coefficient on the {} coupling, bars of each song rotated, {N_ROTATIONS} times",
         coupling.name()
@@ -130,8 +132,7 @@ fn locking_numbers(danced: &[Danced], context: &MusicContext) -> Vec<Number> {
         groups.push(*number_of.entry(song).or_insert(n));
         windows.push(Passage { signal: passage.rise_m_s, bars: passage.bars });
     }
-    let ratios: Vec<f64> =
-        std::iter::once(1.0).chain(wrong_tempi(context.n_wrong_tempi)).collect();
+    let ratios: Vec<f64> = std::iter::once(1.0).chain(wrong_tempi(context.n_wrong_tempi)).collect();
     let share = ratios.len().div_ceil(context.n_threads.get());
     let at: Vec<Vec<f64>> = std::thread::scope(|scope| {
         let workers: Vec<_> = ratios
@@ -155,10 +156,10 @@ fn locking_numbers(danced: &[Danced], context: &MusicContext) -> Vec<Number> {
     };
     let estimate = mean_estimate(r2).within(0.0, 1.0);
     let tempi = context.n_wrong_tempi;
-    let protocol = "vertical velocity of positions, 4 free harmonics of the bar, one fit for a song";
-    let mut numbers = vec![
-        Number::new("locking_r2", "per_song", "", estimate, protocol).with_songs(by_song),
-    ];
+    let protocol =
+        "vertical velocity of positions, 4 free harmonics of the bar, one fit for a song";
+    let mut numbers =
+        vec![Number::new("locking_r2", "per_song", "", estimate, protocol).with_songs(by_song)];
     if tempi > 0 {
         let found = BarLocking::against(r2, &at[1..]);
         let protocol = format!("{protocol}, {tempi} wrong tempi");

@@ -18,9 +18,8 @@ pub fn motion_ratios(own: &[Number], truth: &[Number]) -> Vec<Number> {
 /// Returns the amplitude that is locked to the bar over that of real motion: the coefficients on the known coupling,
 /// mean over mean.
 pub fn coupling_ratio(own: &[Number], truth: &[Number]) -> Option<Number> {
-    let find = |numbers: &[Number]| {
-        numbers.iter().find(|number| number.metric == "coupling").cloned()
-    };
+    let find =
+        |numbers: &[Number]| numbers.iter().find(|number| number.metric == "coupling").cloned();
     let (own, truth) = (find(own)?, find(truth)?);
     let (a, b) = (own.estimate.value?, truth.estimate.value.filter(|x| *x > 0.0)?);
     // A coefficient may be below 0, where a ratio of logarithms would mean nothing.
@@ -59,12 +58,8 @@ fn ratio(
         // Some song stands still, or there is none in common.
         Estimate { value: Some(mean), ci_low, ci_high, n } if n == own.len() => {
             let exp = |x: Option<f64>| x.map(f64::exp);
-            let found = Estimate {
-                value: Some(mean.exp()),
-                ci_low: exp(ci_low),
-                ci_high: exp(ci_high),
-                n,
-            };
+            let found =
+                Estimate { value: Some(mean.exp()), ci_low: exp(ci_low), ci_high: exp(ci_high), n };
             (found, "over that of held-out real motion for the same songs, mean of logarithms")
         }
         _ => (Estimate::plain(Some(a / b), own.len()), "mean over mean of held-out real motion"),

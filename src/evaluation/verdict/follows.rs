@@ -74,12 +74,7 @@ fn wrong_tempi(own: &[Number]) -> Test {
 }
 
 /// A test of whether the coefficient is higher than that of a control, song by song.
-fn paired(
-    name: &'static str,
-    what: &str,
-    own: Option<&Number>,
-    control: &[Number],
-) -> Test {
+fn paired(name: &'static str, what: &str, own: Option<&Number>, control: &[Number]) -> Test {
     let other = own.and_then(|own| find(control, own.metric, &own.variant));
     let differences: Vec<f64> = own
         .zip(other)

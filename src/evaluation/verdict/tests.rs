@@ -5,7 +5,14 @@ use super::*;
 fn number(metric: &'static str, variant: &str, value: f64) -> Number {
     let estimate = Estimate::plain(Some(value), 4);
     let (unit, protocol) = ("", "how".to_owned());
-    Number { metric, variant: variant.to_owned(), unit, estimate, by_song: BTreeMap::new(), protocol }
+    Number {
+        metric,
+        variant: variant.to_owned(),
+        unit,
+        estimate,
+        by_song: BTreeMap::new(),
+        protocol,
+    }
 }
 
 fn by_song(metric: &'static str, variant: &str, songs: &[f64]) -> Number {
@@ -58,7 +65,10 @@ fn control(songs: &[f64]) -> Vec<Number> {
 }
 
 /// Verdicts of numbers, of which some are replaced.
-fn outcomes(changes: &[Number], shifted: &[f64]) -> Vec<(&'static str, Outcome, Vec<&'static str>)> {
+fn outcomes(
+    changes: &[Number],
+    shifted: &[f64],
+) -> Vec<(&'static str, Outcome, Vec<&'static str>)> {
     let mut own = good();
     for change in changes {
         own.retain(|n| (n.metric, &n.variant) != (change.metric, &change.variant));
@@ -136,9 +146,11 @@ fn what_was_not_measured_leaves_a_verdict_open() {
         has_network: false,
     };
     let found = verdicts(&evidence);
-    assert_eq!(found.each_ref().map(|verdict| verdict.outcome.name()), ["won", "won", "open", "won"]);
-    let open: Vec<_> =
-        found[2].tests.iter().filter(|test| test.outcome == Outcome::Open).collect();
+    assert_eq!(
+        found.each_ref().map(|verdict| verdict.outcome.name()),
+        ["won", "won", "open", "won"]
+    );
+    let open: Vec<_> = found[2].tests.iter().filter(|test| test.outcome == Outcome::Open).collect();
     assert_eq!(open.len(), 1);
     assert_eq!(
         open[0].message(),

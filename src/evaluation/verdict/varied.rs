@@ -12,10 +12,8 @@ pub(super) fn tests(evidence: &Evidence) -> Vec<Test> {
     let Evidence { own, truth, .. } = evidence;
     let test = |name, what: &str, variant: &str| {
         // Real motion at one place of different songs is as different as anywhere.
-        let (a, b) = (
-            estimate(own, "song_distance", variant),
-            estimate(truth, "song_distance", "anywhere"),
-        );
+        let (a, b) =
+            (estimate(own, "song_distance", variant), estimate(truth, "song_distance", "anywhere"));
         let over = |x: Option<f64>| Some(x? / b.value.filter(|b| *b > 0.0)?);
         let ratio = Estimate {
             value: over(a.value),

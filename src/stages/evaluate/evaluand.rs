@@ -9,7 +9,7 @@ use ndarray::{Array2, s};
 use super::baselines::{self, Baseline, MusicWindow, RunSettings};
 use super::foreign::{self, ForeignMotions, Refused};
 use super::job::{Evaluated, Job, Motion, SampledWindow, Stage as MadeAt};
-use super::measure::{MAX_KEPT_FRAMES, MeasuredMotion, stride_for};
+use super::measure::{MeasuredMotion, stride_for};
 use super::motions::{self, Phrases, is_held_out};
 use super::params::Params;
 use super::rows::{self, Rows, RunName};
@@ -21,11 +21,11 @@ use crate::evaluation::metrics::PhaseOrigin;
 use crate::evaluation::window::window_starts;
 use crate::generation::LearnedFrom;
 use crate::motion::postprocess::PostProcessConfig;
+use crate::stages::Progress;
 use crate::stages::generate::MotionSettings;
 use crate::stages::learned;
 use crate::stages::model_files::{OpenModel, default_model_cache};
 use crate::stages::motion_source::generated_frames;
-use crate::stages::Progress;
 use crate::store::tables::{self, GenerationRow};
 use crate::store::{Location, Snapshot, StoreError, digest};
 use crate::units::frames_to_s;
@@ -72,8 +72,7 @@ impl Evaluand {
 
     fn of_run(store: &Location, run: &str, most: Option<usize>) -> anyhow::Result<Self> {
         let generations = motions::of_run(store, run, most)?;
-        let phrases =
-            Phrases::read(store, generations.iter().map(|row| row.phrase_id.as_str()))?;
+        let phrases = Phrases::read(store, generations.iter().map(|row| row.phrase_id.as_str()))?;
         let (splits, notes) = splits_of(store, &phrases, &generations)?;
         let motions = generations
             .iter()
@@ -128,8 +127,7 @@ impl Evaluand {
         if let Some(n) = params.num_samples {
             files.keep(n.get());
         }
-        let phrases =
-            Phrases::read(store, files.files.iter().map(|file| file.phrase_id.as_str()))?;
+        let phrases = Phrases::read(store, files.files.iter().map(|file| file.phrase_id.as_str()))?;
         let mut refused = Refused::all(folder, std::mem::take(&mut files.failures));
         // A look at every file, so that what holds no motion is known before the others are measured.
         let (mut motions, mut n_frames, mut notes) = (Vec::new(), Vec::new(), Vec::new());
@@ -265,7 +263,6 @@ impl Evaluand {
             motions: &self.motions,
             phrases: &self.phrases,
             truth: truth.as_ref(),
-            holds: &holds,
             phase: match (self.has_phase, self.postprocess.relock_phase) {
                 (false, _) => PhaseOrigin::Absent,
                 (true, true) => PhaseOrigin::Relocked,
@@ -406,8 +403,7 @@ impl Evaluand {
         job: &Job,
         progress: &dyn Progress,
     ) -> anyhow::Result<Vec<Evaluated>> {
-        let stride = stride_for(self.n_frames.iter().sum::<usize>().max(1).min(usize::MAX / 2));
-        debug_assert!(stride >= 1 && MAX_KEPT_FRAMES > 0);
+        let stride = stride_for(self.n_frames.iter().sum());
         let measurer = job.measurer(stride);
         progress.start("evaluate", "motions", self.motions.len() as u64);
         if let Some(files) = &self.files {

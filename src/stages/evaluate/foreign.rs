@@ -206,9 +206,8 @@ pub struct Refused {
 impl Refused {
     /// Names files by their paths below a folder.
     pub fn all(folder: &Path, files: impl IntoIterator<Item = (PathBuf, Failure)>) -> Vec<Self> {
-        let name = |path: &Path| {
-            path.strip_prefix(folder).unwrap_or(path).to_string_lossy().into_owned()
-        };
+        let name =
+            |path: &Path| path.strip_prefix(folder).unwrap_or(path).to_string_lossy().into_owned();
         files.into_iter().map(|(path, failure)| Self { name: name(&path), failure }).collect()
     }
 }

@@ -9,7 +9,7 @@ use super::measure::{MeasuredMotion, Measurer, kept_frames, stride_for};
 use super::motions::{Phrases, is_held_out};
 use super::params::Params;
 use super::splits::{ALL, MusicSplit, SPLITS};
-use super::subjects::{Finding, Item, Making, Meter, Subject, channels};
+use super::subjects::{Finding, Item, Meter, Subject, channels};
 use super::truth::{Truth, TruthPhrase};
 use crate::evaluation::Measured;
 use crate::evaluation::coupling::{Coupling, Harmonics, Template, consistency_p};
@@ -88,7 +88,6 @@ pub struct Job<'a> {
     pub motions: &'a [Motion],
     pub phrases: &'a Phrases,
     pub truth: Option<&'a Truth>,
-    pub holds: &'a (dyn Fn(&str) -> bool + Sync),
     pub phase: PhaseOrigin,
     /// Whether motions were decoded by this program.
     pub has_raw: bool,
@@ -128,8 +127,7 @@ impl Job<'_> {
             },
             threads: self.params.threads,
         };
-        let real = Making { holds: &|_| false, phase: PhaseOrigin::Own };
-        let own = Making { holds: self.holds, phase: self.phase };
+        let (real, own) = (PhaseOrigin::Own, self.phase);
         let mut findings = Vec::new();
         let mut all_verdicts = Vec::new();
         let largest = SPLITS
@@ -138,7 +136,7 @@ impl Job<'_> {
             .max()
             .unwrap_or(0);
         let truth_name = MusicSplit::HeldOut.name();
-        let truth = meter(largest).numbers(truth_name, &held_out_items, &real);
+        let truth = meter(largest).numbers(truth_name, &held_out_items, real);
         let mut truth_numbers = truth.clone();
         truth_numbers.extend(channels(held_out.iter().map(|(_, kept)| kept), &training_kept));
         if !held_out_items.is_empty() {
@@ -148,7 +146,7 @@ impl Job<'_> {
         if !training.is_empty() {
             let items: Vec<&Item> = training.iter().map(|(item, _)| item).collect();
             // Distances from itself say nothing.
-            let mut numbers = meter(items.len()).numbers(ALL, &items, &real);
+            let mut numbers = meter(items.len()).numbers(ALL, &items, real);
             numbers.retain(|number| !DISTANCES.contains(&number.metric));
             findings.push(Finding { subject: Subject::TrainingTruth, split: ALL, numbers });
         }
@@ -159,7 +157,7 @@ impl Job<'_> {
         progress.say("measuring what was generated");
         if splits.len() > 1 {
             let items: Vec<&Item> = generated.iter().map(|(item, _)| item).collect();
-            let mut numbers = meter(items.len()).numbers(ALL, &items, &own);
+            let mut numbers = meter(items.len()).numbers(ALL, &items, own);
             numbers.extend(meter(0).decoded(&items, self.raw_phase()));
             numbers.extend(self.control(None));
             findings.push(Finding { subject: Subject::Generated, split: ALL, numbers });
@@ -170,7 +168,7 @@ impl Job<'_> {
             let items: Vec<&Item> = chosen.iter().map(|(item, _)| item).collect();
             let meter = meter(items.len());
             let name = split.name();
-            let mut numbers = meter.numbers(name, &items, &own);
+            let mut numbers = meter.numbers(name, &items, own);
             numbers.extend(meter.decoded(&items, self.raw_phase()));
             numbers.extend(motion_ratios(&numbers, &truth));
             numbers.extend(coupling_ratio(&numbers, &truth));
@@ -186,7 +184,7 @@ impl Job<'_> {
                 let items: Vec<&Item> = items.iter().collect();
                 let numbers = match items.is_empty() {
                     true => Vec::new(),
-                    false => meter.numbers(name, &items, &real),
+                    false => meter.numbers(name, &items, real),
                 };
                 Finding { subject, split: name, numbers }
             };
@@ -280,8 +278,9 @@ impl Job<'_> {
         let Some(truth) = self.truth else { return (Vec::new(), Vec::new()) };
         let measure = |phrases: Vec<(usize, &TruthPhrase)>| -> Measurements {
             let n = phrases.len();
-            let chosen: Vec<(usize, &TruthPhrase)> =
-                (0..n.min(MAX_TRUTH_WINDOWS)).map(|i| phrases[i * n / n.min(MAX_TRUTH_WINDOWS)]).collect();
+            let chosen: Vec<(usize, &TruthPhrase)> = (0..n.min(MAX_TRUTH_WINDOWS))
+                .map(|i| phrases[i * n / n.min(MAX_TRUTH_WINDOWS)])
+                .collect();
             let n_frames = chosen.iter().map(|(_, phrase)| phrase.motion.nrows()).sum();
             let measurer = self.measurer(stride_for(n_frames));
             let feed = |give: &mut dyn FnMut(usize, Array2<f32>)| {
@@ -374,13 +373,14 @@ impl Job<'_> {
                 let song = self.phrases.song(id);
                 let is_other =
                     |i: usize| self.phrases.song(&truth.phrases[of_phrase[i]].id) != song;
-                let items = window_starts(features.nrows(), length).take(most).filter_map(|first| {
-                    let window = features.slice(s![first..first + length, ..]);
-                    let nearest = nearest_phrase(index, window, &is_other)?;
-                    let phrase = &truth.phrases[*of_phrase.get(nearest)?];
-                    let window = phrase.motion.slice(s![..length, ..]);
-                    self.baseline_item(measurer, generated, id, first, window)
-                });
+                let items =
+                    window_starts(features.nrows(), length).take(most).filter_map(|first| {
+                        let window = features.slice(s![first..first + length, ..]);
+                        let nearest = nearest_phrase(index, window, &is_other)?;
+                        let phrase = &truth.phrases[*of_phrase.get(nearest)?];
+                        let window = phrase.motion.slice(s![..length, ..]);
+                        self.baseline_item(measurer, generated, id, first, window)
+                    });
                 let items: Vec<Item> = items.collect();
                 found.insert(id.to_owned(), items);
                 Ok::<_, StoreError>(())
@@ -403,16 +403,16 @@ impl Job<'_> {
         let song = self.phrases.song(phrase_id);
         let known = generated.iter().find(|(item, _)| {
             item.song == song
-                && item.music.as_ref().is_some_and(|music| {
-                    music.bars.len() >= first_frame + measurer.window_frames()
-                })
+                && item
+                    .music
+                    .as_ref()
+                    .is_some_and(|music| music.bars.len() >= first_frame + measurer.window_frames())
         });
         let music = match known.filter(|_| self.phrases.is_song(phrase_id)) {
             Some((item, _)) => item.music.clone(),
-            None => self
-                .phrases
-                .music(phrase_id, first_frame + measurer.window_frames())
-                .map(Arc::new),
+            None => {
+                self.phrases.music(phrase_id, first_frame + measurer.window_frames()).map(Arc::new)
+            }
         };
         let measured: Measured = measurer.measure(window).windows.into_iter().next()?;
         Some(Item {
@@ -427,11 +427,7 @@ impl Job<'_> {
     }
 
     /// Returns the best constant with the music of each phrase, one for each window.
-    fn mean_motion(
-        &self,
-        measurer: &Measurer,
-        generated: &[(Item, Array2<f32>)],
-    ) -> Vec<Item> {
+    fn mean_motion(&self, measurer: &Measurer, generated: &[(Item, Array2<f32>)]) -> Vec<Item> {
         let Some(truth) = self.truth else { return Vec::new() };
         let Some(still) =
             measurer.measure(truth.mean_motion.view()).windows.into_iter().next().map(Arc::new)
@@ -464,7 +460,9 @@ impl Job<'_> {
     /// Sums up how far motions are from their constraints.
     fn control(&self, split: Option<MusicSplit>) -> Vec<Number> {
         let chosen = || {
-            self.motions.iter().filter(move |motion| split.is_none_or(|split| motion.split == split))
+            self.motions
+                .iter()
+                .filter(move |motion| split.is_none_or(|split| motion.split == split))
         };
         let misses = |i: usize| -> (Vec<f64>, Vec<usize>) {
             chosen()

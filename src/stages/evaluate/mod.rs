@@ -200,7 +200,8 @@ impl Summary for EvaluateSummary {
     }
 
     fn n_failed(&self) -> u64 {
-        self.missed.iter().map(|(.., n)| *n as u64).sum::<u64>() + self.not_won.len() as u64
+        self.missed.iter().map(|(.., n)| *n as u64).sum::<u64>()
+            + self.not_won.len() as u64
             + self.refused.len() as u64
     }
 }

@@ -15,9 +15,7 @@ use crate::report::{
 };
 
 use crate::store::Location;
-use crate::store::tables::{
-    GenerationRow, MetricRow, SanityCheckRow, SongMetricRow, VerdictRow,
-};
+use crate::store::tables::{GenerationRow, MetricRow, SanityCheckRow, SongMetricRow, VerdictRow};
 use crate::training::TemporalConfig;
 use crate::units::frames_to_s;
 
@@ -115,9 +113,11 @@ impl Page<'_> {
             };
             self.found.metrics.iter().find(is_it).and_then(|row| row.value)
         };
-        let truth = self.found.metrics.iter().find(|row| {
-            row.subject == "held_out_truth" && row.metric == "locking_r2"
-        });
+        let truth = self
+            .found
+            .metrics
+            .iter()
+            .find(|row| row.subject == "held_out_truth" && row.metric == "locking_r2");
         let real = truth.and_then(|row| row.value);
         if let (Some(own), Some(real)) = (value("generated", "locking_r2"), real)
             && own > real
@@ -162,9 +162,7 @@ impl Page<'_> {
             row.and_then(|row| row.score).unwrap_or(f64::NEG_INFINITY)
         };
         let mut order: Vec<usize> = (0..motions.len()).collect();
-        order.sort_by(|a, b| {
-            n_failed(b).cmp(&n_failed(a)).then(score(a).total_cmp(&score(b)))
-        });
+        order.sort_by(|a, b| n_failed(b).cmp(&n_failed(a)).then(score(a).total_cmp(&score(b))));
         order.into_iter().take(n).map(|i| self.card(i, &failed)).collect()
     }
 
@@ -246,9 +244,8 @@ fn verdicts(rows: &[VerdictRow]) -> Vec<Verdict> {
 
 /// Pairs the numbers of songs that both runs have, and adjusts the probabilities for their number.
 fn paired(there: &[SongMetricRow], here: &[SongMetricRow]) -> Vec<Paired> {
-    let key = |row: &SongMetricRow| {
-        [&row.metric, &row.variant, &row.split, &row.song].map(String::clone)
-    };
+    let key =
+        |row: &SongMetricRow| [&row.metric, &row.variant, &row.split, &row.song].map(String::clone);
     let known: BTreeMap<[String; 4], f64> = there.iter().map(|row| (key(row), row.value)).collect();
     let mut pairs: BTreeMap<[String; 3], Vec<f64>> = BTreeMap::new();
     for row in here {
@@ -258,8 +255,10 @@ fn paired(there: &[SongMetricRow], here: &[SongMetricRow]) -> Vec<Paired> {
             pairs.entry([metric, variant, split]).or_default().push(row.value - other);
         }
     }
-    let found: Vec<_> =
-        pairs.into_iter().map(|(key, differences)| (key, paired_difference(&differences))).collect();
+    let found: Vec<_> = pairs
+        .into_iter()
+        .map(|(key, differences)| (key, paired_difference(&differences)))
+        .collect();
     let p: Vec<f64> = found.iter().filter_map(|(_, pair)| pair.p_either()).collect();
     let mut adjusted = holm(&p).into_iter();
     found

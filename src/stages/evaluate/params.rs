@@ -44,7 +44,12 @@ pub struct Params {
     #[arg(long, value_name = "URL")]
     pub store: String,
     /// The run of generate whose motions are evaluated.
-    #[arg(long, value_name = "NAME", required_unless_present = "motions", conflicts_with = "motions")]
+    #[arg(
+        long,
+        value_name = "NAME",
+        required_unless_present = "motions",
+        conflicts_with = "motions"
+    )]
     pub run: Option<String>,
     /// Motions of any program instead: a folder of files named after the store's phrases (ID.npy, ID.csv, ID.bvh,
     /// ID.parquet; of several motions ID.0.npy, ID.1.npy, …).

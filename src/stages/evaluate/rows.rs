@@ -5,9 +5,7 @@ use super::job::{Found, Stage as MadeAt};
 use super::{CHECKS, Evaluate};
 use crate::evaluation::{Check, CheckSet};
 use crate::stages::Stage as _;
-use crate::store::tables::{
-    FailureRow, MetricRow, SanityCheckRow, SongMetricRow, VerdictRow,
-};
+use crate::store::tables::{FailureRow, MetricRow, SanityCheckRow, SongMetricRow, VerdictRow};
 use crate::store::{
     Commit, Item as Settled, Ledger, Location, Row, Snapshot, StoreError, TimestampUs,
 };
@@ -133,9 +131,8 @@ impl Rows {
         self.songs.sort_by_cached_key(|row| {
             [&row.song, &row.metric, &row.variant, &row.split].map(String::clone)
         });
-        self.verdicts.sort_by_cached_key(|row| {
-            [&row.split, &row.verdict, &row.test].map(String::clone)
-        });
+        self.verdicts
+            .sort_by_cached_key(|row| [&row.split, &row.verdict, &row.test].map(String::clone));
     }
 
     /// Reads the rows of a run; of a quick evaluation its checks alone.
@@ -171,8 +168,7 @@ pub fn metrics_of(store: &Location, run: &str) -> Result<Vec<MetricRow>, StoreEr
 /// # Errors
 /// [`StoreError`].
 pub fn songs_of(store: &Location, run: &str) -> Result<Vec<SongMetricRow>, StoreError> {
-    Snapshot::take(store, SongMetricRow::schema())?
-        .rows_where(|row: &SongMetricRow| row.run == run)
+    Snapshot::take(store, SongMetricRow::schema())?.rows_where(|row: &SongMetricRow| row.run == run)
 }
 
 /// What the tables of a store know of a run.

@@ -110,23 +110,15 @@ pub struct Meter<'a> {
     pub threads: NonZeroUsize,
 }
 
-/// What is known of how a set of windows was made.
-#[derive(Clone, Copy)]
-pub struct Making<'a> {
-    /// Tells the checks that post-processing makes true.
-    pub holds: &'a dyn Fn(&str) -> bool,
-    pub phase: PhaseOrigin,
-}
-
 impl Meter<'_> {
     /// Measures a set of windows.
-    pub fn numbers(&self, split: &str, items: &[&Item], making: &Making) -> Vec<Number> {
+    pub fn numbers(&self, split: &str, items: &[&Item], phase: PhaseOrigin) -> Vec<Number> {
         let danced: Vec<Danced> = items.iter().map(|item| item.danced(&item.measured)).collect();
         // Wrong tempi take most of the time; of all splits together nothing rests on them.
         let n_wrong_tempi = if split == ALL { 0 } else { N_WRONG_TEMPI };
         let mut numbers = music_numbers(&danced, &self.music_context(n_wrong_tempi));
-        numbers.extend(phase_numbers(&danced, making.phase, ""));
-        numbers.extend(soundness_numbers(&danced, making.holds, ""));
+        numbers.extend(phase_numbers(&danced, phase, ""));
+        numbers.extend(soundness_numbers(&danced, ""));
         let context = MotionContext { reference: self.reference, n_frechet: self.n_frechet };
         numbers.extend(motion_numbers(&danced, &context));
         numbers
@@ -141,7 +133,7 @@ impl Meter<'_> {
         if danced.is_empty() {
             return Vec::new();
         }
-        let mut numbers = soundness_numbers(&danced, &|_| false, DECODED);
+        let mut numbers = soundness_numbers(&danced, DECODED);
         let mut phases = phase_numbers(&danced, phase, DECODED);
         // Beats of motion are those of what people see.
         phases.retain(|number| number.metric != "rayleigh");

@@ -62,8 +62,7 @@ pub fn read(
         phrases.push(TruthPhrase { id: phrase.id.to_string(), split: phrase.split, motion });
     }
     let train = || phrases.iter().filter(|phrase| phrase.split == Split::Train);
-    let too_little =
-        "the training phrases of the store are too few or too short to compare with; two windows of 2.5 s are \
+    let too_little = "the training phrases of the store are too few or too short to compare with; two windows of 2.5 s are \
          the least";
     let Some(length) = window_frames(train().map(|phrase| phrase.motion.nrows())) else {
         progress.note(too_little);
