@@ -7,7 +7,7 @@ use std::process::Command;
 
 use motiongen::motion::phase::unwrapped;
 use motiongen::store::tables::{self, PhraseRow, VerdictRow};
-use motiongen::store::{Location, Row as _, Snapshot, StoreError};
+use motiongen::store::{Location, Snapshot, StoreError};
 use ndarray::Array2;
 
 use crate::support::{Dir, Output, phrases, rows, run};
@@ -22,7 +22,7 @@ const CASES: [(&str, &[&str], &[&str]); 14] = [
     ("faster",      &["follows_music"],                       &["varied"]),
     ("jitter",      &["sound", "like_real"],                  &[]),
     ("reversed",    &["follows_music"],                       &["like_real", "varied"]),
-    ("beat_late",   &["follows_music"],                       &["sound", "like_real", "varied"]),
+    ("beat_early",  &["follows_music"],                       &["sound", "like_real", "varied"]),
     ("other_song",  &["follows_music"],                       &["like_real"]),
     ("one_for_all", &["follows_music", "varied"],             &["sound"]),
     ("mixed_takes", &["sound"],                               &["like_real", "follows_music", "varied"]),

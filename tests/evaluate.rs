@@ -388,6 +388,10 @@ fn a_model_that_is_not_there_leaves_the_split_unknown() {
     assert!(output.stdout.contains("Nobody knows which of these songs model m learned from"));
 }
 
+fn motion_file(frames: &Array2<f32>) -> Vec<u8> {
+    array(&[frames.nrows(), frames.ncols()], frames.as_slice().expect("in order"))
+}
+
 #[test]
 fn motions_of_any_program_are_evaluated_and_what_is_none_is_listed() {
     let dir = Dir::new();
@@ -396,9 +400,9 @@ fn motions_of_any_program_are_evaluated_and_what_is_none_is_listed() {
     let folder = dir.at("theirs");
     for song in N_TRAIN..N_TRAIN + N_HELD_OUT {
         let name = format!("theirs/{}.npy", songs[song]);
-        dir.write(name, trajectory(&locked(song, 0)));
+        dir.write(name, motion_file(&locked(song, 0)));
     }
-    dir.write("theirs/nobody.npy", trajectory(&locked(0, 0)));
+    dir.write("theirs/nobody.npy", motion_file(&locked(0, 0)));
     dir.write(format!("theirs/{}.npy", songs[0]), b"no array");
     let place = store.display().to_string();
     let motions = folder.display().to_string();

@@ -398,7 +398,7 @@ fn reference_statistics_hold_the_quantiles_of_the_ground_truth() {
     let motions: Vec<Array2<f32>> = golden.motions.iter().map(MotionRow::frames).collect();
     let views: Vec<ArrayView2<f32>> = motions.iter().map(|motion| motion.view()).collect();
     let found = ReferenceStatistics::fit(&views, "hash".to_owned()).expect("finite");
-    assert_eq!((found.n_motions, found.n_chunks), (4, 4));
+    assert_eq!((found.n_windows, found.n_chunks), (4, 4));
     let numbers = |t: &GeometricThresholds| {
         [
             t.speed_q50_m_s,

@@ -154,7 +154,10 @@ impl Test {
 
     /// Returns what the test found, in a sentence.
     pub fn message(&self) -> String {
-        let Self { statistic, estimate, rule, against, unit, .. } = self;
+        let Self { estimate, rule, against, unit, .. } = self;
+        let mut letters = self.statistic.chars();
+        let first = letters.next().map(char::to_uppercase);
+        let statistic: String = first.into_iter().flatten().chain(letters).collect();
         let Some(value) = estimate.value else {
             return format!("{statistic} was not measured ({against})");
         };

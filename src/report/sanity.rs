@@ -140,7 +140,7 @@ pub(super) fn section(out: &mut String, report: &Report) {
             }
             put!(
                 out,
-                "<h3>{} checks, {} <small>{motion}</small></h3>\n<p>Motions that pass all of them: \
+                "<h3>{} checks, {} <small>{motion}</small></h3>\n<p>Share that passes all of them: \
                  {}.</p>\n<div class=\"scroll\"><table class=\"checks\">\n<thead><tr><th \
                  scope=\"col\">check</th><th scope=\"col\">threshold</th><th \
                  scope=\"col\">passed</th><th scope=\"col\" class=\"text\">share</th><th \

@@ -106,12 +106,12 @@ def reversed_in_time(song, songs, rng):
     return from_poses(p[::-1], q[::-1], phase, style[::-1])
 
 
-def beat_late(song, songs, rng):
-    """Real motion that begins a beat late; the phase channel is the music's."""
+def beat_early(song, songs, rng):
+    """Real motion that is a beat ahead of its music; the phase channel is the music's."""
     p, q, phase, style = poses(songs[song]["takes"][0])
     bars = songs[song]["bars"]
     beat = int(round(len(bars) / (bars[-1] - bars[0]) / songs[song]["beats_per_bar"]))
-    return from_poses(p[:-beat], q[:-beat], phase[beat:], style[:-beat])
+    return from_poses(p[beat:], q[beat:], phase, style)
 
 
 def other_song(song, songs, rng):
@@ -206,7 +206,7 @@ CASES = {
     "faster": faster,
     "jitter": jitter,
     "reversed": reversed_in_time,
-    "beat_late": beat_late,
+    "beat_early": beat_early,
     "other_song": other_song,
     "one_for_all": one_for_all,
     "mixed_takes": mixed_takes,

@@ -154,7 +154,7 @@ fn what_was_not_measured_leaves_a_verdict_open() {
     assert_eq!(open.len(), 1);
     assert_eq!(
         open[0].message(),
-        "coefficient less that with the music of other songs was not measured (nothing was measured with the \
+        "Coefficient less that with the music of other songs was not measured (nothing was measured with the \
          music of other songs)"
     );
     let nothing = Evidence { own: &[], truth: &[], ..evidence };
@@ -177,14 +177,14 @@ fn a_test_says_both_values_and_what_it_is_held_against() {
     let found = verdicts(&evidence);
     assert_eq!(
         found[0].tests[0].message(),
-        "share of windows that pass every strict check as decoded is 0.9, asked is at least 0.8; held-out real \
+        "Share of windows that pass every strict check as decoded is 0.9, asked is at least 0.8; held-out real \
          motion 0.94"
     );
     let other = found[2].tests.iter().find(|test| test.name == "other_music").expect("a test");
     let message = other.message();
     assert!(
         message.starts_with(
-            "coefficient less that with the music of other songs is 0.938, asked is above 0; 0.05 with the \
+            "Coefficient less that with the music of other songs is 0.938, asked is above 0; 0.05 with the \
              music of other songs, 4 songs, p 0.0"
         ),
         "{message}"

@@ -76,6 +76,7 @@ fn model_in(folder: &Path, config: UNetConfig) -> OpenModel {
             decoder_step: 1,
             validation_loss: None,
             data: "d".to_owned(),
+            learned_from: None,
         },
         precision: storage,
         unet: config,
