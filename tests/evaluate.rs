@@ -264,7 +264,9 @@ fn numbers_and_baselines_are_what_the_motions_were_made_to_have() {
         assert!((own("phase_error", "raw").expect("decoded") - 0.25).abs() < 1e-6);
         // Every one of the 199 wrong tempi does worse, and no rotation of the bars as well.
         assert_eq!(own("locking_wrong_share", "per_song"), Some(0.005));
-        assert!(own("locking_p", "per_song") <= Some(0.01), "{split}");
+        // Real motion of this store is coupled to the bar in a way of its own, which this motion hardly shares.
+        let p = own("locking_p", "per_song").expect("songs");
+        assert!((0.001..0.5).contains(&p), "{split}: {p}");
         assert!(own("locking_r2", "per_song") > Some(0.99), "{split}");
         // The music of another song has another tempo.
         let shuffled = value(&found, ["shuffled", split, "locking_r2", "per_song"]);
@@ -365,8 +367,11 @@ fn a_required_verdict_that_is_not_won_is_an_exit_code() {
     // Its decoded velocities are those of no body, and its jerk that of no training motion.
     let found = verdicts(&store, "locked", "held_out");
     assert_eq!((found["sound"].as_str(), found["like_real"].as_str()), ("lost", "lost"));
-    // Nobody knows how real motion of this store follows the bar: it does not.
-    assert_eq!(found["follows_music"], "open");
+    // It follows the bar, but not as real motion of this store does: shifted by a beat it does as well.
+    assert_eq!(found["follows_music"], "lost");
+    let shifted = |row: &VerdictRow| row.test == "shifted_bars" && row.split == "held_out";
+    let shifted = rows::<VerdictRow>(&store).into_iter().find(shifted).expect("a test");
+    assert_eq!(shifted.outcome, "lost", "{}", shifted.message);
     // Without the word, verdicts change no exit code.
     assert_eq!(evaluate(&store, "locked", &[]).code, 0);
 }
@@ -461,9 +466,9 @@ fn evaluating_again_does_nothing_and_with_force_finds_the_same() {
     assert!(forced.stdout.contains("  16 motions (137.1 s) evaluated;"), "{forced:?}");
     assert_eq!(without_time(&store), first, "whatever the number of threads");
     // A motion more is another evaluation, which takes the place of the first.
-    let less = evaluate(&store, "locked", &["--num-samples=3", "--num-frames=90"]);
+    let less = evaluate(&store, "locked", &["--num-samples=3", "--num-frames=150"]);
     assert!(less.stdout.contains("  3 motions ("), "{less:?}");
-    assert_eq!(rows::<SanityCheckRow>(&store).len(), 2 * 3 * 13, "90 frames are no window");
+    assert_eq!(rows::<SanityCheckRow>(&store).len(), 2 * 3 * 19);
     // A quick one leaves the numbers.
     let quick = evaluate(&store, "locked", &["--quick"]);
     assert_eq!(quick.code, 0, "{quick:?}");
@@ -486,9 +491,8 @@ fn evaluating_again_does_nothing_and_with_force_finds_the_same() {
     let compared = evaluate(&store, "locked", &["--force", "--against=other"]);
     assert!(
         compared.stdout.contains(
-            "compared with other, 168 numbers: 148 equal, 20 not measured\n  No number is paired song by \
-             song, so that none is called better or worse\n  weights: other weights of there, locked \
-             weights o here\n"
+            "compared with other, 306 numbers: 278 equal, 28 not measured\n  No number is paired song by \
+             song, so that none is called better or worse\n"
         ),
         "{compared:?}"
     );

@@ -2,6 +2,7 @@
 
 mod adversaries;
 mod audio_header;
+mod calibration;
 mod diffusion;
 mod engine;
 mod evaluate;

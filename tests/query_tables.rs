@@ -23,7 +23,7 @@ const PHRASES: [(&str, usize, bool); 5] = [
 ];
 
 /// The tables that are empty until there are models.
-const OF_MODELS: [&str; 7] = [
+const OF_MODELS: [&str; 9] = [
     "training_log",
     "onnx_checks",
     "generations",
@@ -31,6 +31,8 @@ const OF_MODELS: [&str; 7] = [
     "decoded",
     "sanity_checks",
     "metrics",
+    "verdicts",
+    "song_metrics",
 ];
 
 fn write_phrase(dir: &Dir, i: usize, n_frames: usize) -> Vec<Frame> {
@@ -199,12 +201,12 @@ fn a_refused_query_leaves_the_output_file_as_it_was() {
 fn tables_counts_rows_bytes_and_parts_of_what_is_live() {
     let (dir, _) = sound_store();
     let store = dir.at("store");
-    let expected = |tables: [(&str, usize); 3]| {
+    let expected = |tables: [(&str, usize); 4]| {
         let mut text =
             String::from("table                    rows          bytes   parts  version\n");
-        let of_extract = ["features", "extractions", "beats"].map(|name| (name, 0));
-        let [phrases, motion, failures] = tables;
-        let rest = [failures].into_iter().chain(OF_MODELS.map(|name| (name, 0)));
+        let of_extract = ["features", "extractions"].map(|name| (name, 0));
+        let [phrases, motion, beats, failures] = tables;
+        let rest = [beats, failures].into_iter().chain(OF_MODELS.map(|name| (name, 0)));
         for (name, n_rows) in [phrases, motion].into_iter().chain(of_extract).chain(rest) {
             let live = live_files(&store, name);
             let n_bytes: u64 = live.iter().sum();
@@ -219,7 +221,7 @@ fn tables_counts_rows_bytes_and_parts_of_what_is_live() {
         text
     };
     let output = ask(&store, &["--tables"]);
-    let first = expected([("phrases", 5), ("motion", 177), ("failures", 1)]);
+    let first = expected([("phrases", 5), ("motion", 177), ("beats", 14), ("failures", 1)]);
     assert_eq!((output.code, output.stdout), (0, first), "{}", output.stderr);
 
     // One phrase is replaced by a longer one, the broken one is repaired.
@@ -228,7 +230,7 @@ fn tables_counts_rows_bytes_and_parts_of_what_is_live() {
     let output = ingest(&dir.at("source"), &store, &["--batch-phrases", "2"]);
     assert_eq!(output.code, 0, "{output:?}");
     let output = ask(&store, &["--tables"]);
-    let then = expected([("phrases", 6), ("motion", 186), ("failures", 0)]);
+    let then = expected([("phrases", 6), ("motion", 186), ("beats", 14), ("failures", 0)]);
     assert_eq!((output.code, output.stdout), (0, then), "{}", output.stderr);
 }
 
@@ -340,8 +342,10 @@ onnx_checks                 0              0       0        1
 generations                 0              0       0        2
 generated                   0              0       0        1
 decoded                     0              0       0        1
-sanity_checks               0              0       0        1
+sanity_checks               0              0       0        2
 metrics                     0              0       0        1
+verdicts                    0              0       0        1
+song_metrics                0              0       0        1
 ";
     let output = ask(&store, &["--tables"]);
     assert_eq!((output.code, output.stdout.as_str()), (0, expected), "{}", output.stderr);
@@ -393,7 +397,8 @@ fn an_unknown_table_comes_with_the_nearest_and_all_others() {
         let start = format!("table \"{table}\" not found; nearest: {nearest}");
         assert!(sentence.starts_with(&start), "{sentence}");
         let all = "; a store has phrases, motion, features, extractions, beats, failures, \
-                   training_log, onnx_checks, generations, generated, decoded, sanity_checks, metrics";
+                   training_log, onnx_checks, generations, generated, decoded, sanity_checks, metrics, \
+                   verdicts, song_metrics";
         assert!(sentence.ends_with(all), "{sentence}");
     }
 }
