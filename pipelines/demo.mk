@@ -30,8 +30,8 @@ demo:
 	@echo "model    $(STORE)/models/$(MODEL)"
 	@echo "motion   $(PAGE) (open it in a browser)"
 	@echo "report   $(REPORT) (open it in a browser)"
-	@echo "numbers  $(MOTIONGEN) query --store $(STORE) \"select model, subject, metric, variant, value, ci_low, \
-	ci_high from metrics where split = 'held_out' and metric like 'locking%'\""
+	@echo "verdicts $(MOTIONGEN) query --store $(STORE) \"select verdict, test, outcome, message from verdicts \
+	where split = 'held_out'\""
 
 # ingest: both sources into one store.
 $(foreach s,$(SOURCES),$(call watch,$(s),$(DATA)/$(s),$(STORE)))
@@ -123,10 +123,9 @@ g.checks_passed, g.n_checks, round(g.locking, 3) as bar_locking, round(g.real_ti
 from generations g where g.selected and g.sample = 0 order by g.phrase_id limit 8
 endef
 # Quotes on the way to the shell, which has the query in quotes of its own.
-define METRICS
-select subject, metric, variant, round(value, 4) as value, round(ci_low, 4) as ci_low,
-round(ci_high, 4) as ci_high, n from metrics where split = '\''held_out'\'' and
-(metric = '\''pass_rate'\'' or (metric like '\''locking%'\'' and variant = '\''per_song'\'')) order by metric, variant, subject
+define VERDICTS
+select verdict, verdict_outcome, test, outcome, round(value, 3) as value, rule, threshold, against
+from verdicts where split = '\''held_out'\'' order by verdict, test
 endef
 # Lines become spaces on the way to the shell.
 define newline
@@ -148,5 +147,5 @@ $(ANSWERS): $(INGESTED) $(EXTRACTED) $(LIBRARY) $(FINETUNED) $(EXPORTED) $(PLOT)
 	$(call ask,What did training bring?,TRAINING)
 	$(call ask,Does onnxruntime answer what was trained?,CHECKS)
 	$(call ask,What was danced$(comma) and how well?,GENERATIONS)
-	$(call ask,Does it follow music that it did not learn from?,METRICS)
+	$(call ask,What may be said of motion for songs that nothing was learned from?,VERDICTS)
 	@mv $@.new $@

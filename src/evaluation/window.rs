@@ -28,6 +28,14 @@ pub fn window_frames(n_frames: impl IntoIterator<Item = usize>) -> Option<usize>
     (length >= CHUNK_FRAMES).then_some(length)
 }
 
+/// Returns the length of windows for motions of these lengths where there is no training motion to compare with: 120
+/// frames, or as many as nine in ten of them have.
+pub fn own_window_frames(n_frames: impl IntoIterator<Item = usize>) -> usize {
+    let mut lengths: Vec<f64> = n_frames.into_iter().map(|n| n as f64).collect();
+    let most = percentile(&mut lengths, SHORTER_PERCENT).unwrap_or(0.0).floor() as usize;
+    most.clamp(1, WINDOW_FRAMES)
+}
+
 /// Returns the first frames of the windows of a motion, one behind the other; what is left at its end belongs to
 /// none.
 pub fn window_starts(n_frames: usize, window_frames: usize) -> impl Iterator<Item = usize> {
@@ -64,6 +72,10 @@ mod tests {
         lengths[5] = 3;
         assert_eq!(window_frames(lengths), None);
         assert_eq!(window_frames([]), None);
+        assert_eq!(
+            [own_window_frames([31, 40, 35]), own_window_frames([]), own_window_frames([900])],
+            [31, 1, 120]
+        );
     }
 
     #[test]

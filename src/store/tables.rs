@@ -253,7 +253,7 @@ rows! {
         ci_high: Option<f64>, "", "Upper end of its 95 % interval.";
         unit: String, "", "Unit of the value; empty where it has none.";
         rule: String, "", "`at least`, `at most`, `above`, `below`, or a range.";
-        limit: f64, "", "The limit of the rule; of a range the upper one.";
+        threshold: f64, "", "The number of the rule; of a range the upper one.";
         against: String, "", "What the value is held against.";
         p: Option<f64>, "", "Probability by chance, of tests that have one.";
         p_holm: Option<f64>, "", "The same, adjusted for the tests of the verdict (Holm).";

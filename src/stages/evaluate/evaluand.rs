@@ -18,7 +18,7 @@ use super::subjects::Subject;
 use super::truth::{self, Truth};
 use crate::evaluation::holds_by_construction;
 use crate::evaluation::metrics::PhaseOrigin;
-use crate::evaluation::window::window_starts;
+use crate::evaluation::window::{own_window_frames, window_starts};
 use crate::generation::LearnedFrom;
 use crate::motion::postprocess::PostProcessConfig;
 use crate::stages::Progress;
@@ -263,6 +263,7 @@ impl Evaluand {
             motions: &self.motions,
             phrases: &self.phrases,
             truth: truth.as_ref(),
+            window_frames: self.window_frames(truth.as_ref()),
             phase: match (self.has_phase, self.postprocess.relock_phase) {
                 (false, _) => PhaseOrigin::Absent,
                 (true, true) => PhaseOrigin::Relocked,
@@ -291,6 +292,14 @@ impl Evaluand {
             rows.add(name, found, &|song| self.phrases.song_name(song));
         }
         Ok(rows)
+    }
+
+    /// Returns the frames of a window: as many for all that is compared.
+    fn window_frames(&self, truth: Option<&Truth>) -> usize {
+        truth.map_or_else(
+            || own_window_frames(self.n_frames.iter().copied()),
+            |truth| truth.statistics.window_frames,
+        )
     }
 
     /// Reads the activity of the songs that were danced to, and of those with held-out real motion.
@@ -333,7 +342,7 @@ impl Evaluand {
         }
         let model = OpenModel::of_store(store, &row.model, &default_model_cache())?;
         let settings = RunSettings::of_run(row, &model.card)?;
-        let length = truth.map_or(model.card.window_frames, |truth| truth.statistics.window_frames);
+        let length = self.window_frames(truth);
         let windows = self.music_windows(store, split, length, most)?;
         let request = baselines::Request {
             store,

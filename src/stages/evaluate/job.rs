@@ -88,6 +88,8 @@ pub struct Job<'a> {
     pub motions: &'a [Motion],
     pub phrases: &'a Phrases,
     pub truth: Option<&'a Truth>,
+    /// Frames of a window: as many for all that is compared.
+    pub window_frames: usize,
     pub phase: PhaseOrigin,
     /// Whether motions were decoded by this program.
     pub has_raw: bool,
@@ -219,6 +221,7 @@ impl Job<'_> {
         Measurer {
             limits: self.params.limits,
             reference: self.truth.map(|truth| &truth.statistics),
+            window_frames: self.window_frames,
             num_frames: self.params.num_frames.map(Into::into),
             stride,
             threads: self.params.threads,
@@ -251,7 +254,7 @@ impl Job<'_> {
                 }
                 music => music,
             };
-            let firsts = window_starts(found.is.n_frames, self.measurer(1).window_frames());
+            let firsts = window_starts(found.is.n_frames, self.window_frames);
             for (i, (first_frame, window)) in firsts.zip(&found.is.windows).enumerate() {
                 let decoded = found.decoded.as_ref().and_then(|decoded| decoded.windows.get(i));
                 let item = Item {
@@ -290,7 +293,7 @@ impl Job<'_> {
                 Ok::<_, std::convert::Infallible>(())
             };
             let Ok(found) = measurer.run(chosen.len(), feed);
-            let length = measurer.window_frames();
+            let length = measurer.window_frames;
             let mut items = Vec::new();
             // Takes of one place of a song are motions for one phrase.
             let mut places: BTreeMap<(usize, u64), usize> = BTreeMap::new();
@@ -365,7 +368,7 @@ impl Job<'_> {
         }
         let most = MAX_RETRIEVED.div_ceil(names.len().max(1));
         let owned: BTreeSet<String> = names.iter().map(|id| (*id).to_owned()).collect();
-        let length = measurer.window_frames();
+        let length = measurer.window_frames;
         let mut found: BTreeMap<String, Vec<Item>> = BTreeMap::new();
         Snapshot::take(self.store, tables::features())?.visit_items(
             &owned,
@@ -406,12 +409,12 @@ impl Job<'_> {
                 && item
                     .music
                     .as_ref()
-                    .is_some_and(|music| music.bars.len() >= first_frame + measurer.window_frames())
+                    .is_some_and(|music| music.bars.len() >= first_frame + measurer.window_frames)
         });
         let music = match known.filter(|_| self.phrases.is_song(phrase_id)) {
             Some((item, _)) => item.music.clone(),
             None => {
-                self.phrases.music(phrase_id, first_frame + measurer.window_frames()).map(Arc::new)
+                self.phrases.music(phrase_id, first_frame + measurer.window_frames).map(Arc::new)
             }
         };
         let measured: Measured = measurer.measure(window).windows.into_iter().next()?;

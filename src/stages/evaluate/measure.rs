@@ -7,7 +7,7 @@ use std::sync::mpsc::{Receiver, sync_channel};
 use ndarray::{Array2, ArrayView2, Axis, s};
 
 use crate::evaluation::reference_statistics::ReferenceStatistics;
-use crate::evaluation::window::{WINDOW_FRAMES, window, window_starts};
+use crate::evaluation::window::{window, window_starts};
 use crate::evaluation::window_range::RANGE_CHECKS;
 use crate::evaluation::{Check, Measured, checks};
 use crate::motion::{ChannelLimits, MOTION_DIM};
@@ -23,6 +23,8 @@ const MIN_WINDOW_SHARE: f64 = 0.9;
 pub struct Measurer<'a> {
     pub limits: ChannelLimits,
     pub reference: Option<&'a ReferenceStatistics>,
+    /// Frames of a window.
+    pub window_frames: usize,
     /// Most frames of a motion that are looked at.
     pub num_frames: Option<usize>,
     /// One of so many frames is kept.
@@ -78,16 +80,11 @@ impl Measurer<'_> {
         Ok(measured.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner))
     }
 
-    /// Returns the frames of a window.
-    pub fn window_frames(&self) -> usize {
-        self.reference.map_or(WINDOW_FRAMES, |reference| reference.window_frames)
-    }
-
     /// Measures one motion, `[T, 25]`.
     pub fn measure(&self, frames: ArrayView2<f32>) -> MeasuredMotion {
         let n = self.num_frames.unwrap_or(usize::MAX).min(frames.nrows());
         let frames = frames.slice(s![..n, ..]);
-        let length = self.window_frames();
+        let length = self.window_frames;
         let (mut windows, mut kept) = (Vec::new(), Array2::zeros((0, MOTION_DIM)));
         for first in window_starts(n, length) {
             let placed = window(frames, first, length);

@@ -225,7 +225,7 @@ fn verdicts(rows: &[VerdictRow]) -> Vec<Verdict> {
             ci_high: row.ci_high,
             unit: row.unit.clone(),
             rule: row.rule.clone(),
-            limit: Some(row.limit),
+            limit: Some(row.threshold),
             against: row.against.clone(),
             message: row.message.clone(),
         };

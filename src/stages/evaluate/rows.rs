@@ -116,7 +116,7 @@ impl Rows {
                     ci_high: test.estimate.ci_high,
                     unit: test.unit.to_owned(),
                     rule: test.rule.words(),
-                    limit: test.rule.limit(),
+                    threshold: test.rule.limit(),
                     against: test.against.clone(),
                     p: test.p,
                     p_holm: test.p_holm,
