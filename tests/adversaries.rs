@@ -19,7 +19,7 @@ const VERDICTS: [&str; 4] = ["sound", "like_real", "follows_music", "varied"];
 const CASES: [(&str, &[&str], &[&str]); 14] = [
     ("real",        &[],                                      &VERDICTS),
     ("upside_down", &["sound", "like_real", "follows_music"], &[]),
-    ("faster",      &["follows_music"],                       &["varied"]),
+    ("faster",      &["like_real", "follows_music"],          &["varied"]),
     ("jitter",      &["sound", "like_real"],                  &[]),
     ("reversed",    &["follows_music"],                       &["like_real", "varied"]),
     ("beat_early",  &["follows_music"],                       &["sound", "like_real", "varied"]),

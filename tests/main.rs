@@ -2,6 +2,7 @@
 
 mod adversaries;
 mod audio_header;
+mod beats;
 mod calibration;
 mod diffusion;
 mod engine;

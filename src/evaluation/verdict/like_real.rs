@@ -5,8 +5,8 @@ use crate::evaluation::interval::Estimate;
 
 /// Speeds along each axis over those of real motion.
 const SPEED_RATIO: [f64; 2] = [0.67, 1.5];
-/// Jerk over that of real motion.
-const JERK_RATIO: [f64; 2] = [0.5, 2.0];
+/// Jerk over that of real motion; at 1.2 times its speed motion has 1.73 times its jerk.
+const JERK_RATIO: [f64; 2] = [0.6, 1.6];
 /// How much farther from the training split than held-out real motion a Fréchet distance may be: in eight features,
 /// as much as half a deviation of each.
 const FRECHET_MARGIN: f64 = 2.0;
