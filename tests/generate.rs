@@ -8,7 +8,9 @@ use std::process::Command;
 use std::time::Duration;
 
 use motiongen::motion::npy::write as npy;
-use motiongen::store::tables::{GENERATED, GenerationRow};
+use motiongen::motion::{Beats, CHANNEL_NAMES, bar_phase};
+use motiongen::store::tables::{BeatRow, GENERATED, GenerationRow};
+use motiongen::store::{Commit, Item, Ledger, Location, Row as _};
 use ndarray::Array2;
 
 use crate::support::{Dir, Output, confined, failures, finish, motiongen, rows, run, write};
@@ -321,6 +323,56 @@ fn memory_does_not_grow_with_the_track() {
     // Ten minutes are 18,000 frames: 12 MB of features and 2 MB of motion.
     let output = finish(&mut confined(&command, 600 << 20));
     assert_eq!(output.code, 0, "{output:?}");
+}
+
+/// Commits numbered beats of a phrase as ingest does for a beat list.
+fn commit_list(store: &Path, phrase: &str, beats: &[(f64, i32)]) {
+    let store = Location::local(store).expect("a folder");
+    let mut commit = Commit::new(&store, "beats of a list", "", "lists");
+    let rows: Vec<BeatRow> = (0..)
+        .zip(beats)
+        .map(|(beat, &(time_s, number))| BeatRow {
+            phrase_id: phrase.to_owned(),
+            beat,
+            frame: (time_s * 30.0).round() as i32,
+            time_s,
+            number: Some(number),
+            source: Some("beats_file".to_owned()),
+        })
+        .collect();
+    let schema = BeatRow::schema;
+    commit.part(schema().name, schema).expect("a part").write_rows(&rows).expect("rows");
+    let (id, input_hash) = (phrase.to_owned(), phrase.to_owned());
+    let item = Item { id, fingerprint: String::new(), input_hash, failure: None };
+    commit.settle(item, &Ledger::default());
+    commit.publish().expect("published");
+}
+
+#[test]
+fn motions_have_the_phase_of_a_beat_list_and_follow_it_when_it_changes() {
+    let dir = Dir::new();
+    let store = modelled(&dir);
+    generate(&store, &[]);
+    let longest = generations(&store).into_iter().max_by_key(|row| row.n_frames).expect("rows");
+    let list = [(0.2, 3), (0.7, 1), (1.3, 2), (1.7, 3)];
+    commit_list(&store, &longest.phrase_id, &list);
+    let output = generate(&store, &[]);
+    assert!(output.stdout.contains("  1 motions made ("), "{output:?}");
+    let output = generate(&store, &[]);
+    assert!(output.stdout.contains("nothing to do"), "{output:?}");
+    let phase = CHANNEL_NAMES[16];
+    let store = store.display().to_string();
+    let sql = format!(
+        "select {phase} from generated where phrase_id = '{}' order by frame",
+        longest.phrase_id
+    );
+    let output = run(["query", "--store", &store, &sql, "--format", "csv"]);
+    let found: Vec<f32> =
+        output.stdout.lines().skip(1).map(|x| x.parse().expect("a phase")).collect();
+    let beats = Beats::parse("0.2 3\n0.7 1\n1.3 2\n1.7 3\n").expect("beats");
+    let times_s: Vec<f64> = (0..found.len()).map(motiongen::units::frames_to_s).collect();
+    let expected: Vec<f32> = bar_phase(&times_s, &beats).iter().map(|&x| x as f32).collect();
+    assert_eq!((found.len() as i64, found), (longest.n_frames, expected));
 }
 
 #[test]

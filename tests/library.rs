@@ -45,7 +45,7 @@ fn from(songs: &Path, captures: &Path, more: &[&str]) -> Vec<std::ffi::OsString>
 const RATE_HZ: u32 = 11_025;
 
 /// A song of clicks at `tempo_bpm`, the first at 0.25 s, louder and louder up to its middle.
-fn clicks(tempo_bpm: f64, duration_s: f64) -> Vec<u8> {
+pub fn clicks(tempo_bpm: f64, duration_s: f64) -> Vec<u8> {
     let n_samples = (duration_s * f64::from(RATE_HZ)) as usize;
     let sample = |i: usize| {
         let time_s = i as f64 / f64::from(RATE_HZ);

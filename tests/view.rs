@@ -36,12 +36,12 @@ fn text(path: &Path) -> String {
     path.display().to_string()
 }
 
-fn page(path: &str) -> String {
+pub fn page(path: &str) -> String {
     std::fs::read_to_string(path).expect("a page")
 }
 
 /// Returns what the script of a page reads.
-fn data(page: &str) -> Value {
+pub fn data(page: &str) -> Value {
     let (_, rest) = page.split_once("id=\"data\">").expect("data");
     let (json, _) = rest.split_once("</script>").expect("the end of the data");
     serde_json::from_str(json).expect("JSON")

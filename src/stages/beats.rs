@@ -110,17 +110,27 @@ impl PhraseBeats {
     /// One beat is enough where its number is known and the row has a tempo, as of a short excerpt of a slow
     /// song.
     pub fn in_bars(&self, row: &PhraseRow) -> Option<Beats> {
-        let (mut times_s, mut numbers) = (self.times_s.clone(), self.numbers.clone());
         let stated = row.beats_per_bar.and_then(|n| u32::try_from(n).ok());
+        let is_default = row.beats_per_bar_source.as_deref() == Some(DEFAULT);
+        self.counted(stated, is_default, row.tempo_bpm)
+    }
+
+    fn counted(
+        &self,
+        stated: Option<u32>,
+        is_default: bool,
+        tempo_bpm: Option<f64>,
+    ) -> Option<Beats> {
+        let (mut times_s, mut numbers) = (self.times_s.clone(), self.numbers.clone());
         let beats_per_bar = match &numbers {
             // A row that is older than the beats says nothing of them.
             Some(numbers) => {
                 stated.filter(|n| numbers.iter().all(|number| *number <= i64::from(*n)))
             }
-            None => stated.filter(|_| row.beats_per_bar_source.as_deref() != Some(DEFAULT)),
+            None => stated.filter(|_| !is_default),
         };
         if let (&[time_s], Some(&[number]), Some(beats_per_bar), Some(tempo_bpm)) =
-            (times_s.as_slice(), numbers.as_deref(), beats_per_bar, row.tempo_bpm)
+            (times_s.as_slice(), numbers.as_deref(), beats_per_bar, tempo_bpm)
         {
             times_s.push(time_s + 60.0 / tempo_bpm);
             numbers = Some(vec![number, number % i64::from(beats_per_bar) + 1]);
@@ -180,4 +190,107 @@ pub fn of_phrases(
 pub fn of_item(rows: &ItemTables) -> Result<PhraseBeats, StoreError> {
     let rows: Vec<BeatRow> = rows.rows()?;
     Ok(PhraseBeats::of_rows(rows.iter().map(KnownBeat::from).collect()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::motion::{BeatsPerBarSource, bar_phase};
+
+    fn beat(
+        beat: i32,
+        time_s: f64,
+        number: Option<i64>,
+        source: impl Into<Option<BeatSource>>,
+    ) -> KnownBeat {
+        KnownBeat { beat, time_s, number, source: source.into() }
+    }
+
+    #[test]
+    fn the_best_source_counts_and_its_beats_are_in_order() {
+        use BeatSource::{BeatsFile, Features, Tracker};
+        let tracked = || vec![beat(0, 0.3, None, Tracker), beat(1, 0.9, None, Tracker)];
+        let listed = || vec![beat(1, 0.5, Some(2), BeatsFile), beat(0, 0.1, Some(1), BeatsFile)];
+        let found = PhraseBeats::of_rows(tracked().into_iter().chain(listed()).collect());
+        let expected = PhraseBeats {
+            times_s: vec![0.1, 0.5],
+            numbers: Some(vec![1, 2]),
+            source: Some(BeatsFile),
+        };
+        assert_eq!(found, expected);
+        let found = PhraseBeats::of_rows(tracked());
+        assert_eq!((found.times_s(), found.is_numbered()), (&[0.3, 0.9][..], false));
+        // Rows of release 0.1 give way to all others, and are what there is without them.
+        let old = || vec![beat(0, 0.4, None, None), beat(1, 1.0, None, None)];
+        assert_eq!(PhraseBeats::of_rows(old()).times_s(), [0.4, 1.0]);
+        let imported = beat(0, 0.7, None, Features);
+        let rows = old().into_iter().chain([imported]).chain(tracked().split_off(2)).collect();
+        let found = PhraseBeats::of_rows(rows);
+        assert_eq!((found.times_s(), found.source()), (&[0.7][..], Some(Features)));
+        assert_eq!(PhraseBeats::of_rows(Vec::new()), PhraseBeats::default());
+        for source in BeatSource::ALL {
+            assert_eq!(BeatSource::named(source.name()), Some(source));
+        }
+        assert_eq!(BeatSource::named("drummer"), None);
+    }
+
+    #[test]
+    fn numbers_count_where_every_beat_has_one() {
+        let some = vec![beat(0, 0.1, Some(3), None), beat(1, 0.6, None, None)];
+        assert!(!PhraseBeats::of_rows(some).is_numbered());
+    }
+
+    #[test]
+    fn an_excerpt_keeps_its_place_in_the_bar() {
+        let phase = |beats: &Beats, t: f64| bar_phase(&[t], beats)[0];
+        let numbered = |beats: &[(f64, i64)]| {
+            let row = |(i, &(t, number)): (usize, &(f64, i64))| {
+                beat(i as i32, t, Some(number), BeatSource::Tracker)
+            };
+            PhraseBeats::of_rows(beats.iter().enumerate().map(row).collect())
+        };
+        // Bars of four, said by the row though the excerpt has no fourth beat, and no first one.
+        let excerpt = numbered(&[(0.25, 2), (0.75, 3)]);
+        let beats = excerpt.counted(Some(4), true, Some(120.0)).expect("two beats");
+        assert_eq!((beats.beats_per_bar(), beats.numbers()), (4, Some(&[2, 3][..])));
+        assert!((phase(&beats, 0.25) - 0.25).abs() < 1e-12);
+        assert!((phase(&beats, 1.75) - 0.0).abs() < 1e-12);
+        // One beat, continued at the tempo of the row.
+        let one = numbered(&[(0.5, 3)]);
+        let beats = one.counted(Some(3), false, Some(30.0)).expect("a tempo");
+        assert_eq!((beats.times_s(), beats.numbers()), (&[0.5, 2.5][..], Some(&[3, 1][..])));
+        assert!((phase(&beats, 2.5) - 0.0).abs() < 1e-12);
+        assert_eq!(one.counted(Some(3), false, None), None);
+        // A row that speaks of shorter bars is older than these numbers.
+        let beats = excerpt.counted(Some(2), false, None).expect("two beats");
+        assert_eq!(beats.beats_per_bar(), 3);
+    }
+
+    #[test]
+    fn beats_without_numbers_are_in_bars_that_somebody_said_or_nobody() {
+        let rows = vec![beat(0, 0.5, None, None), beat(1, 1.0, None, None)];
+        let beats = PhraseBeats::of_rows(rows);
+        let source = |beats: Option<Beats>| {
+            beats.map(|beats| (beats.beats_per_bar(), beats.beats_per_bar_source()))
+        };
+        assert_eq!(
+            source(beats.counted(Some(4), true, None)),
+            Some((4, BeatsPerBarSource::Default))
+        );
+        assert_eq!(
+            source(beats.counted(Some(3), false, None)),
+            Some((3, BeatsPerBarSource::Given))
+        );
+        assert_eq!(PhraseBeats::default().counted(Some(4), true, Some(120.0)), None);
+    }
+
+    #[test]
+    fn rows_have_the_nearest_frame_and_none_behind_the_last() {
+        let beats = [(0.05, Some(4)), (1.04, Some(1)), (2.0, None)];
+        let found: Vec<_> = rows("a", beats, 41, BeatSource::Features).collect();
+        let of = |row: &BeatRow| (row.beat, row.frame, row.time_s, row.number);
+        let expected = [(0, 2, 0.05, Some(4)), (1, 31, 1.04, Some(1)), (2, 40, 2.0, None)];
+        assert_eq!(found.iter().map(of).collect::<Vec<_>>(), expected);
+        assert!(found.iter().all(|row| row.source.as_deref() == Some("features")));
+    }
 }

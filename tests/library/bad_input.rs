@@ -1,11 +1,12 @@
 //! Songs and captures that cannot be used are failures with a sentence, and the job goes on.
 
 use std::collections::BTreeMap;
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::Path;
 
-use super::{clicks, constructed, from, library, write_captures, write_songs};
+use super::{clicks, constructed, from, library, library_command, write_captures, write_songs};
 use crate::support::files::{coherent, trajectory, wav_of};
-use crate::support::{Dir, failures, finish, ingest, motion, motiongen};
+use crate::support::{Dir, confined, failures, finish, ingest, motion, motiongen};
 
 /// Kind and message of every failure.
 fn told(store: &Path) -> BTreeMap<String, (String, String)> {
@@ -184,24 +185,42 @@ fn a_song_that_breaks_loses_its_phrases() {
 fn a_song_out_of_reach_keeps_its_phrases() {
     let dir = Dir::new();
     let (songs, captures, store) = (write_songs(&dir), write_captures(&dir), dir.at("store"));
+    let flags = from(&songs, &captures, &["--takes", "1"]);
+    assert_eq!(library(&store, &flags).code, 0);
+    let whole = motion(&store);
+    let locked = ["a waltz.beats.txt", "tracked.wav"].map(|name| songs.join(name));
+    let set_mode = |path: &std::path::PathBuf, mode| {
+        std::fs::set_permissions(path, std::fs::Permissions::from_mode(mode)).unwrap();
+    };
+    locked.iter().for_each(|path| set_mode(path, 0o000));
+    let forced = from(&songs, &captures, &["--takes", "1", "--force"]);
+    let output = finish(&mut confined(&library_command(&store, &forced), 2_000_000_000));
+    assert_eq!(output.code, 1, "{output:?}");
+    assert!(output.stdout.contains("1 songs danced to (4 phrases), 0 up to date, 2 failed; "));
+    let told = told(&store);
+    assert_eq!(told.keys().collect::<Vec<_>>(), ["a waltz.wav", "tracked.wav"]);
+    assert!(told.values().all(|(kind, _)| kind == "unreadable"), "{told:?}");
+    assert!(motion(&store) == whole);
+    locked.iter().for_each(|path| set_mode(path, 0o644));
+    let output = library(&store, &flags);
+    assert_eq!(output.code, 0, "{output:?}");
+    assert!(motion(&store) == whole && failures(&store).is_empty());
+}
+
+#[test]
+fn a_store_has_all_that_its_songs_are_danced_to() {
+    let dir = Dir::new();
+    let (songs, captures, store) = (write_songs(&dir), write_captures(&dir), dir.at("store"));
     assert_eq!(ingest(&songs, &store, &[]).code, 0);
     assert_eq!(finish(motiongen().args(["extract", "--store"]).arg(&store)).code, 0);
     let captures = captures.to_str().unwrap();
     assert_eq!(library(&store, &["--captures", captures, "--takes", "1"]).code, 0);
     let whole = motion(&store);
-    // Features are in the store, beat lists beside the songs.
-    std::fs::rename(&songs, dir.at("elsewhere")).unwrap();
+    std::fs::remove_dir_all(&songs).unwrap();
     let output = library(&store, &["--captures", captures, "--takes", "1", "--force"]);
-    assert_eq!(output.code, 1, "{output:?}");
-    assert!(output.stdout.contains("1 songs danced to (3 phrases), 0 up to date, 2 failed; "));
-    let told = told(&store);
-    assert_eq!(told.keys().collect::<Vec<_>>(), ["a waltz.wav", "marches/one.wav"]);
-    assert!(told.values().all(|(kind, _)| kind == "unreadable"), "{told:?}");
-    assert!(motion(&store) == whole);
-    std::fs::rename(dir.at("elsewhere"), &songs).unwrap();
-    let output = library(&store, &["--captures", captures, "--takes", "1"]);
     assert_eq!(output.code, 0, "{output:?}");
-    assert!(motion(&store) == whole && failures(&store).is_empty());
+    assert!(output.stdout.contains("3 songs danced to (10 phrases)"), "{}", output.stdout);
+    assert!(motion(&store) == whole);
 }
 
 #[test]

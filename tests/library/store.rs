@@ -4,6 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use motiongen::motion::{Beats, bar_phase};
+use motiongen::stages::beats::of_phrases;
+use motiongen::store::Location;
 use motiongen::store::tables::BeatRow;
 use motiongen::units::frames_to_s;
 
@@ -63,6 +65,8 @@ fn tables_hold_dances_to_the_songs_of_the_store() {
     assert_eq!(ids, [all, expected("tracked.wav", 3)].concat());
 
     let (frames, features, beats) = (motion(&store), features(&store), beats(&store));
+    let known = of_phrases(&Location::local(&store).unwrap(), |_| true).unwrap();
+    let mut n_upbeats = 0;
     for (id, row) in &rows {
         let (song, rest) = id.split_once(".t").unwrap();
         let first = 60 * rest.split_once('.').unwrap().1.parse::<usize>().unwrap();
@@ -76,6 +80,24 @@ fn tables_hold_dances_to_the_songs_of_the_store() {
         );
         assert!(features[id][..] == features[song][first..first + 120], "{id}: features differ");
         assert_eq!(frames[id].len(), 120);
+
+        // Wherever in a bar it begins, the numbers of its beats say so.
+        let numbers: Vec<i32> = beats[id].iter().map(|row| row.number.unwrap()).collect();
+        let n = row.beats_per_bar.unwrap();
+        assert!(numbers.windows(2).all(|pair| pair[1] == pair[0] % n + 1), "{id}: {numbers:?}");
+        n_upbeats += usize::from(numbers[0] != 1);
+        let counted = known[id].in_bars(row).unwrap();
+        let (first_s, last_s) =
+            (counted.times_s()[0], counted.times_s()[counted.times_s().len() - 1]);
+        for (i, frame) in frames[id].iter().enumerate() {
+            let time_s = frames_to_s(i);
+            // Beyond its first and last beat a phrase does not know the song's.
+            if (first_s..=last_s).contains(&time_s) {
+                let phase = bar_phase(&[time_s], &counted)[0];
+                let off = (phase - f64::from(frame[16])).abs();
+                assert!(off.min(1.0 - off) < 1e-6, "{id}: {phase} for {} at {i}", frame[16]);
+            }
+        }
 
         let (tempo_bpm, beats_per_bar, source) = match song {
             "a waltz.wav" => (141.3, 3, ("beats_file", "beats_file")),
@@ -94,7 +116,7 @@ fn tables_hold_dances_to_the_songs_of_the_store() {
             let found = &beats[id];
             assert_eq!(found.len(), clicks.len(), "{id}");
             for (i, (row, t)) in found.iter().zip(clicks).enumerate() {
-                assert_eq!(row.beat, i as i32);
+                assert_eq!((row.beat, row.source.as_deref()), (i as i32, Some("beats_file")));
                 assert!((row.time_s - t).abs() < 1e-9, "{id}: {row:?} for {t}");
                 assert_eq!(row.frame, (row.time_s * 30.0).round().min(119.0) as i32);
             }
@@ -108,6 +130,8 @@ fn tables_hold_dances_to_the_songs_of_the_store() {
             assert!(frames[id].iter().zip(phase).all(|(f, p)| f[16] == p as f32), "{id}: phase");
         }
     }
+    assert!(n_upbeats > 3, "{n_upbeats} phrases begin within a bar");
+    assert!(beats["tracked.wav.t00.0000"].iter().all(|b| b.source.as_deref() == Some("tracker")));
     let by_song: BTreeSet<_> = rows.values().map(|r| (&r.source, &r.split)).collect();
     let splits: BTreeSet<_> = by_song.iter().map(|(_, split)| split.as_str()).collect();
     assert_eq!((by_song.len(), splits.len()), (3, 3), "{by_song:?}");
