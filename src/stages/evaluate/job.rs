@@ -1,9 +1,9 @@
 //! The work: motions become windows, windows become numbers, and numbers verdicts.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use ndarray::{Array2, ArrayView2, s};
+use ndarray::Array2;
 
 use super::measure::{MeasuredMotion, Measurer, kept_frames, stride_for};
 use super::motions::{Phrases, is_held_out};
@@ -11,19 +11,15 @@ use super::params::Params;
 use super::splits::{ALL, MusicSplit, SPLITS};
 use super::subjects::{Finding, Item, Meter, Subject, channels};
 use super::truth::{Truth, TruthPhrase};
-use crate::evaluation::Measured;
 use crate::evaluation::coupling::{Coupling, Harmonics, Template, consistency_p};
 use crate::evaluation::metrics::{
     Danced, Number, PhaseOrigin, control_numbers, coupling_ratio, motion_ratios, song_harmonics,
 };
 use crate::evaluation::verdict::{Evidence, Verdict, verdicts};
 use crate::evaluation::window::window_starts;
-use crate::generation::Retrieval;
 use crate::stages::Progress;
-use crate::store::{Location, Snapshot, StoreError, digest, tables};
+use crate::store::{Location, StoreError};
 
-/// Windows of music for which the library is asked for its nearest phrase.
-const MAX_RETRIEVED: usize = 500;
 /// Windows of real motion that are measured beside what was generated, evenly among all.
 const MAX_TRUTH_WINDOWS: usize = 4000;
 /// A coupling that training motion shows with a lower probability by chance is taken for one.
@@ -346,120 +342,6 @@ impl Job<'_> {
         if p < COUPLING_P { Template::fit(&songs).map(Coupling::Learned) } else { None }
     }
 
-    /// Asks the library for the nearest phrases of other songs, for one motion of each phrase.
-    fn retrieved(
-        &self,
-        measurer: &Measurer,
-        generated: &[(Item, Array2<f32>)],
-    ) -> Result<Vec<Item>, StoreError> {
-        let Some((truth, (index, of_phrase))) =
-            self.truth.and_then(|truth| Some((truth, truth.retrieval.as_ref()?)))
-        else {
-            return Ok(Vec::new());
-        };
-        let mut names: BTreeSet<&str> =
-            self.motions.iter().map(|motion| motion.phrase_id.as_str()).collect();
-        if names.len() > MAX_RETRIEVED {
-            // A song here and there, where there are more than are asked for.
-            let mut order: Vec<&str> = names.into_iter().collect();
-            order.sort_by_cached_key(|id| digest(id.as_bytes()));
-            order.truncate(MAX_RETRIEVED);
-            names = order.into_iter().collect();
-        }
-        let most = MAX_RETRIEVED.div_ceil(names.len().max(1));
-        let owned: BTreeSet<String> = names.iter().map(|id| (*id).to_owned()).collect();
-        let length = measurer.window_frames;
-        let mut found: BTreeMap<String, Vec<Item>> = BTreeMap::new();
-        Snapshot::take(self.store, tables::features())?.visit_items(
-            &owned,
-            |id, features: Array2<f32>| {
-                let song = self.phrases.song(id);
-                let is_other =
-                    |i: usize| self.phrases.song(&truth.phrases[of_phrase[i]].id) != song;
-                let items =
-                    window_starts(features.nrows(), length).take(most).filter_map(|first| {
-                        let window = features.slice(s![first..first + length, ..]);
-                        let nearest = nearest_phrase(index, window, &is_other)?;
-                        let phrase = &truth.phrases[*of_phrase.get(nearest)?];
-                        let window = phrase.motion.slice(s![..length, ..]);
-                        self.baseline_item(measurer, generated, id, first, window)
-                    });
-                let items: Vec<Item> = items.collect();
-                found.insert(id.to_owned(), items);
-                Ok::<_, StoreError>(())
-            },
-        )?;
-        Ok(found.into_values().flatten().collect())
-    }
-
-    /// Measures a window of some motion with the music of a place of a phrase that motion was generated for.
-    fn baseline_item(
-        &self,
-        measurer: &Measurer,
-        generated: &[(Item, Array2<f32>)],
-        phrase_id: &str,
-        first_frame: usize,
-        window: ArrayView2<f32>,
-    ) -> Option<Item> {
-        let place = self.motions.iter().position(|motion| motion.phrase_id == phrase_id)?;
-        let motion = &self.motions[place];
-        let song = self.phrases.song(phrase_id);
-        let known = generated.iter().find(|(item, _)| {
-            item.song == song
-                && item
-                    .music
-                    .as_ref()
-                    .is_some_and(|music| music.bars.len() >= first_frame + measurer.window_frames)
-        });
-        let music = match known.filter(|_| self.phrases.is_song(phrase_id)) {
-            Some((item, _)) => item.music.clone(),
-            None => {
-                self.phrases.music(phrase_id, first_frame + measurer.window_frames).map(Arc::new)
-            }
-        };
-        let measured: Measured = measurer.measure(window).windows.into_iter().next()?;
-        Some(Item {
-            song,
-            phrase: place,
-            first_frame,
-            split: motion.split,
-            measured: Arc::new(measured),
-            decoded: None,
-            music,
-        })
-    }
-
-    /// Returns the best constant with the music of each phrase, one for each window.
-    fn mean_motion(&self, measurer: &Measurer, generated: &[(Item, Array2<f32>)]) -> Vec<Item> {
-        let Some(truth) = self.truth else { return Vec::new() };
-        let Some(still) =
-            measurer.measure(truth.mean_motion.view()).windows.into_iter().next().map(Arc::new)
-        else {
-            return Vec::new();
-        };
-        let mut places = BTreeSet::new();
-        generated
-            .iter()
-            .filter(|(item, _)| places.insert((item.phrase, item.first_frame)))
-            .take(MAX_RETRIEVED)
-            .map(|(item, _)| Item { measured: still.clone(), decoded: None, ..item.clone() })
-            .collect()
-    }
-
-    fn sampled(&self, measurer: &Measurer, sampled: &[SampledWindow]) -> Sampled {
-        let item = |window: &SampledWindow| {
-            let (id, first) = (window.phrase_id.as_str(), window.first_frame);
-            self.baseline_item(measurer, &[], id, first, window.frames.view())
-        };
-        let of_subject = |subject: Subject| -> Vec<Item> {
-            sampled.iter().filter(|window| window.subject == subject).filter_map(item).collect()
-        };
-        Sampled {
-            untrained: of_subject(Subject::Untrained),
-            no_music: of_subject(Subject::NoMusic),
-        }
-    }
-
     /// Sums up how far motions are from their constraints.
     fn control(&self, split: Option<MusicSplit>) -> Vec<Number> {
         let chosen = || {
@@ -482,19 +364,5 @@ impl Job<'_> {
 /// Windows with the frames that are kept of their motions.
 type Measurements = Vec<(Item, Array2<f32>)>;
 
-/// Baselines that were sampled.
-struct Sampled {
-    untrained: Vec<Item>,
-    no_music: Vec<Item>,
-}
-
 /// Metrics that say how far windows are from the training split.
 const DISTANCES: [&str; 4] = ["fid_k", "fid_g", "feature_shift", "channel_distance"];
-
-fn nearest_phrase(
-    index: &Retrieval,
-    window: ArrayView2<f32>,
-    is_among: &dyn Fn(usize) -> bool,
-) -> Option<usize> {
-    index.nearest_among(window, is_among).map(|(nearest, _)| nearest)
-}

@@ -1,6 +1,7 @@
 //! `evaluate`: motion becomes numbers and verdicts that can be queried, beside those of what it is compared with.
 
 mod baselines;
+mod compared;
 mod evaluand;
 mod foreign;
 mod job;
@@ -9,6 +10,7 @@ mod motions;
 mod page;
 mod params;
 mod rows;
+mod sampled;
 mod splits;
 mod subjects;
 mod truth;
@@ -129,7 +131,7 @@ type Missed = (&'static str, f64, f64, usize);
 
 fn missed(params: &Params, checks: &[SanityCheckRow]) -> Vec<Missed> {
     let wanted = [("reference", params.min_pass_rate), ("strict", params.min_strict_pass_rate)];
-    let of = |(set, least): (&'static str, Option<f64>)| {
+    let missed = |(set, least): (&'static str, Option<f64>)| {
         let least = least?;
         let is_of_set = |row: &&SanityCheckRow| {
             row.check_set == set && row.stage.as_deref() != Some(MadeAt::Raw.name())
@@ -141,7 +143,7 @@ fn missed(params: &Params, checks: &[SanityCheckRow]) -> Vec<Missed> {
         let share = 1.0 - failed.len() as f64 / all.len().max(1) as f64;
         (share < least).then_some((set, share, least, failed.len()))
     };
-    wanted.into_iter().filter_map(of).collect()
+    wanted.into_iter().filter_map(missed).collect()
 }
 
 /// What was measured.

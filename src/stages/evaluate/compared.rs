@@ -1,0 +1,142 @@
+//! What generated motion is compared with, beside real motion: retrieved, constant and sampled motion for its music.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use ndarray::{Array2, ArrayView2, s};
+
+use super::job::{Job, SampledWindow};
+use super::measure::Measurer;
+use super::subjects::{Item, Subject};
+use crate::evaluation::Measured;
+use crate::evaluation::window::window_starts;
+use crate::store::{Snapshot, StoreError, digest, tables};
+
+/// Windows of music for which the library is asked for its nearest phrase.
+const MAX_RETRIEVED: usize = 500;
+
+/// Baselines that were sampled.
+pub(super) struct Sampled {
+    pub untrained: Vec<Item>,
+    pub no_music: Vec<Item>,
+}
+
+impl Job<'_> {
+    /// Asks the library for the nearest phrases of other songs, for one motion of each phrase.
+    pub(super) fn retrieved(
+        &self,
+        measurer: &Measurer,
+        generated: &[(Item, Array2<f32>)],
+    ) -> Result<Vec<Item>, StoreError> {
+        let Some((truth, (index, of_phrase))) =
+            self.truth.and_then(|truth| Some((truth, truth.retrieval.as_ref()?)))
+        else {
+            return Ok(Vec::new());
+        };
+        let mut names: BTreeSet<&str> =
+            self.motions.iter().map(|motion| motion.phrase_id.as_str()).collect();
+        if names.len() > MAX_RETRIEVED {
+            // A song here and there, where there are more than are asked for.
+            let mut order: Vec<&str> = names.into_iter().collect();
+            order.sort_by_cached_key(|id| digest(id.as_bytes()));
+            order.truncate(MAX_RETRIEVED);
+            names = order.into_iter().collect();
+        }
+        let most = MAX_RETRIEVED.div_ceil(names.len().max(1));
+        let owned: BTreeSet<String> = names.iter().map(|id| (*id).to_owned()).collect();
+        let length = measurer.window_frames;
+        let mut found: BTreeMap<String, Vec<Item>> = BTreeMap::new();
+        Snapshot::take(self.store, tables::features())?.visit_items(
+            &owned,
+            |id, features: Array2<f32>| {
+                let song = self.phrases.song(id);
+                let is_other =
+                    |i: usize| self.phrases.song(&truth.phrases[of_phrase[i]].id) != song;
+                let items =
+                    window_starts(features.nrows(), length).take(most).filter_map(|first| {
+                        let window = features.slice(s![first..first + length, ..]);
+                        let (nearest, _) = index.nearest_among(window, is_other)?;
+                        let phrase = &truth.phrases[*of_phrase.get(nearest)?];
+                        let window = phrase.motion.slice(s![..length, ..]);
+                        self.baseline_item(measurer, generated, id, first, window)
+                    });
+                let items: Vec<Item> = items.collect();
+                found.insert(id.to_owned(), items);
+                Ok::<_, StoreError>(())
+            },
+        )?;
+        Ok(found.into_values().flatten().collect())
+    }
+
+    /// Measures a window of some motion with the music of a place of a phrase that motion was generated for.
+    fn baseline_item(
+        &self,
+        measurer: &Measurer,
+        generated: &[(Item, Array2<f32>)],
+        phrase_id: &str,
+        first_frame: usize,
+        window: ArrayView2<f32>,
+    ) -> Option<Item> {
+        let place = self.motions.iter().position(|motion| motion.phrase_id == phrase_id)?;
+        let motion = &self.motions[place];
+        let song = self.phrases.song(phrase_id);
+        let known = generated.iter().find(|(item, _)| {
+            item.song == song
+                && item
+                    .music
+                    .as_ref()
+                    .is_some_and(|music| music.bars.len() >= first_frame + measurer.window_frames)
+        });
+        let music = match known.filter(|_| self.phrases.is_song(phrase_id)) {
+            Some((item, _)) => item.music.clone(),
+            None => {
+                self.phrases.music(phrase_id, first_frame + measurer.window_frames).map(Arc::new)
+            }
+        };
+        let measured: Measured = measurer.measure(window).windows.into_iter().next()?;
+        Some(Item {
+            song,
+            phrase: place,
+            first_frame,
+            split: motion.split,
+            measured: Arc::new(measured),
+            decoded: None,
+            music,
+        })
+    }
+
+    /// Returns the best constant with the music of each phrase, one for each window.
+    pub(super) fn mean_motion(
+        &self,
+        measurer: &Measurer,
+        generated: &[(Item, Array2<f32>)],
+    ) -> Vec<Item> {
+        let Some(truth) = self.truth else { return Vec::new() };
+        let Some(still) =
+            measurer.measure(truth.mean_motion.view()).windows.into_iter().next().map(Arc::new)
+        else {
+            return Vec::new();
+        };
+        let mut places = BTreeSet::new();
+        generated
+            .iter()
+            .filter(|(item, _)| places.insert((item.phrase, item.first_frame)))
+            .take(MAX_RETRIEVED)
+            .map(|(item, _)| Item { measured: still.clone(), decoded: None, ..item.clone() })
+            .collect()
+    }
+
+    pub(super) fn sampled(&self, measurer: &Measurer, sampled: &[SampledWindow]) -> Sampled {
+        let item = |window: &SampledWindow| {
+            let (id, first) = (window.phrase_id.as_str(), window.first_frame);
+            self.baseline_item(measurer, &[], id, first, window.frames.view())
+        };
+        let of_subject = |subject: Subject| -> Vec<Item> {
+            sampled.iter().filter(|window| window.subject == subject).filter_map(item).collect()
+        };
+        Sampled {
+            untrained: of_subject(Subject::Untrained),
+            no_music: of_subject(Subject::NoMusic),
+        }
+    }
+}
