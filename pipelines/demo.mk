@@ -124,7 +124,7 @@ from generations g where g.selected and g.sample = 0 order by g.phrase_id limit 
 endef
 # Quotes on the way to the shell, which has the query in quotes of its own.
 define VERDICTS
-select verdict, verdict_outcome, test, outcome, round(value, 3) as value, rule, threshold, against
+select verdict, verdict_outcome, test, outcome, round(value, 3) as value, rule, round(threshold, 3) as threshold, against
 from verdicts where split = '\''held_out'\'' order by verdict, test
 endef
 # Lines become spaces on the way to the shell.

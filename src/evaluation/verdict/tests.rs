@@ -115,6 +115,7 @@ fn good_motion_wins_and_each_fault_loses_its_verdict() {
         (number("coupling_ratio", "constructed", 0.3), "follows_music", "amplitude"),
         (number("coupling_ratio", "constructed", 2.4), "follows_music", "amplitude"),
         (number("song_distance", "anywhere", 0.4), "varied", "songs"),
+        (number("song_distance", "anywhere", 11.0), "varied", "songs"),
         (number("song_distance", "same_place", 0.0), "varied", "one_for_all"),
     ];
     for (change, verdict, test) in cases {

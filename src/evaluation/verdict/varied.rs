@@ -3,8 +3,8 @@
 use super::{Evidence, Rule, Test, estimate, real};
 use crate::evaluation::interval::Estimate;
 
-/// Least distance over that of real motion.
-const MIN_RATIO: f64 = 0.5;
+/// Distance over that of real motion: less is alike, more is noise.
+const RATIO: [f64; 2] = [0.5, 2.0];
 
 /// Windows of different songs are as different as in real motion, anywhere and at the same place, which one motion
 /// for all songs is not.
@@ -26,7 +26,7 @@ pub(super) fn tests(evidence: &Evidence) -> Vec<Test> {
             format!("{what} over that of real motion"),
             ratio,
             "",
-            Rule::AtLeast(MIN_RATIO),
+            Rule::Within(RATIO[0], RATIO[1]),
             real(truth, "song_distance", "anywhere"),
         )
     };
