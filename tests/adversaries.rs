@@ -1,6 +1,8 @@
 //! Motions whose verdict is known, through the real command: real held-out motion wins everything, and each fault
 //! loses the verdict that names it. `tests/adversaries/make.py` makes them.
 
+#![expect(clippy::print_stderr, reason = "what was found is printed, for docs/evaluate.md")]
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::Command;

@@ -1,5 +1,7 @@
 //! Whether p-values and intervals are what they say: simulated, with what was found printed.
 
+#![expect(clippy::print_stderr, reason = "what was found is printed, for docs/evaluate.md")]
+
 use std::f64::consts::TAU;
 use std::thread;
 

@@ -205,9 +205,9 @@ impl CouplingSums {
         self.square += u * u;
         for (i, (harmonic, term)) in terms.into_iter().enumerate() {
             self.harmonics[i] = harmonic;
-            for j in 0..2 {
-                self.first[i][j] += term[j];
-                self.product[i][j] += rise_m_s * term[j];
+            for (j, x) in term.into_iter().enumerate() {
+                self.first[i][j] += x;
+                self.product[i][j] += rise_m_s * x;
             }
         }
     }

@@ -315,8 +315,6 @@ mod tests {
     fn a_check_is_a_row_with_a_bar() {
         let line = CheckLine {
             set: "strict".to_owned(),
-            stage: String::new(),
-            by_construction: false,
             check: "phase_monotonic".to_owned(),
             threshold: 0.05,
             n: 8,

@@ -73,8 +73,8 @@ fn motions_of_any_program_are_evaluated_and_what_is_none_is_listed() {
     let store = make_store(&dir);
     let songs = all_names();
     let folder = dir.at("theirs");
-    for song in N_TRAIN..N_TRAIN + N_HELD_OUT {
-        let name = format!("theirs/{}.npy", songs[song]);
+    for (song, id) in songs.iter().enumerate().skip(N_TRAIN) {
+        let name = format!("theirs/{id}.npy");
         dir.write(name, motion_file(&locked(song, 0)));
     }
     dir.write("theirs/nobody.npy", motion_file(&locked(0, 0)));

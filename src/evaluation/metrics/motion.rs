@@ -297,7 +297,9 @@ fn song_distances(danced: &[Danced]) -> [Number; 2] {
 
 /// How different motions are for one place of one phrase.
 fn multimodality_number(danced: &[Danced]) -> Number {
-    let mut places: BTreeMap<(usize, usize), (usize, Vec<Array2<f64>>)> = BTreeMap::new();
+    // By phrase and first frame: the song, and a row for each motion.
+    type Place = (usize, usize);
+    let mut places: BTreeMap<Place, (usize, Vec<Array2<f64>>)> = BTreeMap::new();
     for item in danced {
         if let Some(rows) = joined(item.motion).filter(|rows| rows.nrows() > 0) {
             let place = places.entry((item.phrase, item.first_frame)).or_default();

@@ -140,16 +140,7 @@ impl Phrases {
         let wanted: BTreeSet<&str> =
             phrase_ids.into_iter().filter_map(|id| self.rows.get(id)).map(song_of).collect();
         let is_song = |row: &&PhraseRow| !row.is_constructed() && wanted.contains(song_of(row));
-        // A set, so that the order of the map does not matter.
-        #[expect(clippy::iter_over_hash_type, reason = "collected into a set")]
-        let found = {
-            let mut found = BTreeSet::new();
-            for row in self.rows.values().filter(is_song) {
-                found.insert(row.phrase_id.clone());
-            }
-            found
-        };
-        found
+        self.rows.values().filter(is_song).map(|row| row.phrase_id.clone()).collect()
     }
 
     /// Takes in the features of a whole song, `[T, 163]`.
