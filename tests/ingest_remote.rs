@@ -336,7 +336,7 @@ fn a_store_that_refuses_ends_the_run_with_its_place_and_what_to_set() {
         let output = finish(&mut job.ingest("tables", &[]));
         assert_eq!((output.code, output.stdout.as_str()), (2, ""), "{}", output.stderr);
         let (start, end) =
-            (format!("error: {url}/motion/"), format!("could not write{}", hint(&job)));
+            (format!("error: {url}/beats/"), format!("could not write{}", hint(&job)));
         assert!(output.stderr.starts_with(&start), "{}", output.stderr);
         assert!(output.stderr.contains(&end), "{}", output.stderr);
 
@@ -353,7 +353,7 @@ fn throttling_without_end_ends_the_run_after_the_tries_that_were_asked_for() {
     job.stores.inject(faults.only(|method, _| method == "PUT"));
     let output = finish(&mut job.ingest("tables", &["--max-retries", "1", "--workers", "1"]));
     assert_eq!((output.code, output.stdout.as_str()), (2, ""), "{}", output.stderr);
-    let start = format!("error: {}/motion/", job.url("tables"));
+    let start = format!("error: {}/beats/", job.url("tables"));
     assert!(output.stderr.starts_with(&start), "{}", output.stderr);
     for part in [".parquet: could not write: ", "429 Too Many Requests", "max_retries: 1"] {
         assert!(output.stderr.contains(part), "{part}: {}", output.stderr);
