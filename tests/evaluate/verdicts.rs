@@ -118,3 +118,45 @@ fn motions_of_any_program_are_evaluated_and_what_is_none_is_listed() {
         )
     );
 }
+
+#[test]
+fn a_required_verdict_of_which_nothing_was_measured_is_an_exit_code() {
+    let dir = Dir::new();
+    let store = make_store(&dir);
+    let song = &all_names()[N_TRAIN];
+    // Shorter than a window.
+    let short = locked(N_TRAIN, 0).slice(ndarray::s![..37, ..]).to_owned();
+    dir.write(format!("short/{song}.npy"), motion_file(&short));
+    let place = store.display().to_string();
+    let motions = dir.at("short").display().to_string();
+    let fixed = ["evaluate", "--quiet", "--store", &place, "--motions", &motions, "--require"];
+    let output = run(fixed.iter().chain(&["sound,varied"]));
+    assert_eq!(output.code, 1, "{output:?}");
+    for verdict in ["sound", "varied"] {
+        let line = format!("  required verdict {verdict} is open\n");
+        assert!(output.stdout.contains(&line), "{output:?}");
+    }
+    assert!(!output.stdout.contains("required verdict follows_music"), "{output:?}");
+}
+
+#[test]
+fn one_value_that_is_not_finite_is_not_sound_however_much_is() {
+    let dir = Dir::new();
+    let store = make_store(&dir);
+    for (song, id) in all_names().iter().enumerate().skip(N_TRAIN) {
+        let mut frames = locked(song, 0);
+        if song == N_TRAIN {
+            let last = frames.nrows() - 1;
+            frames[[last, 20]] = f32::NAN;
+        }
+        dir.write(format!("one_nan/{id}.npy"), motion_file(&frames));
+    }
+    let place = store.display().to_string();
+    let motions = dir.at("one_nan").display().to_string();
+    let output = run(["evaluate", "--quiet", "--store", &place, "--motions", &motions]);
+    assert_eq!(output.code, 0, "{output:?}");
+    let is_finite = |row: &VerdictRow| row.test == "finite" && row.verdict == "sound";
+    let found = rows::<VerdictRow>(&store).into_iter().find(is_finite).expect("a test");
+    assert_eq!((found.outcome.as_str(), found.value), ("lost", Some(0.8)), "{}", found.message);
+    assert_eq!(found.verdict_outcome, "lost");
+}

@@ -6,6 +6,7 @@ mod ratio;
 
 pub use motion::{
     MotionContext, channel_numbers, control_numbers, motion_numbers, soundness_numbers,
+    whole_numbers,
 };
 pub use music::{
     MusicContext, N_WRONG_TEMPI, PhaseOrigin, music_numbers, phase_numbers, shifted_numbers,

@@ -51,6 +51,30 @@ pub fn motion_numbers(danced: &[Danced], context: &MotionContext) -> Vec<Number>
     numbers
 }
 
+/// Measures the shares of whole motions that are finite, and that have no seams: of each motion its song and both.
+pub fn whole_numbers(motions: &[(usize, bool, bool)]) -> Vec<Number> {
+    let songs: Vec<usize> = motions.iter().map(|(song, ..)| *song).collect();
+    let share = |variant: &str, protocol: &str, is_true: Vec<bool>| {
+        let share = clustered_share_estimate(&is_true, &songs);
+        Number::new("pass_rate", variant.to_owned(), "", share, protocol)
+    };
+    if motions.is_empty() {
+        return Vec::new();
+    }
+    vec![
+        share(
+            "finite",
+            "share of motions all of whose values are finite, with orientations of length 1",
+            motions.iter().map(|(_, is_finite, _)| *is_finite).collect(),
+        ),
+        share(
+            "seamless",
+            "share of motions whose derivatives agree over the borders of windows and to the last frame",
+            motions.iter().map(|(.., is_seamless)| *is_seamless).collect(),
+        ),
+    ]
+}
+
 /// Measures the share of windows that pass all checks of a set, and means of what the checks look at.
 ///
 /// `stage` is added to the variants, where it is not empty.

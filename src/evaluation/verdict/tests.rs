@@ -27,6 +27,8 @@ fn good() -> Vec<Number> {
         number("pass_rate", "strict", 0.95),
         number("pass_rate", "strict_raw", 0.9),
         number("jerk_ratio", "", 1.1),
+        number("pass_rate", "finite", 1.0),
+        number("pass_rate", "seamless", 0.9),
         number("fid_k", "axes", 0.8),
         number("fid_g", "", 1.2),
         number("feature_shift", "", 0.2),
@@ -105,6 +107,8 @@ fn good_motion_wins_and_each_fault_loses_its_verdict() {
     let cases = [
         (number("pass_rate", "strict_raw", 0.79), "sound", "decoded"),
         (number("pass_rate", "strict", 0.5), "sound", "post_processed"),
+        (number("pass_rate", "finite", 0.99), "sound", "finite"),
+        (number("pass_rate", "seamless", 0.7), "sound", "seamless"),
         (number("speed_ratio", "y", 0.6), "like_real", "speed_y"),
         (number("jerk_ratio", "", 4.0), "like_real", "jerk"),
         (number("fid_k", "axes", 2.6), "like_real", "fid_k"),

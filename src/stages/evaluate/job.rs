@@ -14,6 +14,7 @@ use super::truth::{Truth, TruthPhrase};
 use crate::evaluation::coupling::{Coupling, Harmonics, Template, consistency_p};
 use crate::evaluation::metrics::{
     Danced, Number, PhaseOrigin, control_numbers, coupling_ratio, motion_ratios, song_harmonics,
+    whole_numbers,
 };
 use crate::evaluation::verdict::{Evidence, Verdict, verdicts};
 use crate::evaluation::window::window_starts;
@@ -168,6 +169,7 @@ impl Job<'_> {
             let name = split.name();
             let mut numbers = meter.numbers(name, &items, own);
             numbers.extend(meter.decoded(&items, self.raw_phase()));
+            numbers.extend(whole_numbers(&self.whole(evaluated, split)));
             numbers.extend(motion_ratios(&numbers, &truth));
             numbers.extend(coupling_ratio(&numbers, &truth));
             numbers.extend(channels(chosen.iter().map(|(_, kept)| kept), &training_kept));
@@ -210,6 +212,17 @@ impl Job<'_> {
         }
         findings.retain(|finding| !finding.numbers.is_empty());
         Ok(Found { findings, verdicts: all_verdicts })
+    }
+
+    /// Returns the songs of a split's motions, whether each is finite, and whether it is without seams.
+    fn whole(&self, evaluated: &[Evaluated], split: MusicSplit) -> Vec<(usize, bool, bool)> {
+        let motions = self.motions.iter().zip(evaluated);
+        motions
+            .filter(|(motion, _)| motion.split == split)
+            .map(|(motion, found)| {
+                (self.phrases.song(&motion.phrase_id), found.is.is_finite, found.is.is_seamless)
+            })
+            .collect()
     }
 
     /// Returns what measures motions of which one frame in `stride` is kept.

@@ -18,6 +18,10 @@ pub const MAX_KEPT_FRAMES: usize = 60_000;
 
 /// Least share of the windows of a motion within the training split's bounds for the motion to pass.
 const MIN_WINDOW_SHARE: f64 = 0.9;
+/// Checks that every frame must keep: its values are numbers, and its orientation is one.
+const FINITE_CHECKS: [&str; 2] = ["finite", "quaternion"];
+/// Checks that hold between neighbouring frames, also where a window ends.
+const SEAM_CHECKS: [&str; 4] = ["finite", "velocity", "acceleration", "angular_velocity"];
 
 /// How motions are measured.
 pub struct Measurer<'a> {
@@ -40,6 +44,11 @@ pub struct MeasuredMotion {
     pub checks: Vec<Check>,
     /// Its windows, one behind the other, without messages.
     pub windows: Vec<Measured>,
+    /// Whether it passes [`FINITE_CHECKS`] from its first frame to its last.
+    pub is_finite: bool,
+    /// Whether nine in ten windows over the borders of `windows` and at the end of the motion pass
+    /// [`SEAM_CHECKS`].
+    pub is_seamless: bool,
     /// Every `stride`th frame of each window, \[_, 25\].
     pub kept: Array2<f32>,
 }
@@ -97,8 +106,32 @@ impl Measurer<'_> {
         for check in windows.iter_mut().flat_map(|window| &mut window.checks) {
             check.message = String::new();
         }
-        MeasuredMotion { n_frames: n, checks, windows, kept }
+        let is_finite = passes(&checks, &FINITE_CHECKS);
+        let is_seamless = self.is_seamless(frames);
+        MeasuredMotion { n_frames: n, checks, windows, is_finite, is_seamless, kept }
     }
+
+    /// Windows that are measured end where the next begins, so that a jump between them is in none, and the rest of a
+    /// motion behind the last is in none either: windows half a length later, and the one that ends with the motion,
+    /// have both.
+    fn is_seamless(&self, frames: ArrayView2<f32>) -> bool {
+        let (n, length) = (frames.nrows(), self.window_frames);
+        let Some(last) = n.checked_sub(length) else { return true };
+        let halfway = length / 2;
+        let between = window_starts(n.saturating_sub(halfway), length).map(|first| first + halfway);
+        let firsts: Vec<usize> = between.filter(|&first| first != last).chain([last]).collect();
+        let is_passed = |first: usize| {
+            let window = frames.slice(s![first..first + length, ..]);
+            passes(&checks(window, self.limits), &SEAM_CHECKS)
+        };
+        let n_passed = firsts.iter().filter(|&&first| is_passed(first)).count();
+        n_passed as f64 >= MIN_WINDOW_SHARE * firsts.len() as f64
+    }
+}
+
+/// Returns whether all checks of these names were passed.
+fn passes(checks: &[Check], names: &[&str]) -> bool {
+    checks.iter().filter(|check| names.contains(&check.name)).all(|check| check.passed)
 }
 
 /// Returns a check of all windows of a motion, with the answer that is worst; none where it was not made.
@@ -136,4 +169,56 @@ pub fn kept_frames<'a>(kept: impl IntoIterator<Item = &'a Array2<f32>>) -> Array
 /// Returns one of how many frames is kept of `n_frames`.
 pub fn stride_for(n_frames: usize) -> usize {
     n_frames.div_ceil(MAX_KEPT_FRAMES).max(1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::motion::kinematics::{Poses, frames_of};
+
+    /// A body that goes round, of `n` frames.
+    fn motion(n: usize) -> Array2<f32> {
+        let place = |t: usize| {
+            let s = t as f64 / 30.0;
+            [s.sin(), 1.0, s.cos()]
+        };
+        let position_m = (0..n + 2).map(place).collect();
+        let orientation = vec![[1.0, 0.0, 0.0, 0.0]; n + 2];
+        frames_of(&Poses { position_m, orientation }, n)
+    }
+
+    fn measured(frames: &Array2<f32>) -> [bool; 2] {
+        let measurer = Measurer {
+            limits: ChannelLimits::Wide,
+            reference: None,
+            window_frames: 120,
+            num_frames: None,
+            stride: 1,
+            threads: NonZeroUsize::MIN,
+        };
+        let found = measurer.measure(frames.view());
+        [found.is_finite, found.is_seamless]
+    }
+
+    #[test]
+    fn what_no_window_has_is_seen_where_windows_meet_and_at_the_end() {
+        assert_eq!(measured(&motion(497)), [true, true]);
+        // 1 m to the side at each border, which the velocities do not say.
+        let mut jumps = motion(497);
+        for t in 0..497 {
+            jumps[[t, 0]] += (t / 120 % 2) as f32;
+        }
+        assert_eq!(measured(&jumps), [true, false]);
+        // Behind the last whole window, which ends at frame 480.
+        let mut tail = motion(497);
+        tail.slice_mut(s![481.., 3..6]).fill(9.0);
+        assert_eq!(measured(&tail), [true, false]);
+        tail[[490, 20]] = f32::NAN;
+        assert_eq!(measured(&tail), [false, false]);
+        let mut long = motion(497);
+        long.slice_mut(s![.., 9..13]).mapv_inplace(|x| 1.5 * x);
+        assert_eq!(measured(&long), [false, true]);
+        // Too short for a window.
+        assert_eq!(measured(&motion(61)), [true, true]);
+    }
 }

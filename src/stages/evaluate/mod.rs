@@ -24,6 +24,7 @@ use anyhow::Context as _;
 
 use super::failure::write_failures;
 use super::{Contract, Progress, Stage, Summary};
+use crate::evaluation::verdict::Quality;
 use crate::report::{self, Report};
 use crate::store::tables::SanityCheckRow;
 use crate::store::{self, Location};
@@ -115,13 +116,18 @@ impl Stage for Evaluate {
 /// A required verdict that was not won, and how it ended.
 type NotWon = (String, report::Outcome);
 
+/// Returns the required verdicts that were not won. One of which nothing was measured, for example because every motion
+/// is shorter than a window, is open.
 fn not_won(params: &Params, report: &Report) -> Vec<NotWon> {
-    report
-        .verdicts
-        .iter()
-        .filter(|verdict| params.require.iter().any(|asked| asked.asks_for(&verdict.verdict)))
-        .filter(|verdict| verdict.outcome != report::Outcome::Won)
-        .map(|verdict| (verdict.verdict.clone(), verdict.outcome))
+    let is_required = |name: &str| params.require.iter().any(|asked| asked.asks_for(name));
+    let told = report.verdicts.iter().map(|told| (told.verdict.clone(), told.outcome));
+    let is_told = |name: &str| report.verdicts.iter().any(|told| told.verdict == name);
+    let untold = Quality::ALL
+        .into_iter()
+        .filter(|quality| !is_told(quality.name()))
+        .map(|quality| (quality.name().to_owned(), report::Outcome::Open));
+    told.chain(untold)
+        .filter(|(name, outcome)| is_required(name) && *outcome != report::Outcome::Won)
         .collect()
 }
 
