@@ -1,7 +1,7 @@
 //! The coupling of vertical velocity to the bar that is known beforehand, as one signed coefficient.
 //!
 //! R² of a free fit of harmonics cannot tell which way round a motion follows the bar: reversed, turned upside
-//! down or shifted by a beat it is the same, and whoever keeps the best of several motions raises it. Where it is
+//! down or shifted by a beat it is the same, and keeping the best of several motions raises it. Where it is
 //! known what vertical velocity owes to the bar (a library was constructed with ḣ(φ, a); captured motion has a
 //! mean over the training songs) one coefficient says how much of that is there: 1 as in real motion, 0 by
 //! chance, below 0 the wrong way.
