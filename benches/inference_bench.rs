@@ -145,15 +145,14 @@ impl Served {
                     let model = Model::read(std::fs::read(folder.join(name))?.into(), None, name)?;
                     Ok(Parameters::from_fn(list, |p| values_of(&model, p, name).expect("a weight")))
                 };
-                let (unet, list) = UNet1D::new(&config);
+                let (_, list) = UNet1D::new(&config);
                 let of_unet = read("unet.onnx", list)?;
                 let (decoder, list) = MotionDecoder::new(&DecoderConfig::default());
                 let of_decoder = read("decoder.onnx", list)?;
                 Box::new(EagerEngine::new(
-                    (unet, of_unet),
+                    (&config, of_unet),
                     (decoder, of_decoder),
-                    false,
-                    FeatureScale::identity(FEATURE_DIM),
+                    &FeatureScale::identity(FEATURE_DIM),
                     (n_workers, n_threads),
                 )?)
             }
@@ -175,7 +174,8 @@ impl Served {
                 let path = if is_optimized { optimized } else { plain };
                 let decoder = folder.join("decoder.onnx");
                 let unet = (path.as_path(), is_optimized);
-                Box::new(OnnxEngine::open(&runtime, unet, &decoder, false, plan)?)
+                let config = preset_of(text("preset")?)?.config();
+                Box::new(OnnxEngine::open(&runtime, unet, &decoder, &config, plan)?)
             }
         };
         let load_s = started.elapsed().as_secs_f64();

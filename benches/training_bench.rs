@@ -16,7 +16,7 @@ use motiongen::model::{DecoderConfig, MotionDecoder, Preset, UNet1D};
 use motiongen::motion::{MOTION_DIM, Normalizer};
 use motiongen::training::{
     Augmentation, Batch, Chances, Dataset, FinetuneConfig, FinetuneLearner, Learner as _,
-    NetworkConfig, Objective, OptimizerConfig, TemporalConfig, Windows,
+    NetworkConfig, Objective, OptimizerConfig, TemporalConfig, Windows, Withhold,
 };
 use serde_json::{Value, json};
 
@@ -89,7 +89,13 @@ impl Bench {
             .run(|| {
                 let (unet, decoder) = (Parameters::new(unet, 1), Parameters::new(decoder, 1));
                 let networks = [&unet, &decoder];
-                FinetuneLearner::new(&network, &Objective::default(), &config, &windows, networks)
+                FinetuneLearner::new(
+                    &network,
+                    (&Objective::default(), Withhold::default()),
+                    &config,
+                    &windows,
+                    networks,
+                )
             })?
             .on(&threads);
         let random = |stream: u64, len: usize| {
@@ -110,6 +116,7 @@ impl Bench {
                     step: (i as f64 + 0.5) / n as f64,
                     no_audio: 1.0,
                     no_style: 1.0,
+                    no_clock: 1.0,
                 })
                 .collect(),
             phrase_ids: vec!["bench".into(); n],

@@ -56,9 +56,22 @@ pub struct ModelCard {
     /// How fast the motion is that it was trained on; generated motion is held to it.
     #[serde(default)]
     pub motion_range: Option<MotionRange>,
+    /// How it is best sampled; cards of release 0.1 do not tell.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sampling: Option<SamplingDefaults>,
     pub licence: String,
     pub files: Vec<FileEntry>,
 }
+
+/// How a model is best sampled, as measured on the songs of its validation split.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SamplingDefaults {
+    /// With which the motion that is locked to the bar is as large as that of real motion.
+    pub guidance: f64,
+}
+
+/// Guidance of models whose card tells none, as release 0.1 sampled them.
+const GUIDANCE_WITHOUT_CARD: f64 = 4.0;
 
 /// What a model was made of.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -157,6 +170,11 @@ impl ModelCard {
             return Err(config("window_frames is below 2; export the model again".to_owned()));
         }
         Ok(card)
+    }
+
+    /// Returns the guidance that the model is sampled with unless the user says otherwise.
+    pub fn guidance(&self) -> f64 {
+        self.sampling.as_ref().map_or(GUIDANCE_WITHOUT_CARD, |sampling| sampling.guidance)
     }
 
     /// Returns a file's entry.

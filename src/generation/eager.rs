@@ -6,7 +6,7 @@ use ndarray::{Array3, ArrayView3};
 
 use crate::audio::FeatureScale;
 use crate::autodiff::{Arena, Eager, Parameters, Tensor, Threads};
-use crate::model::{MotionDecoder, UNet1D, UNetInputs};
+use crate::model::{MotionDecoder, UNet1D, UNetConfig, UNetInputs, condition_scale};
 
 use super::engine::{Engine, EngineError, Inputs};
 use super::pool::Pool;
@@ -15,9 +15,10 @@ use super::pool::Pool;
 pub struct EagerEngine {
     unet: UNet1D,
     unet_parameters: Parameters<f32>,
-    takes_style: bool,
+    style_dim: usize,
     decoder: MotionDecoder,
     decoder_parameters: Parameters<f32>,
+    /// Of the condition.
     scale: FeatureScale,
     workers: Pool<Worker>,
 }
@@ -28,22 +29,28 @@ struct Worker {
 }
 
 impl EagerEngine {
-    /// Makes an engine of `n_workers` that have `n_threads` each.
+    /// Makes an engine of `n_workers` that have `n_threads` each; `scale` is that of the features.
     ///
     /// # Errors
     /// When the system gives no threads.
     pub fn new(
-        (unet, unet_parameters): (UNet1D, Parameters<f32>),
+        (config, unet_parameters): (&UNetConfig, Parameters<f32>),
         (decoder, decoder_parameters): (MotionDecoder, Parameters<f32>),
-        takes_style: bool,
-        scale: FeatureScale,
+        scale: &FeatureScale,
         (n_workers, n_threads): (NonZeroUsize, NonZeroUsize),
     ) -> std::io::Result<Self> {
         let worker =
             |_| Ok(Worker { threads: Threads::start(n_threads)?, arena: Arena::default() });
         let workers = (0..n_workers.get()).map(worker).collect::<std::io::Result<Vec<_>>>()?;
-        let workers = Pool::new(workers);
-        Ok(Self { unet, unet_parameters, takes_style, decoder, decoder_parameters, scale, workers })
+        Ok(Self {
+            unet: UNet1D::new(config).0,
+            unet_parameters,
+            style_dim: config.style_dim,
+            decoder,
+            decoder_parameters,
+            scale: condition_scale(config, scale),
+            workers: Pool::new(workers),
+        })
     }
 }
 
@@ -66,7 +73,11 @@ impl Engine for EagerEngine {
         let x = inputs.x.as_standard_layout();
         let t: Vec<f32> = inputs.t.iter().map(|&t| t as f32).collect();
         let drop: Vec<f32> = inputs.drop_audio.iter().map(|&d| f32::from(u8::from(d))).collect();
-        let style = inputs.style.filter(|_| self.takes_style);
+        // As in the exported files, a style that is not given is one of zeros, not a network without a style.
+        let style: Option<Vec<f32>> = (self.style_dim > 0).then(|| match inputs.style {
+            Some(style) => style.iter().copied().collect(),
+            None => vec![0.0; batch * self.style_dim],
+        });
         self.workers.with(|Worker { threads, arena }| {
             threads.run(|| {
                 let mut g = Eager::new(&self.unet_parameters, arena);
@@ -75,10 +86,7 @@ impl Engine for EagerEngine {
                 let audio =
                     g.input(&[batch, frames, n_features], audio.as_slice().expect("in order"));
                 let drop = (!drop.is_empty()).then(|| g.input(&[batch], &drop));
-                let style = style.map(|style| {
-                    let values: Vec<f32> = style.iter().copied().collect();
-                    g.input(style.shape(), &values)
-                });
+                let style = style.map(|style| g.input(&[batch, self.style_dim], &style));
                 let inputs = UNetInputs {
                     x: &x,
                     t: &t,

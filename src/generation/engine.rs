@@ -13,7 +13,8 @@ pub struct Inputs<'a> {
     pub x: ArrayView3<'a, f32>,
     /// Step of each sample, \[batch\].
     pub t: &'a [usize],
-    /// Features as the table has them, \[batch, frames, 163\].
+    /// Features as the table has them, then the clock of a network that hears it, \[batch, frames,
+    /// condition_dim\].
     pub audio: ArrayView3<'a, f32>,
     /// Samples that go without music, \[batch\]; nobody where empty.
     pub drop_audio: &'a [bool],
@@ -69,7 +70,7 @@ impl Inputs<'_> {
             let (found, expected) = (found.to_vec(), expected.to_vec());
             Err(EngineError::Shape { what, found, expected })
         };
-        expect("the shape of the features", self.audio.shape(), &[batch, frames, n_features])?;
+        expect("the shape of the condition", self.audio.shape(), &[batch, frames, n_features])?;
         expect("the number of steps", &[self.t.len()], &[batch])?;
         if !self.drop_audio.is_empty() {
             expect("the number of samples without music", &[self.drop_audio.len()], &[batch])?;

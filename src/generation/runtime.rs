@@ -3,9 +3,10 @@
 use std::borrow::Cow;
 use std::path::Path;
 
-use ndarray::{Array3, ArrayView3};
+use ndarray::{Array3, ArrayView3, s};
 
 use crate::audio::FEATURE_DIM;
+use crate::model::UNetConfig;
 use crate::onnx::{
     DecoderNames, Device, Numbers, OnnxError, Runtime, Session, SessionOptions, Tensor, UNetNames,
 };
@@ -28,7 +29,7 @@ pub struct SessionPlan {
 /// motion is fastest with one worker of N threads.
 pub struct OnnxEngine {
     workers: Pool<Worker>,
-    takes_style: bool,
+    config: UNetConfig,
 }
 
 struct Worker {
@@ -45,7 +46,7 @@ impl OnnxEngine {
         runtime: &Runtime,
         (unet, is_optimized): (&Path, bool),
         decoder: &Path,
-        takes_style: bool,
+        config: &UNetConfig,
         plan: SessionPlan,
     ) -> Result<Self, OnnxError> {
         let options = |is_optimized| SessionOptions {
@@ -59,13 +60,14 @@ impl OnnxEngine {
                 unet: Session::open(runtime, unet, options(is_optimized))?,
                 decoder: Session::open(runtime, decoder, options(false))?,
             };
-            let needed = [UNetNames::X, UNetNames::T, UNetNames::AUDIO];
+            let mut needed = vec![UNetNames::X, UNetNames::T, UNetNames::AUDIO];
+            needed.extend(config.clock.then_some(UNetNames::CLOCK));
             worker.unet.expect(&needed, UNetNames::PREDICTION)?;
             worker.decoder.expect(&[DecoderNames::LATENT], DecoderNames::MOTION)?;
             Ok(worker)
         };
         let workers = (0..plan.n_workers.max(1)).map(worker).collect::<Result<Vec<_>, _>>()?;
-        Ok(Self { workers: Pool::new(workers), takes_style })
+        Ok(Self { workers: Pool::new(workers), config: config.clone() })
     }
 }
 
@@ -79,21 +81,25 @@ impl Engine for OnnxEngine {
     }
 
     fn predict(&self, inputs: &Inputs) -> Result<Array3<f32>, EngineError> {
-        inputs.check(FEATURE_DIM)?;
+        inputs.check(self.config.condition_dim())?;
         let batch = inputs.x.dim().0;
         let t: Vec<i64> = inputs.t.iter().map(|&t| t as i64).collect();
         let mut given = vec![
             floats(UNetNames::X, inputs.x),
             Tensor { name: UNetNames::T, shape: vec![batch], numbers: Numbers::Integer(t.into()) },
-            floats(UNetNames::AUDIO, inputs.audio),
+            floats(UNetNames::AUDIO, inputs.audio.slice_move(s![.., .., ..FEATURE_DIM])),
         ];
+        if self.config.clock {
+            let clock = inputs.audio.slice_move(s![.., .., FEATURE_DIM..]);
+            given.push(floats(UNetNames::CLOCK, clock));
+        }
         if inputs.drop_audio.contains(&true) {
             let drop: Vec<f32> =
                 inputs.drop_audio.iter().map(|&d| f32::from(u8::from(d))).collect();
             let numbers = Numbers::Float(drop.into());
             given.push(Tensor { name: UNetNames::DROP_AUDIO, shape: vec![batch], numbers });
         }
-        if let Some(style) = inputs.style.filter(|_| self.takes_style) {
+        if let Some(style) = inputs.style.filter(|_| self.config.style_dim > 0) {
             let numbers = Numbers::Float(style.iter().copied().collect::<Vec<_>>().into());
             given.push(Tensor { name: UNetNames::STYLE, shape: style.shape().to_vec(), numbers });
         }

@@ -42,8 +42,8 @@ pub struct Generator<'a> {
 /// What motion is made for.
 #[derive(Clone, Copy, Debug)]
 pub struct Track<'a> {
-    /// Features as the table has them, \[T, 163\].
-    pub features: ArrayView2<'a, f32>,
+    /// What the network hears: features as the table has them, then the clock if it hears one, \[T, condition_dim\].
+    pub condition: ArrayView2<'a, f32>,
     pub seed: u64,
     /// Normalised style, for a model that takes one.
     pub style: Option<[f32; STYLE_DIM]>,
@@ -86,7 +86,7 @@ impl Generator<'_> {
         track: &Track,
         mut emit: impl FnMut(Array2<f32>) -> Result<(), E>,
     ) -> Result<(), E> {
-        let windows = self.windows(track.features.nrows());
+        let windows = self.windows(track.condition.nrows());
         let start = track.constraints.map(|c| c.constraints.placement()).unwrap_or_default();
         let give = |mut frames: Array2<f32>, emit: &mut dyn FnMut(Array2<f32>) -> Result<(), E>| {
             if frames.nrows() == 0 {
@@ -121,7 +121,7 @@ impl Generator<'_> {
     /// Samples the windows of a run together. → \[windows, frames, 25\], normalised
     fn sample_run(&self, track: &Track, run: &Run) -> Result<Array3<f32>, EngineError> {
         let (n, frames) = (run.range.len(), run.windows.length());
-        let audio = stacked(track.features, run, frames);
+        let audio = stacked(track.condition, run, frames);
         let style = track
             .style
             .map(|style| Array2::from_shape_fn((n, STYLE_DIM), |(_, channel)| style[channel]));
@@ -245,11 +245,11 @@ fn placement_at(motion: &Array2<f32>, frame: usize) -> Placement {
     Placement::of_first(motion.slice(s![frame.., ..])).unwrap_or_default()
 }
 
-/// Returns the features of a run's windows, \[windows, frames, 163\].
-fn stacked(features: ArrayView2<f32>, run: &Run, frames: usize) -> Array3<f32> {
-    let mut audio = Array3::zeros((run.range.len(), frames, features.ncols()));
+/// Returns the condition of a run's windows, \[windows, frames, condition_dim\].
+fn stacked(condition: ArrayView2<f32>, run: &Run, frames: usize) -> Array3<f32> {
+    let mut audio = Array3::zeros((run.range.len(), frames, condition.ncols()));
     for (i, mut window) in run.range.clone().zip(audio.outer_iter_mut()) {
-        window.assign(&features.slice(s![run.windows.frames(i), ..]));
+        window.assign(&condition.slice(s![run.windows.frames(i), ..]));
     }
     audio
 }

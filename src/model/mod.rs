@@ -4,6 +4,7 @@
 //! music; [`MotionDecoder`] turns what was sampled into the 25 channels. This room knows shapes and
 //! names, not numbers: values are the interpreter's.
 
+mod condition;
 mod decoder;
 mod graph;
 mod layers;
@@ -11,6 +12,7 @@ mod outline;
 mod parameter;
 mod unet;
 
+pub use condition::{condition, condition_scale};
 pub use decoder::{DecoderConfig, MotionDecoder};
 pub use graph::{
     Activation, Attention, Channels, Convolution, Graph, GraphError, GroupNormalization, Result,

@@ -45,7 +45,7 @@ pub struct UNetInputs<'a, T> {
     pub x: &'a T,
     /// Step of each sample, \[batch\], whole numbers in 0..n_steps.
     pub t: &'a T,
-    /// Features of the music, \[batch, frames, audio_cond_dim\].
+    /// Features of the music and its clock, \[batch, frames, condition_dim\].
     pub audio: &'a T,
     /// Samples that go without music, \[batch\], 1 where the null context is used.
     pub drop_audio: Option<&'a T>,
@@ -118,7 +118,7 @@ impl UNet1D {
         ];
         let style_proj = (c.style_dim > 0)
             .then(|| Linear::new(&mut root.at("style_proj"), c.style_dim, time_dim));
-        let audio_proj = Linear::new(&mut root.at("audio_proj"), c.audio_cond_dim, c.context_dim);
+        let audio_proj = Linear::new(&mut root.at("audio_proj"), c.condition_dim(), c.context_dim);
         let null_context =
             root.parameter("null_context", &[c.context_dim], Init::Zeros, Role::Vector);
         let audio_in =

@@ -2,9 +2,9 @@
 
 use crate::audio::FeatureScale;
 use crate::model::{
-    DecoderConfig, MotionDecoder, ParameterId, Result, UNet1D, UNetConfig, UNetInputs,
+    DecoderConfig, Graph as _, MotionDecoder, ParameterId, Result, UNet1D, UNetConfig, UNetInputs,
 };
-use crate::motion::MOTION_DIM;
+use crate::motion::{CLOCK_DIM, MOTION_DIM};
 
 use super::builder::{Axes, Builder, Form, Storage};
 use super::proto::Graph;
@@ -17,6 +17,8 @@ impl UNetNames {
     pub const X: &'static str = "x_t";
     pub const T: &'static str = "t";
     pub const AUDIO: &'static str = "audio";
+    /// Only in networks that hear the clock.
+    pub const CLOCK: &'static str = "clock";
     /// May be left out.
     pub const DROP_AUDIO: &'static str = "drop_audio";
     /// May be left out; only in networks that take a style.
@@ -62,6 +64,15 @@ pub fn unet(
         c.audio_cond_dim,
         "features of the music as motiongen extract writes them",
     );
+    let clock = c.clock.then(|| {
+        g.input(
+            UNetNames::CLOCK,
+            Axes::Frames,
+            CLOCK_DIM,
+            "cos and sin of 2 pi n bars for n = 1, 2, 3 and the beats of a bar, ln(tempo / 120), 1 where known; \
+             zeros where unknown",
+        )
+    });
     let drop_audio = g.optional_input(
         UNetNames::DROP_AUDIO,
         Axes::Batch,
@@ -76,7 +87,11 @@ pub fn unet(
             "style, normalised, 0 for none",
         )
     });
-    let audio = g.standardized(audio, &scale.centre, &scale.scale)?;
+    let features = g.standardized(audio, &scale.centre, &scale.scale)?;
+    let audio = match &clock {
+        Some(clock) => g.concat(&[&features, clock])?,
+        None => features,
+    };
     let inputs = UNetInputs {
         x: &x,
         t: &t,

@@ -16,7 +16,7 @@ use super::{ClientParams, Contract, Progress, Stage, Summary};
 use crate::store::Location;
 use crate::training::{
     Augmentation, Checkpoints, Drive, End, FinetuneConfig, FinetuneLearner, Journal, Kind, Loader,
-    OptimizerConfig, Plan, State, TemporalConfig, Windows,
+    OptimizerConfig, Plan, State, TemporalConfig, Windows, Withhold,
 };
 
 /// The stage.
@@ -301,18 +301,18 @@ impl Stage for Finetune {
         let limit = config.num_phrases;
         let phrases = read_phrases(&store, Self::NAME, machine, limit, progress, &watch)?;
         let network = &trained.config.network;
-        let windows = Arc::new(Windows::new(
+        let windows = Windows::new(
             Arc::clone(&phrases.dataset),
             trained.scales.clone(),
             // The phrases as they are: sampled motion is held against them.
             Augmentation { condition_noise: 0.0, mirror: false, yaw_deg: 0.0, stretch: 0.0 },
             network.window_frames,
             params.seed,
-        ));
-        let objective = &trained.config.diffusion.objective;
+        );
+        let windows = Arc::new(windows.heard_by(&network.unet));
         let mut learner = FinetuneLearner::new(
             network,
-            objective,
+            (&trained.config.diffusion.objective, Withhold::of(&trained.config.diffusion)),
             &config,
             &windows,
             [&unet.parameters, &decoder.parameters],

@@ -174,16 +174,15 @@ impl OpenModel {
         n_threads: NonZeroUsize,
     ) -> anyhow::Result<EagerEngine> {
         let card = &self.card;
-        let (unet, list) = UNet1D::new(&card.unet);
+        let (_, list) = UNet1D::new(&card.unet);
         let unet_parameters = self.parameters(file_names::UNET, file_names::UNET_WEIGHTS, list)?;
         let (decoder, list) = MotionDecoder::new(&card.decoder);
         let decoder_parameters =
             self.parameters(file_names::DECODER, file_names::DECODER_WEIGHTS, list)?;
         let engine = EagerEngine::new(
-            (unet, unet_parameters),
+            (&card.unet, unet_parameters),
             (decoder, decoder_parameters),
-            card.unet.style_dim > 0,
-            card.feature_scale.clone(),
+            &card.feature_scale,
             (n_workers, n_threads),
         );
         engine.context("while starting threads")
@@ -206,14 +205,13 @@ impl OpenModel {
     ) -> anyhow::Result<EagerEngine> {
         let card = &self.card;
         let first = |list: ParameterList| Parameters::new(list.without_zero_layers(), 0);
-        let (unet, list) = UNet1D::new(&card.unet);
+        let (_, list) = UNet1D::new(&card.unet);
         let unet_parameters = first(list);
         let (decoder, list) = MotionDecoder::new(&card.decoder);
         let engine = EagerEngine::new(
-            (unet, unet_parameters),
+            (&card.unet, unet_parameters),
             (decoder, first(list)),
-            card.unet.style_dim > 0,
-            card.feature_scale.clone(),
+            &card.feature_scale,
             (n_workers, n_threads),
         );
         engine.context("while starting threads")
@@ -260,7 +258,7 @@ impl OpenModel {
         plan: SessionPlan,
         cache: &Path,
     ) -> anyhow::Result<OnnxEngine> {
-        let takes_style = self.card.unet.style_dim > 0;
+        let config = &self.card.unet;
         let unet = self.folder.join(file_names::UNET);
         let decoder = self.folder.join(file_names::DECODER);
         // Files are looked through while onnxruntime loads what it has of them already.
@@ -268,13 +266,7 @@ impl OpenModel {
             let verified = scope.spawn(|| self.verify());
             let opened = (|| {
                 if plan.device != Device::Cpu {
-                    return Ok(OnnxEngine::open(
-                        runtime,
-                        (&unet, false),
-                        &decoder,
-                        takes_style,
-                        plan,
-                    )?);
+                    return Ok(OnnxEngine::open(runtime, (&unet, false), &decoder, config, plan)?);
                 }
                 let entry = self.card.file(file_names::UNET, &self.place)?;
                 let key = format!(
@@ -299,7 +291,7 @@ impl OpenModel {
                     )?)
                 })?;
                 let unet = optimized.join(file_names::UNET);
-                Ok(OnnxEngine::open(runtime, (&unet, true), &decoder, takes_style, plan)?)
+                Ok(OnnxEngine::open(runtime, (&unet, true), &decoder, config, plan)?)
             })();
             // A file that was changed explains whatever else went wrong.
             verified.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;

@@ -78,6 +78,9 @@ pub struct DiffusionTraining {
     pub augmentation: Augmentation,
     /// Probability that a window goes without its music, for guidance.
     pub condition_dropout: f64,
+    /// Probability that a window goes without its clock alone, in a network that hears it.
+    #[serde(default)]
+    pub clock_dropout: f64,
     /// Probability that a window goes without its style, in a network that takes one.
     pub style_dropout: f64,
     pub batch_size: usize,

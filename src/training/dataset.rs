@@ -6,10 +6,11 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use ndarray::Array2;
+use ndarray::{Array2, ArrayView2};
 
 use crate::audio::FEATURE_DIM;
-use crate::motion::{MOTION_DIM, Trajectory, TrajectoryError};
+use crate::motion::phase::DEFAULT_BEATS_PER_BAR;
+use crate::motion::{Channel, MOTION_DIM, Trajectory, TrajectoryError, clock};
 use crate::store::tables::{self, PhraseRow};
 use crate::store::{
     FrameSpool, Location, Patience, Row as _, Snapshot, StoreError, TableSchema, digest,
@@ -49,12 +50,27 @@ pub struct Phrase {
     pub id: Arc<str>,
     pub split: Split,
     pub n_frames: usize,
+    /// Beats of a bar.
+    pub beats_per_bar: u32,
     /// Identity of the music, where the table of phrases tells it.
     pub song_hash: Option<Arc<str>>,
     /// Digest of the phrase's files, or of its motion and features.
     pub content_hash: Arc<str>,
     motion_row: u64,
     feature_row: u64,
+}
+
+impl Phrase {
+    /// Returns the clock of frames of the phrase's motion, as it is or stretched, \[T, 25\] → \[T, 10\].
+    pub fn clock_of(&self, motion: ArrayView2<f32>) -> Array2<f32> {
+        let phase = motion.column(Channel::Phase.range().start);
+        let phase: Vec<f64> = phase.iter().map(|&x| f64::from(x)).collect();
+        clock(&phase, self.beats_per_bar)
+    }
+}
+
+fn beats_per_bar(row: &PhraseRow) -> u32 {
+    row.beats_per_bar.and_then(|n| u32::try_from(n).ok()).unwrap_or(DEFAULT_BEATS_PER_BAR)
 }
 
 /// A phrase that cannot be learned from, and why.
@@ -204,6 +220,7 @@ impl Dataset {
                 id: id.into(),
                 split,
                 n_frames: motion.n_frames.min(features.n_frames),
+                beats_per_bar: beats_per_bar(&row),
                 song_hash: row.song_hash.map(Into::into),
                 content_hash: row.content_hash.into(),
                 motion_row: motion.row,
@@ -249,6 +266,7 @@ impl Dataset {
                 id: id.into(),
                 split,
                 n_frames: of_motion.nrows().min(of_features.nrows()),
+                beats_per_bar: DEFAULT_BEATS_PER_BAR,
                 song_hash: None,
                 content_hash: content_hash.into(),
                 motion_row: motion.append(of_motion.view())?,

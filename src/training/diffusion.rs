@@ -1,12 +1,14 @@
 //! Training of the UNet: noise is added to motion, and the network learns to tell what was added.
 
+use std::borrow::Cow;
 use std::sync::Arc;
 
+use crate::audio::FEATURE_DIM;
 use crate::autodiff::{Arena, Eager, Gradients, Interpreter, Parameters, Tape, Tensor, Threads};
 use crate::diffusion::Schedule;
-use crate::model::{UNet1D, UNetInputs};
-use crate::motion::MOTION_DIM;
+use crate::model::{Graph as _, UNet1D, UNetInputs};
 use crate::motion::style::STYLE_DIM;
+use crate::motion::{MOTION_DIM, Normalizer};
 use crate::weights::{Archive, Section};
 
 use super::averaged::Averaged;
@@ -111,9 +113,11 @@ impl DiffusionLearner {
             threads,
             takes_style,
             seed,
+            windows,
             ..
         } = &mut *self;
         let (withhold, takes_style, seed) = (Withhold::of(config), *takes_style, *seed);
+        let normalizer = windows.normalizer();
         let parameters = network.live();
         gradients.iter_mut().for_each(Gradients::clear);
         let mut loss = 0.0;
@@ -121,13 +125,13 @@ impl DiffusionLearner {
             let numbers = first..(first + side_by_side).min(n_parts);
             let parts: Vec<_> = numbers.zip(gradients.iter_mut().zip(arenas.iter())).collect();
             let losses = threads.side_by_side(parts, |(part, (gradients, arena))| {
-                let windows = batch.windows(at(part)..at(part + 1));
+                let batch = batch.windows(at(part)..at(part + 1));
                 // Parts weigh as much as they have frames, so that any number of parts has one loss.
-                let share = windows.mask.iter().map(|&w| f64::from(w)).sum::<f64>() / all.max(1.0);
+                let share = batch.mask.iter().map(|&w| f64::from(w)).sum::<f64>() / all.max(1.0);
                 let seed = tape_seed(seed, step * n_parts as u64 + part as u64);
                 let mut tape = Tape::new(parameters, arena, Some(seed));
-                let given = Given::of(&windows, schedule, withhold, takes_style);
-                let loss = given.loss(&mut tape, unet, schedule, &config.objective)?;
+                let given = Given::of(&batch, schedule, withhold, takes_style);
+                let loss = given.loss(&mut tape, unet, normalizer, schedule, &config.objective)?;
                 let value = share * f64::from(loss.scalar());
                 let weight = tape.constant(&[], &[share as f32]);
                 tape.backward_from(loss, weight, gradients)?;
@@ -147,7 +151,8 @@ impl DiffusionLearner {
     fn validation_loss(&self, parameters: &Parameters<f32>) -> Result<f64, TrainingError> {
         let [loss] = self.mean_over_validation(|given| {
             let mut g = Eager::new(parameters, &self.arenas[0]);
-            let loss = given.loss(&mut g, &self.unet, &self.schedule, &self.config.objective)?;
+            let (normalizer, objective) = (self.windows.normalizer(), &self.config.objective);
+            let loss = given.loss(&mut g, &self.unet, normalizer, &self.schedule, objective)?;
             Ok([loss.scalar().into()])
         })?;
         Ok(loss)
@@ -165,7 +170,8 @@ impl DiffusionLearner {
             let mut g = Eager::new(self.network.live(), &self.arenas[0]);
             let mut loss_of = |frame: [f32; MOTION_DIM]| {
                 let says = g.constant(&shape, &frame.repeat(batch.n_windows * batch.n_frames));
-                let loss = given.loss_of(&mut g, &says, &self.schedule, &self.config.objective)?;
+                let (normalizer, objective) = (self.windows.normalizer(), &self.config.objective);
+                let loss = given.loss_of(&mut g, &says, normalizer, &self.schedule, objective)?;
                 Ok::<_, TrainingError>(loss.scalar().into())
             };
             Ok([loss_of(mean.map(|x| x as f32))?, loss_of([0.0; MOTION_DIM])?])
@@ -221,11 +227,17 @@ pub(super) fn tape_seed(seed: u64, number: u64) -> u64 {
 pub struct Withhold {
     pub audio: f64,
     pub style: f64,
+    pub clock: f64,
 }
 
 impl Withhold {
-    fn of(config: &DiffusionTraining) -> Self {
-        Self { audio: config.condition_dropout, style: config.style_dropout }
+    /// Returns those of a configuration.
+    pub fn of(config: &DiffusionTraining) -> Self {
+        Self {
+            audio: config.condition_dropout,
+            style: config.style_dropout,
+            clock: config.clock_dropout,
+        }
     }
 }
 
@@ -235,6 +247,7 @@ pub struct Given<'a> {
     pub t: Vec<usize>,
     x_t: Vec<f32>,
     target: Vec<f32>,
+    audio: Cow<'a, [f32]>,
     drop_audio: Vec<f32>,
     style: Option<Vec<f32>>,
 }
@@ -272,7 +285,8 @@ impl<'a> Given<'a> {
             }
             style
         });
-        Self { batch, t, x_t, target, drop_audio, style }
+        let audio = without_clock(batch, withhold.clock);
+        Self { batch, t, x_t, target, audio, drop_audio, style }
     }
 
     /// Returns the loss of the network's prediction.
@@ -283,11 +297,12 @@ impl<'a> Given<'a> {
         &self,
         g: &mut I,
         unet: &UNet1D,
+        normalizer: &Normalizer,
         schedule: &Schedule,
         objective: &Objective,
     ) -> Result<Tensor<f32>, TrainingError> {
         let y = self.predict(g, unet)?;
-        self.loss_of(g, &y, schedule, objective)
+        self.loss_of(g, &y, normalizer, schedule, objective)
     }
 
     /// Returns the loss of any prediction, \[batch, frames, 25\].
@@ -295,12 +310,25 @@ impl<'a> Given<'a> {
         &self,
         g: &mut I,
         prediction: &Tensor<f32>,
+        normalizer: &Normalizer,
         schedule: &Schedule,
         objective: &Objective,
     ) -> Result<Tensor<f32>, TrainingError> {
         let target = g.constant(prediction.shape(), &self.target);
         let mask = &self.batch.mask;
-        Ok(objective.loss(g, schedule, &self.t, [prediction, &target], mask)?)
+        let loss = objective.loss(g, schedule, &self.t, [prediction, &target], mask)?;
+        let x_t = g.constant(prediction.shape(), &self.x_t);
+        let of_estimate = objective.estimate.loss(
+            g,
+            normalizer,
+            (schedule, &self.t),
+            [prediction, &x_t],
+            (&self.batch.motion, mask),
+        )?;
+        Ok(match of_estimate {
+            Some(of_estimate) => g.add(&loss, &of_estimate)?,
+            None => loss,
+        })
     }
 
     /// Returns the mean of what should be told, channel by channel, over frames that count.
@@ -326,11 +354,11 @@ impl<'a> Given<'a> {
         unet: &UNet1D,
     ) -> Result<Tensor<f32>, TrainingError> {
         let (n, frames) = (self.batch.n_windows, self.batch.n_frames);
-        let n_features = self.batch.audio.len() / (n * frames);
+        let n_features = self.audio.len() / (n * frames);
         let x = g.constant(&[n, frames, MOTION_DIM], &self.x_t);
         let steps: Vec<f32> = self.t.iter().map(|&t| t as f32).collect();
         let t = g.constant(&[n], &steps);
-        let audio = g.constant(&[n, frames, n_features], &self.batch.audio);
+        let audio = g.constant(&[n, frames, n_features], &self.audio);
         let drop_audio = g.constant(&[n], &self.drop_audio);
         let mask = is_partial(&self.batch.mask).then(|| g.constant(&[n, frames], &self.batch.mask));
         let style = self.style.as_ref().map(|style| g.constant(&[n, STYLE_DIM], style));
@@ -344,6 +372,23 @@ impl<'a> Given<'a> {
         };
         Ok(unet.forward(g, inputs)?)
     }
+}
+
+/// Returns the condition of a batch, the clock of windows by chance all zeros: not known.
+fn without_clock(batch: &Batch, probability: f64) -> Cow<'_, [f32]> {
+    let window = batch.audio.len() / batch.n_windows.max(1);
+    let width = window / batch.n_frames.max(1);
+    let mut audio = Cow::Borrowed(batch.audio.as_slice());
+    if width == FEATURE_DIM {
+        return audio;
+    }
+    for (i, chance) in batch.chances.iter().enumerate() {
+        if chance.no_clock < probability {
+            let frames = audio.to_mut()[i * window..(i + 1) * window].chunks_exact_mut(width);
+            frames.for_each(|frame| frame[FEATURE_DIM..].fill(0.0));
+        }
+    }
+    audio
 }
 
 impl Learner for DiffusionLearner {

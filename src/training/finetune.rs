@@ -69,19 +69,21 @@ pub struct FinetuneLearner {
     threads: Arc<Threads>,
     schedule: Schedule,
     objective: Objective,
+    withhold: Withhold,
     config: FinetuneConfig,
     windows: Arc<Windows>,
     reducer: Box<dyn Reducer>,
 }
 
 impl FinetuneLearner {
-    /// Begins with trained networks.
+    /// Begins with trained networks; the UNet's prediction keeps its objective, and its conditions are withheld as
+    /// they were, so that guidance finds what it needs.
     ///
     /// # Errors
     /// A configuration that makes no network; more sampling steps than there are.
     pub fn new(
         network: &NetworkConfig,
-        objective: &Objective,
+        (objective, withhold): (&Objective, Withhold),
         config: &FinetuneConfig,
         windows: &Arc<Windows>,
         [unet, decoder]: [&Parameters<f32>; 2],
@@ -104,6 +106,7 @@ impl FinetuneLearner {
             threads: Arc::new(Threads::of_process()),
             schedule,
             objective: objective.clone(),
+            withhold,
             config: config.clone(),
             windows: Arc::clone(windows),
             reducer: Box::new(Alone),
@@ -145,8 +148,8 @@ impl FinetuneLearner {
         batch: &Batch,
     ) -> Result<Tensor<f32>, TrainingError> {
         let Self { pipeline, schedule, .. } = self;
-        let given = Given::of(batch, schedule, Withhold::default(), pipeline.takes_style);
-        given.loss(g, &pipeline.unet, schedule, &self.objective)
+        let given = Given::of(batch, schedule, self.withhold, pipeline.takes_style);
+        given.loss(g, &pipeline.unet, self.windows.normalizer(), schedule, &self.objective)
     }
 
     /// The losses of motion that is sampled and decoded.

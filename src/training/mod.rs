@@ -1,8 +1,8 @@
 //! Training: phrases in, weights that predict out.
 //!
 //! A [`Dataset`] is read once from the tables of a store; [`Windows`] are cut from it, and a [`Loader`]
-//! makes them into batches ahead of time. What is learned and what that costs is in `objective` and
-//! `temporal`. Everything depends on seeds and numbers of steps, nothing on threads or clocks.
+//! makes them into batches ahead of time. What is learned and what that costs is in `objective`, `estimate`
+//! and `temporal`. Everything depends on seeds and numbers of steps, nothing on threads or clocks.
 
 mod averaged;
 mod checkpoint;
@@ -13,6 +13,7 @@ mod diffusion;
 mod drive;
 mod ema;
 mod error;
+mod estimate;
 mod finetune;
 mod journal;
 mod learning_rate;
@@ -34,11 +35,12 @@ pub use diffusion::{Baselines, DiffusionLearner, Given, Withhold};
 pub use drive::{Alone, Drive, End, Learner, Losses, Plan, Reducer, Step, Validation, Watch};
 pub use ema::{Ema, EmaConfig};
 pub use error::TrainingError;
+pub use estimate::EstimateLosses;
 pub use finetune::{EndToEnd, FinetuneLearner};
 pub use journal::{Journal, RowKind};
 pub use learning_rate::{Course, LearningRate};
 pub use loader::Loader;
-pub use objective::{Objective, Reconstruction, reconstruction};
+pub use objective::{ChannelWeights, Objective, Reconstruction, reconstruction};
 pub use sampling::{Condition, Denoiser};
 pub use temporal::{TemporalConfig, TemporalLosses, temporal_losses};
 pub use window::{Augmentation, Batch, Chances, Scales, Windows, fit_scales};

@@ -10,6 +10,8 @@ use crate::diffusion::{LossType, Schedule, min_snr_weights};
 use crate::model::{Graph, Result};
 use crate::motion::{Channel, MOTION_DIM, Normalizer};
 
+use super::estimate::EstimateLosses;
+
 /// How predictions of the diffusion are weighed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Objective {
@@ -18,15 +20,76 @@ pub struct Objective {
     pub huber_delta: f64,
     /// γ of min-SNR weighting; `None` weighs all steps alike.
     pub min_snr_gamma: Option<f64>,
+    /// How channels are weighed; as release 0.1 did, all alike, where a run says nothing.
+    #[serde(default)]
+    pub channels: ChannelWeights,
+    /// What is asked of the estimate of clean motion beside.
+    #[serde(default)]
+    pub estimate: EstimateLosses,
+}
+
+/// Weights of channels in the distance of a prediction, before they are divided by their mean.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ChannelWeights {
+    /// Of each of the eight style channels, which change slowly and are a third of all.
+    pub style: f64,
+    /// Of vertical position, velocity and acceleration, by which dancers follow the beat.
+    pub vertical: f64,
+}
+
+impl Default for ChannelWeights {
+    fn default() -> Self {
+        Self { style: 1.0, vertical: 1.0 }
+    }
+}
+
+impl ChannelWeights {
+    /// Returns the weight of each channel; their mean is 1.
+    pub fn weights(&self) -> [f64; MOTION_DIM] {
+        let mut weights = [1.0; MOTION_DIM];
+        for channel in [Channel::Position, Channel::Velocity, Channel::Acceleration] {
+            weights[channel.range().start + 1] = self.vertical;
+        }
+        weights[Channel::Style.range()].fill(self.style);
+        let mean = weights.iter().sum::<f64>() / MOTION_DIM as f64;
+        weights.map(|weight| weight / mean)
+    }
 }
 
 impl Default for Objective {
     fn default() -> Self {
-        Self { loss: LossType::Mse, huber_delta: 1.0, min_snr_gamma: None }
+        Self {
+            loss: LossType::Mse,
+            huber_delta: 1.0,
+            min_snr_gamma: None,
+            channels: ChannelWeights::default(),
+            estimate: EstimateLosses::default(),
+        }
     }
 }
 
 impl Objective {
+    /// Multiplies both by the roots of their channels' weights.
+    fn weighed<I: Interpreter>(
+        &self,
+        g: &mut I,
+        both: [&Tensor<I::Element>; 2],
+    ) -> Result<[Tensor<I::Element>; 2]> {
+        let [prediction, target] = both;
+        if self.channels == ChannelWeights::default() {
+            return Ok([prediction.clone(), target.clone()]);
+        }
+        let factor = |weight: f64| match self.loss {
+            LossType::L1 => weight,
+            LossType::Mse | LossType::Huber => weight.sqrt(),
+        };
+        let factors = self.channels.weights().map(|w| I::Element::from_f64(factor(w)));
+        let factors = g.constant(&[MOTION_DIM], &factors);
+        let mut times = |x: &Tensor<_>| g.apply(Binary::new(Pair::Multiply), &[x, &factors]);
+        Ok([times(prediction)?, times(target)?])
+    }
+
     fn cost(&self) -> Cost {
         match self.loss {
             LossType::Mse => Cost::Squared,
@@ -35,7 +98,8 @@ impl Objective {
         }
     }
 
-    /// ⟨w(t) cost(prediction − target)⟩ over frames that count.
+    /// ⟨w(t) cost(√w_c (prediction − target))⟩ over frames that count, w_c the weights of channels (w_c itself where
+    /// the cost is |d|).
     ///
     /// # Shapes
     /// - `prediction`, `target`: \[batch, frames, 25\]; `mask`: \[batch, frames\]; `t`: \[batch\]
@@ -48,6 +112,7 @@ impl Objective {
         mask: &[f32],
     ) -> Result<Tensor<I::Element>> {
         let frames = prediction.shape()[1];
+        let [prediction, target] = &self.weighed(g, [prediction, target])?;
         let Some(gamma) = self.min_snr_gamma else {
             let mask: Vec<_> = mask.iter().map(|&w| I::Element::from_f64(w.into())).collect();
             let mask = g.constant(&prediction.shape()[..2], &mask);

@@ -7,11 +7,12 @@ use serde::{Deserialize, Serialize};
 
 use crate::audio::{FEATURE_DIM, FeatureScale};
 use crate::autodiff::Stream;
+use crate::model::UNetConfig;
 use crate::motion::augment::{
     mirror_x, rotate_yaw, stretch_features, stretch_motion, stretched_frames,
 };
 use crate::motion::style::STYLE_DIM;
-use crate::motion::{Channel, MOTION_DIM, Normalizer, Placement};
+use crate::motion::{CLOCK_DIM, Channel, MOTION_DIM, Normalizer, Placement};
 use crate::store::StoreError;
 
 use super::dataset::{Dataset, Phrase, Split};
@@ -43,7 +44,8 @@ pub struct Batch {
     pub n_frames: usize,
     /// Normalised motion, `[n_windows, n_frames, 25]`; beyond a phrase's end its last frame is held.
     pub motion: Vec<f32>,
-    /// Features in units of their spread, `[n_windows, n_frames, 163]`, held likewise.
+    /// Features in units of their spread and, for a network that hears it, the clock, `[n_windows, n_frames,
+    /// condition_dim]`, held likewise.
     pub audio: Vec<f32>,
     /// 1 for frames of the phrase and 0 for held ones, `[n_windows, n_frames]`.
     pub mask: Vec<f32>,
@@ -64,16 +66,18 @@ pub struct Chances {
     pub no_audio: f64,
     /// Whether the style is withheld.
     pub no_style: f64,
+    /// Whether the clock alone is withheld.
+    pub no_clock: f64,
 }
 
 impl Batch {
-    fn empty(n_windows: usize, n_frames: usize) -> Self {
+    fn empty(n_windows: usize, n_frames: usize, condition_dim: usize) -> Self {
         let zeros = |width: usize| Vec::with_capacity(n_windows * n_frames * width);
         Self {
             n_windows: 0,
             n_frames,
             motion: zeros(MOTION_DIM),
-            audio: zeros(FEATURE_DIM),
+            audio: zeros(condition_dim),
             mask: zeros(1),
             style: Vec::with_capacity(n_windows * STYLE_DIM),
             noise: zeros(MOTION_DIM),
@@ -126,6 +130,8 @@ pub struct Windows {
     scales: Scales,
     augmentation: Augmentation,
     n_frames: usize,
+    /// Whether windows have the clock beside the features.
+    has_clock: bool,
     seed: u64,
     /// Training windows of an epoch: the phrase of each; longer phrases have several.
     train: Vec<u32>,
@@ -166,7 +172,13 @@ impl Windows {
             }
         }
         let scales = scales.into();
-        Self { dataset, scales, augmentation, n_frames, seed, train, validation }
+        let has_clock = false;
+        Self { dataset, scales, augmentation, n_frames, has_clock, seed, train, validation }
+    }
+
+    /// Gives windows what a network hears: the clock too, where its configuration says so.
+    pub fn heard_by(self, config: &UNetConfig) -> Self {
+        Self { has_clock: config.clock, ..self }
     }
 
     pub fn dataset(&self) -> &Dataset {
@@ -179,6 +191,10 @@ impl Windows {
 
     pub fn scales(&self) -> &Scales {
         &self.scales
+    }
+
+    fn condition_dim(&self) -> usize {
+        FEATURE_DIM + if self.has_clock { CLOCK_DIM } else { 0 }
     }
 
     /// Returns how many windows an epoch has.
@@ -209,15 +225,16 @@ impl Windows {
     /// # Errors
     /// [`StoreError`] when the frames at hand cannot be read.
     pub fn train(&self, windows: &[(u64, u32)]) -> Result<Batch, StoreError> {
-        let mut batch = Batch::empty(windows.len(), self.n_frames);
+        let mut batch = Batch::empty(windows.len(), self.n_frames, self.condition_dim());
         for &(number, phrase) in windows {
             let phrase = &self.dataset.phrases()[phrase as usize];
             let (motion, audio) = self.augmented(phrase, number)?;
-            self.push(&mut batch, phrase, motion, audio);
-            let mut drawn = [0.0_f64; 3];
+            let clock = self.has_clock.then(|| phrase.clock_of(motion.view()));
+            self.push(&mut batch, phrase, motion, audio, clock);
+            let mut drawn = [0.0_f64; 4];
             Stream::new(self.seed, CHANCES + number).uniform(0, &mut drawn);
-            let [step, no_audio, no_style] = drawn;
-            batch.chances.push(Chances { step, no_audio, no_style });
+            let [step, no_audio, no_style, no_clock] = drawn;
+            batch.chances.push(Chances { step, no_audio, no_style, no_clock });
             push_noise(&mut batch, Stream::new(self.seed, NOISE + number));
         }
         Ok(batch)
@@ -235,7 +252,7 @@ impl Windows {
     /// # Panics
     /// When there are no validation windows.
     pub fn validation(&self, range: std::ops::Range<usize>) -> Result<Batch, StoreError> {
-        let mut batch = Batch::empty(range.len(), self.n_frames);
+        let mut batch = Batch::empty(range.len(), self.n_frames, self.condition_dim());
         for number in range {
             let (phrase, first) = self.validation[number % self.validation.len()];
             let phrase = &self.dataset.phrases()[phrase as usize];
@@ -243,9 +260,10 @@ impl Windows {
             let motion = self.dataset.motion(phrase, first as usize, n)?;
             let mut audio = self.dataset.features(phrase, first as usize, n)?;
             self.scales.features.apply(audio.view_mut());
-            self.push(&mut batch, phrase, placed(motion), audio);
+            let clock = self.has_clock.then(|| phrase.clock_of(motion.view()));
+            self.push(&mut batch, phrase, placed(motion), audio, clock);
             let step = ((number as f64 + 0.5) * GOLDEN).fract();
-            batch.chances.push(Chances { step, no_audio: 1.0, no_style: 1.0 });
+            batch.chances.push(Chances { step, no_audio: 1.0, no_style: 1.0, no_clock: 1.0 });
             push_noise(&mut batch, Stream::new(0, VALIDATION_NOISE + number as u64));
         }
         Ok(batch)
@@ -303,6 +321,7 @@ impl Windows {
         phrase: &Phrase,
         mut motion: Array2<f32>,
         audio: Array2<f32>,
+        clock: Option<Array2<f32>>,
     ) {
         let n = motion.nrows();
         self.scales.motion.normalize(motion.view_mut());
@@ -310,6 +329,7 @@ impl Windows {
         for t in rows {
             batch.motion.extend(motion.row(t));
             batch.audio.extend(audio.row(t));
+            batch.audio.extend(clock.iter().flat_map(|clock| clock.row(t)));
         }
         batch.mask.extend((0..self.n_frames).map(|t| if t < n { 1.0 } else { 0.0 }));
         let style = motion.slice(s![.., Channel::Style.range()]);

@@ -7,7 +7,7 @@ use motiongen::diffusion::{BetaSchedule, DiffusionConfig, LossType, Prediction};
 use motiongen::model::{DecoderConfig, MotionDecoder, Preset, UNet1D, UNetConfig};
 use motiongen::training::{
     Batch, EndToEnd, FinetuneConfig, FinetuneLearner, Learner, NetworkConfig, Objective,
-    OptimizerConfig, TemporalConfig,
+    OptimizerConfig, TemporalConfig, Withhold,
 };
 
 use super::given;
@@ -75,7 +75,13 @@ impl Case {
         let unet = parameters(UNet1D::new(&network.unet).1);
         let decoder = parameters(MotionDecoder::new(&network.decoder).1);
         let both = [&unet, &decoder];
-        let learner = FinetuneLearner::new(&network, objective, config, &windows, both);
+        let learner = FinetuneLearner::new(
+            &network,
+            (objective, Withhold::default()),
+            config,
+            &windows,
+            both,
+        );
         Self { golden, batch, learner: learner.expect("networks that fit") }
     }
 
@@ -100,7 +106,7 @@ impl Case {
             ..DiffusionConfig::default()
         };
         let objective =
-            Objective { loss: LossType::Huber, huber_delta: 1.0, min_snr_gamma: Some(5.0) };
+            Objective { loss: LossType::Huber, min_snr_gamma: Some(5.0), ..Objective::default() };
         Self::new("finetune_tiny_v", 8, diffusion, &objective, &config(4, [2.0, 0.75, 0.125]))
     }
 

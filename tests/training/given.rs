@@ -50,7 +50,8 @@ pub fn normalizer() -> Normalizer {
 pub fn batch(golden: &Golden, x0: Vec<f32>, noise: Vec<f32>, audio: Vec<f32>) -> Batch {
     let &[n_windows, n_frames] = golden.shape("mask") else { panic!("[batch, frames]") };
     // In the middle of the step's share of the chances.
-    let chance = |t: f64| Chances { step: (t + 0.5) / 1000.0, no_audio: 1.0, no_style: 1.0 };
+    let chance =
+        |t: f64| Chances { step: (t + 0.5) / 1000.0, no_audio: 1.0, no_style: 1.0, no_clock: 1.0 };
     Batch {
         n_windows,
         n_frames,

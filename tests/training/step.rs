@@ -60,6 +60,7 @@ fn learner(accumulate: usize, side_by_side: usize) -> DiffusionLearner {
         objective: Objective::default(),
         augmentation: Augmentation::default(),
         condition_dropout: DROPPED,
+        clock_dropout: 0.0,
         style_dropout: 0.0,
         batch_size: 3,
         accumulate,
@@ -163,16 +164,19 @@ fn every_objective_is_pytorchs() {
     let (parameters, arena): (Parameters<f32>, _) = (parameters(list), Arena::default());
     let predictions = [Prediction::Epsilon, Prediction::Sample, Prediction::Velocity];
     let losses = [LossType::Mse, LossType::L1, LossType::Huber];
+    let normalizer = Normalizer::identity();
     let mut wanted = golden.values("objectives").iter();
     for prediction in predictions {
         let schedule = schedule(prediction);
-        let withhold = Withhold { audio: DROPPED, style: 0.0 };
+        let withhold = Withhold { audio: DROPPED, ..Withhold::default() };
         let given = Given::of(&batch, &schedule, withhold, false);
         for loss in losses {
             for min_snr_gamma in [None, Some(5.0)] {
-                let objective = Objective { loss, huber_delta: 1.0, min_snr_gamma };
+                let objective = Objective { loss, min_snr_gamma, ..Objective::default() };
                 let mut g = Eager::new(&parameters, &arena);
-                let got = given.loss(&mut g, &unet, &schedule, &objective).expect("shapes fit");
+                let got = given
+                    .loss(&mut g, &unet, &normalizer, &schedule, &objective)
+                    .expect("shapes fit");
                 let wanted = [*wanted.next().expect("a loss of each objective")];
                 let what = format!("{prediction:?} by {loss:?}, gamma {min_snr_gamma:?}");
                 assert_near(&what, got.data(), &wanted, SINGLE);

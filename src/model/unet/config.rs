@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::audio::FEATURE_DIM;
-use crate::motion::MOTION_DIM;
+use crate::motion::{CLOCK_DIM, MOTION_DIM};
 
 /// The sizes of a [`UNet1D`](super::UNet1D).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -25,6 +25,10 @@ pub struct UNetConfig {
     pub use_scale_shift_norm: bool,
     /// Features of a frame of music.
     pub audio_cond_dim: usize,
+    /// Whether the clock of the music (`motion::clock`) is given beside its features; networks of release 0.1
+    /// have none.
+    #[serde(default)]
+    pub clock: bool,
     pub time_embed_dim: usize,
     pub context_dim: usize,
     /// Whether the music is added to the first level, frame by frame; the reference draws it without.
@@ -66,7 +70,7 @@ impl Preset {
         }
     }
 
-    /// Returns the sizes.
+    /// Returns the sizes, as the reference draws them: without a clock.
     pub fn config(self) -> UNetConfig {
         let (widths, dim): (&[usize], _) = match self {
             Self::Tiny => (&[40, 48, 64], 32),
@@ -84,6 +88,7 @@ impl Preset {
             num_head_channels: None,
             use_scale_shift_norm: true,
             audio_cond_dim: FEATURE_DIM,
+            clock: false,
             time_embed_dim: dim,
             context_dim: dim,
             add_audio: true,
@@ -96,6 +101,11 @@ impl Preset {
 }
 
 impl UNetConfig {
+    /// Returns the numbers of a frame of the condition: features, then the clock.
+    pub fn condition_dim(&self) -> usize {
+        self.audio_cond_dim + if self.clock { CLOCK_DIM } else { 0 }
+    }
+
     /// Returns the heads of attention at a width.
     pub fn heads(&self, width: usize) -> usize {
         self.num_head_channels.map_or(self.num_heads, |channels| width / channels)

@@ -19,6 +19,7 @@ use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
 use crate::generation::{
     EagerEngine, EngineError, Generator, ModelCard, OVERLAP_FRAMES, Sampling, Track,
 };
+use crate::model::condition;
 use crate::motion::postprocess::process;
 use crate::stages::Progress;
 use crate::stages::extract::pool::{self, lock};
@@ -58,6 +59,8 @@ pub struct MusicWindow {
     pub features: Array2<f32>,
     /// Bar phase of its frames, \[T\], for post-processing that takes the phase from the music.
     pub phase: Option<Vec<f64>>,
+    /// Clock of its frames, \[T, 10\], for a network that hears it.
+    pub clock: Option<Array2<f32>>,
 }
 
 /// Motion that was sampled for a window of music.
@@ -155,6 +158,7 @@ fn of_columns(row: &GenerationRow, card: &ModelCard) -> anyhow::Result<MotionSet
         constraints: None,
         constraint_strength: 1.0,
         soft: false,
+        no_clock: false,
     })
 }
 
@@ -171,7 +175,7 @@ pub fn sample(
     progress: &dyn Progress,
 ) -> anyhow::Result<Vec<BaselineMotion>> {
     let Request { store, model, settings, windows, .. } = request;
-    for MusicWindow { phrase_id, first_frame, features, phase } in *windows {
+    for MusicWindow { phrase_id, first_frame, features, phase, .. } in *windows {
         let (n_frames, n_features) = features.dim();
         ensure!(
             n_frames > 0 && n_features == FEATURE_DIM,
@@ -236,8 +240,11 @@ fn sample_all(
         *threads,
         || queue.next(),
         |(i, window): (usize, &MusicWindow)| -> anyhow::Result<()> {
+            let clock = window.clock.as_ref().filter(|_| !settings.no_clock);
+            let clock = clock.map(|clock| clock.view());
+            let heard = condition(&card.unet, window.features.view(), clock);
             let track = Track {
-                features: window.features.view(),
+                condition: heard.view(),
                 seed: seed_of(*seed, &window.phrase_id, window.first_frame, 0),
                 style: settings.style,
                 constraints: None,

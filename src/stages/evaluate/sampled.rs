@@ -12,6 +12,7 @@ use super::splits::MusicSplit;
 use super::subjects::Subject;
 use super::truth::Truth;
 use crate::evaluation::window::window_starts;
+use crate::motion::clock;
 use crate::stages::model_files::{OpenModel, default_model_cache};
 use crate::stages::{Progress, learned};
 use crate::store::{Location, Snapshot, StoreError, digest, tables};
@@ -87,14 +88,20 @@ impl Evaluand {
             &names,
             |id, features: Array2<f32>| {
                 let n_frames = features.nrows();
-                let phase = self.phrases.music(id, n_frames).map(|music| {
-                    music.bars.iter().map(|bars| bars.rem_euclid(1.0)).collect::<Vec<f64>>()
+                let music = self.phrases.music(id, n_frames).map(|music| {
+                    let phase: Vec<f64> =
+                        music.bars.iter().map(|bars| bars.rem_euclid(1.0)).collect();
+                    let clock = clock(&phase, music.beats_per_bar);
+                    (phase, clock)
                 });
                 let window = |first: usize| MusicWindow {
                     phrase_id: id.to_owned(),
                     first_frame: first,
                     features: features.slice(s![first..first + length, ..]).to_owned(),
-                    phase: phase.as_ref().map(|phase| phase[first..first + length].to_vec()),
+                    phase: music.as_ref().map(|(phase, _)| phase[first..first + length].to_vec()),
+                    clock: music
+                        .as_ref()
+                        .map(|(_, clock)| clock.slice(s![first..first + length, ..]).to_owned()),
                 };
                 let windows = window_starts(n_frames, length).map(window).collect();
                 all.insert(id.to_owned(), windows);

@@ -8,13 +8,12 @@ use ndarray::{Array3, ArrayView3, Axis, s};
 
 use super::Params;
 use super::files::Files;
-use crate::audio::FEATURE_DIM;
 use crate::autodiff::{Parameters, Stream};
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
 use crate::generation::{
     EagerEngine, Engine, Inputs, OnnxEngine, Sampling, SessionPlan, file_names, sample,
 };
-use crate::model::{MotionDecoder, Parameter, ParameterList, UNet1D};
+use crate::model::{MotionDecoder, Parameter, ParameterList, UNet1D, condition};
 use crate::motion::MOTION_DIM;
 use crate::onnx::{Device, Model, Runtime, Storage, values_of};
 use crate::stages::Progress;
@@ -90,13 +89,12 @@ impl Checking<'_> {
                 .with_context(|| format!("while writing {}", path.display()))?;
         }
         let network = &self.trained.state.config.network;
-        let takes_style = network.unet.style_dim > 0;
         let plan =
             SessionPlan { n_workers: 1, n_threads: machine.threads.get(), device: Device::Cpu };
         let path = |name| folder.path().join(name);
         let unet = path(file_names::UNET);
         let decoder = path(file_names::DECODER);
-        let onnx = OnnxEngine::open(runtime, (&unet, false), &decoder, takes_style, plan)?;
+        let onnx = OnnxEngine::open(runtime, (&unet, false), &decoder, &network.unet, plan)?;
         // What the files hold, which rounding has changed.
         let eager = self.eager(
             self.read_back(
@@ -162,10 +160,9 @@ impl Checking<'_> {
     ) -> anyhow::Result<EagerEngine> {
         let network = &self.trained.state.config.network;
         let engine = EagerEngine::new(
-            (UNet1D::new(&network.unet).0, unet),
+            (&network.unet, unet),
             (MotionDecoder::new(&network.decoder).0, decoder),
-            network.unet.style_dim > 0,
-            self.trained.state.scales.features.clone(),
+            &self.trained.state.scales.features,
             (NonZeroUsize::MIN, self.params.machine.threads),
         );
         engine.context("while starting threads")
@@ -188,23 +185,27 @@ impl Checking<'_> {
         Ok(Parameters::from_fn(list, values))
     }
 
-    /// Returns music of the store, frame after frame, \[frames, 163\]; held-out songs first.
+    /// Returns music of the store as the network hears it, frame after frame, \[frames, condition_dim\];
+    /// held-out songs first.
     fn music(&self) -> anyhow::Result<ndarray::Array2<f32>> {
         let dataset = self.dataset;
         let mut order: Vec<_> = dataset.phrases().iter().collect();
         order.sort_by_key(|phrase| std::cmp::Reverse(phrase.split));
-        let mut music = ndarray::Array2::zeros((0, FEATURE_DIM));
+        let config = &self.trained.state.config.network.unet;
+        let mut music = ndarray::Array2::zeros((0, config.condition_dim()));
         for phrase in order.into_iter().take(N_PHRASES) {
             let features = dataset.features(phrase, 0, phrase.n_frames)?;
-            music.append(Axis(0), features.view()).context("features of another width")?;
+            let clock = phrase.clock_of(dataset.motion(phrase, 0, phrase.n_frames)?.view());
+            let heard = condition(config, features.view(), Some(clock.view()));
+            music.append(Axis(0), heard.view()).context("features of another width")?;
         }
         Ok(music)
     }
 
-    /// Returns the music of a case: excerpts that begin at different places, \[samples, frames, 163\].
+    /// Returns the music of a case: excerpts that begin at different places, \[samples, frames, condition_dim\].
     fn audio(music: &ndarray::Array2<f32>, case: &Case) -> Array3<f32> {
         let n = music.nrows().max(1);
-        Array3::from_shape_fn((case.n_samples, case.n_frames, FEATURE_DIM), |(i, t, j)| {
+        Array3::from_shape_fn((case.n_samples, case.n_frames, music.ncols()), |(i, t, j)| {
             music[[(i * n / case.n_samples + t) % n, j]]
         })
     }

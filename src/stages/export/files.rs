@@ -82,6 +82,7 @@ impl Files {
             normalizer: scales.motion.clone(),
             feature_scale: scales.features.clone(),
             motion_range: range,
+            sampling: None,
             licence: params.licence.clone(),
             files: Vec::new(),
         };

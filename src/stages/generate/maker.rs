@@ -9,8 +9,9 @@ use crate::evaluation::{Score, derivative_error, score};
 use crate::generation::{
     Constrained, Constraints, EngineError, Generator, ModelCard, Primed, Track,
 };
+use crate::model::condition;
 use crate::motion::postprocess::process;
-use crate::motion::{Beats, Channel, MOTION_DIM, bar_phase};
+use crate::motion::{Beats, Channel, MOTION_DIM, bar_phase, clock};
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::retrieval::{Primer, Priming};
 use crate::store::tables::GenerationRow;
@@ -91,6 +92,11 @@ impl Maker<'_> {
             let times_s: Vec<f64> = (0..n_frames).map(frames_to_s).collect();
             bar_phase(&times_s, beats)
         });
+        let bars = phase.as_deref().filter(|_| music.has_downbeats);
+        let known = bars.filter(|_| !self.settings.no_clock).zip(music.beats.as_ref());
+        let clock = known.map(|(bars, beats)| clock(bars, beats.beats_per_bar()));
+        let clock = clock.as_ref().map(|clock| clock.view());
+        let heard = condition(&self.card.unet, music.features, clock);
         let priming = self.priming(music)?;
         let mut best: Option<Candidate> = None;
         let mut rows = Vec::with_capacity(self.settings.best_of);
@@ -100,12 +106,17 @@ impl Maker<'_> {
             let mut unseen = |_: ArrayView2<f32>| Ok(());
             let watcher: &mut dyn FnMut(ArrayView2<f32>) -> std::io::Result<()> =
                 if candidate == 0 { &mut *watch } else { &mut unseen };
-            let decoded =
-                self.sample(music, seed, constraints.as_ref(), priming.as_ref(), watcher)?;
+            let decoded = self.sample(
+                music,
+                heard.view(),
+                seed,
+                constraints.as_ref(),
+                priming.as_ref(),
+                watcher,
+            )?;
             let velocity_error =
                 derivative_error(decoded.view(), Channel::Position, Channel::Velocity);
             let mut frames = decoded.clone();
-            let bars = phase.as_deref().filter(|_| music.has_downbeats);
             let postprocess = &self.settings.postprocess;
             process(postprocess, &mut frames, bars);
             if let Some(constraints) = constraints.as_ref().filter(|_| !self.settings.soft) {
@@ -175,6 +186,7 @@ impl Maker<'_> {
     fn sample(
         &self,
         music: &Music,
+        heard: ArrayView2<f32>,
         seed: u64,
         constraints: Option<&Constraints>,
         priming: Option<&Priming>,
@@ -182,7 +194,7 @@ impl Maker<'_> {
     ) -> Result<Array2<f32>, Failure> {
         let strength = self.settings.constraint_strength;
         let track = Track {
-            features: music.features,
+            condition: heard,
             seed,
             style: self.settings.style,
             constraints: constraints.map(|constraints| Constrained { constraints, strength }),

@@ -98,9 +98,12 @@ pub struct Params {
     /// Which steps of the diffusion are visited.
     #[arg(long, value_enum, default_value_t = Spacing::Trailing, help_heading = "Sampling")]
     pub spacing: Spacing,
-    /// 1 follows the music, more exaggerates it, 0 ignores it.
-    #[arg(long, value_name = "X", default_value_t = 4.0, help_heading = "Sampling")]
-    pub guidance: f64,
+    /// 1 follows the music, more exaggerates it, 0 ignores it [default: the model's]
+    #[arg(long, value_name = "X", help_heading = "Sampling")]
+    pub guidance: Option<f64>,
+    /// Withhold the clock from a model that hears it, so that it dances to the features alone.
+    #[arg(long, help_heading = "Sampling")]
+    pub no_clock: bool,
     /// Share of the noise that ddim renews at every step, 0 to 1.
     #[arg(long, value_name = "X", default_value_t = 0.0, help_heading = "Sampling")]
     pub eta: f64,
@@ -246,6 +249,7 @@ pub struct Settings {
     pub constraints: Option<Asked>,
     pub constraint_strength: f64,
     pub soft: bool,
+    pub no_clock: bool,
 }
 
 impl Settings {
@@ -263,10 +267,10 @@ impl Settings {
         let n_steps = params.steps.unwrap_or_else(|| n_steps.min(schedule.len()));
         let sampler = SamplerConfig { sampler, n_steps, spacing: params.spacing, clip: true };
         sampler.check(schedule.len())?;
+        let guidance = params.guidance.unwrap_or_else(|| card.guidance());
         ensure!(
-            params.guidance >= 0.0 && params.guidance.is_finite(),
-            "--guidance {} is below 0; give 1 to follow the music, more to exaggerate it",
-            params.guidance
+            guidance >= 0.0 && guidance.is_finite(),
+            "--guidance {guidance} is below 0; give 1 to follow the music, more to exaggerate it"
         );
         ensure!(
             params.overlap < card.window_frames,
@@ -286,7 +290,7 @@ impl Settings {
         };
         Ok(Self {
             sampler,
-            guidance: params.guidance,
+            guidance,
             seed: params.seed,
             best_of: params.best_of.get(),
             style: style(&params.style, card)?,
@@ -296,6 +300,7 @@ impl Settings {
             constraints,
             constraint_strength: strength,
             soft: params.soft,
+            no_clock: params.no_clock,
         })
     }
 
@@ -352,6 +357,7 @@ impl Settings {
             constraints: self.constraints_text().map(|text| digest(text.as_bytes())),
             constraint_strength: self.constraint_strength,
             soft: self.soft,
+            no_clock: self.no_clock,
         }
     }
 

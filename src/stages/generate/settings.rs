@@ -44,6 +44,14 @@ pub struct MotionSettings {
     pub constraint_strength: f64,
     /// Whether the rest of the way to constraints is left.
     pub soft: bool,
+    /// Whether the clock is withheld from a network that hears it.
+    #[serde(default, skip_serializing_if = "is_false")]
+    pub no_clock: bool,
+}
+
+/// As release 0.1 wrote settings, what it did not know is left out where it says nothing new.
+fn is_false(is: &bool) -> bool {
+    !is
 }
 
 impl MotionSettings {
@@ -83,6 +91,7 @@ mod tests {
             constraints: None,
             constraint_strength: 1.0,
             soft: false,
+            no_clock: false,
         }
     }
 

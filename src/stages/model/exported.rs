@@ -7,7 +7,6 @@ use std::time::Instant;
 use ndarray::Array3;
 
 use super::thousands;
-use crate::audio::FEATURE_DIM;
 use crate::autodiff::Stream;
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
 use crate::generation::{LearnedFrom, ModelCard, MusicDigests, Sampling, sample};
@@ -50,7 +49,7 @@ pub fn look(
     }
     let card = &opened.card;
     let schedule = Schedule::new(&card.diffusion)?;
-    let audio = Array3::zeros((1, frames, FEATURE_DIM));
+    let audio = Array3::zeros((1, frames, card.unet.condition_dim()));
     let mut timed = Vec::new();
     for (sampler, n_steps) in TIMED {
         let config = SamplerConfig {

@@ -96,7 +96,7 @@ fn follow(params: &Params, batch: usize, use_checkpoint: bool) -> anyhow::Result
             let (unet, list) = UNet1D::new(&config);
             let mut g = Outline::new(&list);
             let x = g.input(&[batch, frames, config.in_channels]);
-            let audio = g.input(&[batch, frames, config.audio_cond_dim]);
+            let audio = g.input(&[batch, frames, config.condition_dim()]);
             let t = g.input(&[batch]);
             let (drop_audio, mask, style) = (Some(&t), None, None);
             let inputs = UNetInputs { x: &x, t: &t, audio: &audio, drop_audio, mask, style };

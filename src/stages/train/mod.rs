@@ -135,6 +135,7 @@ fn check_numbers(params: &Params, config: &TrainConfig) -> anyhow::Result<()> {
     };
     let d = &config.diffusion;
     share("--condition-dropout", d.condition_dropout)?;
+    share("--clock-dropout", d.clock_dropout)?;
     share("--style-dropout", d.style_dropout)?;
     share("--time-stretch", d.augmentation.stretch)?;
     share("--decoder-dropout", config.network.decoder.dropout)?;
@@ -227,7 +228,8 @@ impl<'a> Run<'a> {
         let scales = scales(&phrases.dataset, n_frames, self.watch)?;
         let windows = |augmentation: Augmentation| {
             let (dataset, scales) = (Arc::clone(&phrases.dataset), scales.clone());
-            Arc::new(Windows::new(dataset, scales, augmentation, n_frames, params.seed))
+            let windows = Windows::new(dataset, scales, augmentation, n_frames, params.seed);
+            Arc::new(windows.heard_by(&config.network.unet))
         };
         let mut account = Account::new(&params.run, self.store, phrases.left_out.clone());
 

@@ -7,8 +7,8 @@ use crate::model::{DecoderConfig, Preset, UNetConfig};
 use crate::motion::ChannelLimits;
 use crate::motion::style::STYLE_DIM;
 use crate::training::{
-    Augmentation, Course, DecoderTraining, DiffusionTraining, EmaConfig, LearningRate,
-    NetworkConfig, Objective, OptimizerConfig, TrainConfig,
+    Augmentation, ChannelWeights, Course, DecoderTraining, DiffusionTraining, EmaConfig,
+    EstimateLosses, LearningRate, NetworkConfig, Objective, OptimizerConfig, TrainConfig,
 };
 
 /// Sizes of the networks; each wins over the preset.
@@ -48,6 +48,10 @@ pub struct NetworkParams {
     /// beat falls.
     #[arg(long, help_heading = "Networks")]
     pub attention_only: bool,
+    /// Let the UNet hear the features alone, as the reference does, without the clock: where in its bar and how
+    /// fast the music is.
+    #[arg(long, help_heading = "Networks")]
+    pub no_clock: bool,
     /// Let the UNet take a style (the mean of the style channels) beside the music.
     #[arg(long, help_heading = "Networks")]
     pub style: bool,
@@ -110,9 +114,28 @@ pub struct DiffusionParams {
     /// Weigh steps by min-SNR with this γ (5 is usual) [default: all steps alike]
     #[arg(long, value_name = "GAMMA", help_heading = "Diffusion")]
     pub min_snr_gamma: Option<f64>,
+    /// Weight of each style channel; all others but the vertical ones have 1.
+    #[arg(long, value_name = "X", default_value_t = 1.0, help_heading = "Diffusion")]
+    pub style_weight: f64,
+    /// Weight of vertical position, velocity and acceleration.
+    #[arg(long, value_name = "X", default_value_t = 1.0, help_heading = "Diffusion")]
+    pub vertical_weight: f64,
+    /// Weight of velocities against differences of positions, of the estimate of clean motion.
+    #[arg(long, value_name = "X", default_value_t = 0.0, help_heading = "Diffusion")]
+    pub velocity_loss: f64,
+    /// Weight of accelerations against differences of velocities.
+    #[arg(long, value_name = "X", default_value_t = 0.0, help_heading = "Diffusion")]
+    pub acceleration_loss: f64,
+    /// Weights of the first, second and third differences of poses against the truth's.
+    #[arg(long, value_name = "X,X,X", value_delimiter = ',', num_args = 3, default_values_t = [0.0; 3],
+          help_heading = "Diffusion")]
+    pub difference_losses: Vec<f64>,
     /// Probability that a window goes without its music, for guidance.
     #[arg(long, value_name = "P", default_value_t = 0.1, help_heading = "Diffusion")]
     pub condition_dropout: f64,
+    /// Probability that a window goes without its clock alone, so that the network hears as well.
+    #[arg(long, value_name = "P", default_value_t = 0.1, help_heading = "Diffusion")]
+    pub clock_dropout: f64,
     /// Probability that a window goes without its style, with --style.
     #[arg(long, value_name = "P", default_value_t = 0.1, help_heading = "Diffusion")]
     pub style_dropout: f64,
@@ -248,6 +271,7 @@ impl NetworkParams {
             time_embed_dim: self.time_embed_dim.unwrap_or(preset.time_embed_dim),
             context_dim: self.context_dim.unwrap_or(preset.context_dim),
             add_audio: !self.attention_only,
+            clock: !self.no_clock,
             style_dim: if self.style { STYLE_DIM } else { 0 },
             dropout: self.dropout.unwrap_or(preset.dropout),
             n_steps: timesteps,
@@ -320,6 +344,12 @@ impl ConfigParams {
                     loss: d.loss,
                     huber_delta: d.huber_delta,
                     min_snr_gamma: d.min_snr_gamma,
+                    channels: ChannelWeights { style: d.style_weight, vertical: d.vertical_weight },
+                    estimate: EstimateLosses {
+                        velocity: d.velocity_loss,
+                        acceleration: d.acceleration_loss,
+                        differences: d.difference_losses.clone().try_into().unwrap_or_default(),
+                    },
                 },
                 augmentation: Augmentation {
                     condition_noise: a.condition_noise,
@@ -328,6 +358,7 @@ impl ConfigParams {
                     stretch: a.time_stretch,
                 },
                 condition_dropout: d.condition_dropout,
+                clock_dropout: d.clock_dropout,
                 style_dropout: d.style_dropout,
                 batch_size: o.batch_size.get(),
                 accumulate: o.accumulate.get(),

@@ -37,8 +37,8 @@ struct Digested<'a> {
     feature_scale: &'a FeatureScale,
     settings: &'a MotionSettings,
     seed: u64,
-    /// Phrase, first frame, and digests of features and phase.
-    windows: Vec<(&'a str, usize, String, Option<String>)>,
+    /// Phrase, first frame, and digests of features, phase and clock.
+    windows: Vec<(&'a str, usize, String, Option<String>, Option<String>)>,
 }
 
 /// Returns the digest of a baseline.
@@ -50,7 +50,10 @@ pub fn digest_of(baseline: Baseline, request: &Request, settings: &MotionSetting
             .phase
             .as_ref()
             .map(|phase| digest(&phase.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>()));
-        (window.first_frame, digest(&features), phase)
+        let clock = window.clock.as_ref().filter(|_| card.unet.clock);
+        let clock = clock
+            .map(|clock| digest(&clock.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>()));
+        (window.first_frame, digest(&features), phase, clock)
     };
     let digested = Digested {
         version: VERSION,
@@ -68,8 +71,8 @@ pub fn digest_of(baseline: Baseline, request: &Request, settings: &MotionSetting
             .windows
             .iter()
             .map(|w| {
-                let (first, features, phase) = window(w);
-                (w.phrase_id.as_str(), first, features, phase)
+                let (first, features, phase, clock) = window(w);
+                (w.phrase_id.as_str(), first, features, phase, clock)
             })
             .collect(),
     };

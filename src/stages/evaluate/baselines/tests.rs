@@ -92,6 +92,7 @@ fn model_in(folder: &Path, config: UNetConfig) -> OpenModel {
         normalizer,
         feature_scale: scale,
         motion_range: None,
+        sampling: None,
         licence: String::new(),
         files,
     };
@@ -116,6 +117,7 @@ fn windows() -> Vec<MusicWindow> {
             first_frame,
             features: music(seed, n),
             phase: (seed != 1).then(|| (0..n).map(|t| t as f64 / 60.0).collect()),
+            clock: None,
         })
         .collect()
 }
@@ -245,13 +247,12 @@ fn with_its_zeros_a_fresh_network_says_the_same_for_every_input() {
     let model = model_in(folder.path(), unet_config());
     let one = NonZeroUsize::MIN;
     let drawn = model.untrained(one, one).expect("an engine");
-    let (unet, list) = UNet1D::new(&model.card.unet);
+    let (_, list) = UNet1D::new(&model.card.unet);
     let (decoder, decoder_list) = MotionDecoder::new(&model.card.decoder);
     let fresh = EagerEngine::new(
-        (unet, Parameters::new(list, 0)),
+        (&model.card.unet, Parameters::new(list, 0)),
         (decoder, Parameters::new(decoder_list, 0)),
-        false,
-        FeatureScale::identity(FEATURE_DIM),
+        &FeatureScale::identity(FEATURE_DIM),
         (one, one),
     )
     .expect("an engine");
