@@ -69,6 +69,11 @@ pub fn clock(phase: &[f64], beats_per_bar: u32) -> Array2<f32> {
     clock
 }
 
+/// Returns whether a phase tells the clock of some frame.
+pub fn is_known(phase: &[f64], beats_per_bar: u32) -> bool {
+    clock(phase, beats_per_bar).column(CLOCK_DIM - 1).iter().any(|&known| known == 1.0)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -267,7 +267,7 @@ fn the_documented_python_samples_what_motiongen_samples() {
          {}\n\
          import onnx\n\
          for name in ('unet', 'decoder'):\n    onnx.checker.check_model(f'models/demo/{{name}}.onnx', full_check=True)\n\
-         for name, x in dict(noise=noise, audio=audio, motion=motion).items():\n    \
+         for name, x in dict(noise=noise, audio=audio, clock=clock, motion=motion).items():\n    \
          np.ascontiguousarray(x, dtype='<f4').tofile(name)\n",
         documented("python")
     );
@@ -278,8 +278,13 @@ fn the_documented_python_samples_what_motiongen_samples() {
         let bytes = bytes(&folder.join(name));
         bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
     };
-    let (noise, audio, motion) = (floats_of("noise"), floats_of("audio"), floats_of("motion"));
-    let wanted = sampled_by_motiongen(&store.join("models/m"), &noise, &audio);
+    let [noise, audio, clock, motion] = ["noise", "audio", "clock", "motion"].map(floats_of);
+    let times_s: Vec<f64> = (0..120).map(|t| f64::from(t) / 30.0).collect();
+    let phase = motiongen::motion::phase::bar_phase_at_tempo(&times_s, 124.0, 0.5, 4);
+    let own: Vec<f32> = motiongen::motion::clock(&phase, 4).into_iter().collect();
+    // Of single precision.
+    assert!(max_difference(&clock, &own) <= 1e-5, "{clock:?} {own:?}");
+    let wanted = sampled_by_motiongen(&store.join("models/m"), &noise, [&audio, &clock]);
     assert_eq!(motion.len(), 120 * 25);
     // Twenty steps of single precision; accelerations reach 100 m/s².
     let difference = max_difference(&motion, &wanted);
@@ -289,7 +294,7 @@ fn the_documented_python_samples_what_motiongen_samples() {
 }
 
 /// Samples by this program: the session of a file, the sampler of the room `diffusion`.
-fn sampled_by_motiongen(folder: &Path, noise: &[f32], audio: &[f32]) -> Vec<f32> {
+fn sampled_by_motiongen(folder: &Path, noise: &[f32], [audio, clock]: [&[f32]; 2]) -> Vec<f32> {
     use motiongen::diffusion::{DiffusionError, SamplerConfig, Schedule, Spacing, sample};
     use motiongen::generation::ModelCard;
     use motiongen::onnx::{DecoderNames, Session, UNetNames};
@@ -309,6 +314,7 @@ fn sampled_by_motiongen(folder: &Path, noise: &[f32], audio: &[f32]) -> Vec<f32>
             floats(UNetNames::X, &[1, 120, 25], x.as_slice().expect("in order")),
             integers(UNetNames::T, &[t as i64]),
             floats(UNetNames::AUDIO, &[1, 120, 163], audio),
+            floats(UNetNames::CLOCK, &[1, 120, 10], clock),
         ];
         let (_, y) = unet.run(&inputs, UNetNames::PREDICTION).expect("a prediction");
         Ok(Array3::from_shape_vec((1, 120, 25), y).expect("a motion"))
