@@ -12,7 +12,9 @@ use super::outputs::Format;
 use super::settings::{MotionSettings, OUTPUT_VERSION};
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
 use crate::generation::{ModelCard, OVERLAP_FRAMES};
-use crate::motion::postprocess::{Coherence, Hemisphere, PostProcessConfig, SavitzkyGolay};
+use crate::motion::postprocess::{
+    Coherence, FusionVariances, Hemisphere, PostProcessConfig, SavitzkyGolay,
+};
 use crate::motion::rates::MotionRange;
 use crate::motion::style::STYLE_DIM;
 use crate::motion::{Channel, ChannelLimits};
@@ -165,15 +167,15 @@ pub struct PostProcessParams {
     /// Leave the phase as it was decoded, instead of the phase of the music's bars.
     #[arg(long, help_heading = "Post-processing")]
     pub decoded_phase: bool,
-    /// Velocities, accelerations and angular velocities: as decoded, half of each as in the reference, or
-    /// derived from positions and orientations.
+    /// Velocities, accelerations and angular velocities: as decoded, half of each as in the reference, derived
+    /// from positions and orientations, or fused with them by least squares and then derived.
     #[arg(long, value_enum, default_value_t = Coherence::Derive, help_heading = "Post-processing")]
     pub coherence: Coherence,
     /// Frames of the reference's moving average; an odd number [default: none]
     #[arg(long, value_name = "N", help_heading = "Post-processing")]
     pub moving_average: Option<usize>,
-    /// Smooths by polynomials of an order over a window of frames; 0 for none [default: 11,3 with --coherence
-    /// derive]
+    /// Smooths by polynomials of an order over a window of frames; 0 for none; with --coherence derive or
+    /// fuse [default: 11,3 with derive]
     #[arg(long, value_name = "WINDOW,ORDER", value_delimiter = ',', num_args = 1..,
           help_heading = "Post-processing")]
     pub savitzky_golay: Vec<usize>,
@@ -206,6 +208,7 @@ impl PostProcessParams {
                 [window, order] => Some(SavitzkyGolay { window, order }),
                 _ => bail!("--savitzky-golay takes two numbers: WINDOW,ORDER, such as 7,3"),
             },
+            fusion_variances: (self.coherence == Coherence::Fuse).then(FusionVariances::default),
             range: range.filter(|range| range.is_sound() && !self.any_speed),
             ..PostProcessConfig::default()
         };
