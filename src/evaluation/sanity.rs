@@ -7,7 +7,7 @@
 use ndarray::ArrayView2;
 
 use crate::motion::phase::WRAP_BARS;
-use crate::motion::postprocess::{Coherence, PostProcessConfig};
+use crate::motion::postprocess::PostProcessConfig;
 use crate::motion::quaternion::{Quaternion, angular_velocity, dot, normalize};
 use crate::motion::{Channel, ChannelLimits};
 use crate::units::FPS;
@@ -181,7 +181,7 @@ pub fn checks(frames: ArrayView2<f32>, limits: ChannelLimits) -> Vec<Check> {
 ///
 /// `has_phase` tells whether the phase of the music was known, to which `relock_phase` sets that of the motion.
 pub fn holds_by_construction(check: &str, config: &PostProcessConfig, has_phase: bool) -> bool {
-    let is_derived = config.coherence == Coherence::Derive;
+    let is_derived = config.coherence.derives();
     let is_relocked = config.relock_phase && has_phase;
     match check {
         "velocity" | "acceleration" | "angular_velocity" | "velocity_coherence"

@@ -6,6 +6,7 @@ use super::LearnedFrom;
 use crate::audio::{FEATURE_DIM, FeatureScale, feature_names};
 use crate::diffusion::DiffusionConfig;
 use crate::model::{DecoderConfig, UNetConfig};
+use crate::motion::postprocess::FusionVariances;
 use crate::motion::rates::MotionRange;
 use crate::motion::{CHANNEL_NAMES, Normalizer};
 use crate::onnx::Storage;
@@ -68,6 +69,8 @@ pub struct ModelCard {
 pub struct SamplingDefaults {
     /// With which the motion that is locked to the bar is as large as that of real motion.
     pub guidance: f64,
+    /// Of the errors that the decoder leaves, by which post-processing weighs its channels.
+    pub fusion_variances: FusionVariances,
 }
 
 /// Guidance of models whose card tells none, as release 0.1 sampled them.
@@ -166,6 +169,19 @@ impl ModelCard {
         let config = |problem: String| CardError::Config { place: place(), problem };
         card.unet.check().map_err(|e| config(e.to_string()))?;
         card.diffusion.check().map_err(|e| config(e.to_string()))?;
+        if let Some(sampling) = &card.sampling {
+            if !(sampling.guidance.is_finite() && sampling.guidance >= 0.0) {
+                return Err(config(format!(
+                    "guidance is {}; it must be 0 or more; export the model again",
+                    sampling.guidance
+                )));
+            }
+            if let Some((name, variance)) = sampling.fusion_variances.unsound() {
+                return Err(config(format!(
+                    "{name} of fusion_variances is {variance}; it must be above 0; export the model again"
+                )));
+            }
+        }
         if card.window_frames < 2 {
             return Err(config("window_frames is below 2; export the model again".to_owned()));
         }
@@ -175,6 +191,11 @@ impl ModelCard {
     /// Returns the guidance that the model is sampled with unless the user says otherwise.
     pub fn guidance(&self) -> f64 {
         self.sampling.as_ref().map_or(GUIDANCE_WITHOUT_CARD, |sampling| sampling.guidance)
+    }
+
+    /// Returns the variances of the decoder's errors; none where they were not measured.
+    pub fn fusion_variances(&self) -> Option<FusionVariances> {
+        self.sampling.as_ref().map(|sampling| sampling.fusion_variances)
     }
 
     /// Returns a file's entry.

@@ -2,8 +2,10 @@
 
 use ndarray::{Array2, ArrayView2};
 
+use crate::motion::postprocess::Held;
 use crate::motion::quaternion::{
-    Quaternion, angular_velocity, dot, from_axis_angle, make_sign_continuous, mul, normalize,
+    Quaternion, angular_velocity, dot, from_axis_angle, from_rotation_vector, make_sign_continuous,
+    mul, normalize,
 };
 use crate::motion::{CHANNEL_NAMES, Channel, ChannelLimits, MOTION_DIM, Placement, channel_unit};
 use crate::units::frames_to_s;
@@ -213,6 +215,23 @@ impl Constraints {
         }
     }
 
+    /// Returns the poses that are asked for, which post-processing may leave as they are once motion is bent
+    /// to them.
+    pub fn held(&self, n_frames: usize) -> Held {
+        let mut held =
+            Held { position: vec![[false; 3]; n_frames], orientation: vec![false; n_frames] };
+        for (t, wanted) in self.in_range(0, n_frames) {
+            match wanted {
+                Wanted::Value { channel, .. } if Channel::Position.range().contains(&channel) => {
+                    held.position[t][channel - Channel::Position.range().start] = true;
+                }
+                Wanted::Orientation(_) => held.orientation[t] = true,
+                Wanted::Value { .. } => {}
+            }
+        }
+        held
+    }
+
     /// Returns how far a track's motion, `[T, 25]` in the world, is from each constraint.
     pub fn errors(&self, frames: ArrayView2<f32>) -> Vec<Miss> {
         let error = |(t, wanted): (usize, Wanted)| Miss {
@@ -276,13 +295,6 @@ fn orientation(frames: ArrayView2<f32>, t: usize) -> Quaternion {
 /// The rotation that turns `from` into `to`, as its axis times its angle, along the shorter arc.
 fn rotation_vector(to: Quaternion, from: Quaternion) -> [f64; 3] {
     angular_velocity(from, to, 1.0)
-}
-
-/// The inverse of [`rotation_vector`]: exp(v / 2).
-fn from_rotation_vector(v: [f64; 3]) -> Quaternion {
-    let angle = v.iter().map(|x| x * x).sum::<f64>().sqrt();
-    let factor = if angle < 1e-12 { 0.5 } else { (angle / 2.0).sin() / angle };
-    [(angle / 2.0).cos(), v[0] * factor, v[1] * factor, v[2] * factor]
 }
 
 /// Returns constraints that make a track begin as another motion ends: its last `n` frames are the first.
@@ -349,6 +361,11 @@ mod tests {
         let w = 1.0 - u * u * (3.0 - 2.0 * u);
         let expected = 1.0 + 1.0 * w - 0.5 * (1.0 - w);
         assert!((f64::from(frames[[54, 0]]) - expected).abs() < 1e-6, "{}", frames[[54, 0]]);
+        let held = asked.held(60);
+        let frames_held =
+            |axis: usize| (0..60).filter(|t| held.position[*t][axis]).collect::<Vec<_>>();
+        assert_eq!((frames_held(0), frames_held(1)), (vec![50, 57], vec![]));
+        assert!((0..60).all(|t| held.orientation[t] == (t == 30)));
         let before = standing(101);
         assert_eq!(frames[[35, 0]], 1.0, "15 frames before the first nothing is left of it");
         assert_eq!(frames.row(72), before.row(72));

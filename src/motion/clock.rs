@@ -46,8 +46,9 @@ pub fn clock(phase: &[f64], beats_per_bar: u32) -> Array2<f32> {
     let n = phase.len();
     let mut clock = Array2::zeros((n, CLOCK_DIM));
     let bars = unwrapped(phase);
-    let falls = bars.windows(2).any(|pair| !(pair[1] - pair[0] >= -MAX_FALL_BARS));
-    if n < 2 || falls || beats_per_bar == 0 {
+    // A difference with NaN is not above anything.
+    let rises = bars.windows(2).all(|pair| pair[1] - pair[0] >= -MAX_FALL_BARS);
+    if n < 2 || !rises || beats_per_bar == 0 {
         return clock;
     }
     let beats = f64::from(beats_per_bar);

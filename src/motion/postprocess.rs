@@ -1,29 +1,39 @@
 //! Post-processing: what a decoder says becomes motion that keeps the rules of the format.
 //!
 //! The steps come in the order of the reference design (section 9): values, quaternions, smoothing
-//! of quaternions, phase, coherence, smoothing. [`Coherence::Derive`] alone comes after smoothing:
-//! derived before, velocities would belong to positions that smoothing then moves.
+//! of quaternions, phase, coherence, smoothing. What is derived, by [`Coherence::Derive`] and
+//! [`Coherence::Fuse`], alone comes after smoothing: derived before, velocities would belong to positions
+//! that smoothing then moves. Fusion itself comes where coherence does, before the limits of speed.
 //!
 //! Nothing that is not finite is mended: no step puts a finite number where NaN or an infinity was,
 //! so that the checks find it. Neither are derived values held within limits: held, they would no longer
 //! be differences. It is poses that are held, where a range says how fast they may change.
 
+mod banded;
 mod config;
+mod fusion;
+#[cfg(test)]
+mod noise;
 mod orientation;
 mod smoothing;
 #[cfg(test)]
 mod tests;
+mod turning;
+mod variances;
 
 use ndarray::{Array2, s};
 
 pub use config::{
     Coherence, Hemisphere, MAX_WINDOW_FRAMES, PostProcessConfig, PostProcessError, SavitzkyGolay,
 };
+pub use fusion::{Displacement, Held};
+pub use variances::{AxisVariances, FusionVariances};
 
 use super::channels::{Channel, MOTION_DIM};
 use super::kinematics::{Poses, forward_differences, frames_of};
 use super::phase::WRAP_BARS;
 use super::quaternion::Quaternion;
+use fusion::Measured;
 use smoothing::{Polynomials, moving_average};
 
 /// Channel groups that the reference clamps and smooths: all that are vectors.
@@ -43,6 +53,23 @@ const DERIVED: [Channel; 3] = [Channel::Velocity, Channel::Acceleration, Channel
 /// When there are other than 25 channels, another number of phases than frames, or the
 /// configuration does not pass [`PostProcessConfig::check`].
 pub fn process(config: &PostProcessConfig, frames: &mut Array2<f32>, phase: Option<&[f64]>) {
+    process_holding(config, frames, phase, &Held::default());
+}
+
+/// Processes motion as [`process`] does, with some poses held where [`Coherence::Fuse`] moves others;
+/// returns how far it moved them.
+///
+/// Held are values as the frames have them when fusion comes to them. Other steps that move poses
+/// (smoothing, limits of speed) hold none.
+///
+/// # Panics
+/// As [`process`].
+pub fn process_holding(
+    config: &PostProcessConfig,
+    frames: &mut Array2<f32>,
+    phase: Option<&[f64]>,
+    held: &Held,
+) -> Option<Displacement> {
     assert_eq!(frames.ncols(), MOTION_DIM, "channels of motion");
     if config.clamp_values {
         for channel in VECTORS {
@@ -63,6 +90,7 @@ pub fn process(config: &PostProcessConfig, frames: &mut Array2<f32>, phase: Opti
     if config.apply_smoothing {
         smooth_columns(frames, &VECTORS, |x| moving_average(x, config.smoothing_kernel_size));
     }
+    let displacement = (config.coherence == Coherence::Fuse).then(|| fuse(config, frames, held));
     limit(config, frames);
     if let Some(SavitzkyGolay { window, order }) = config.savitzky_golay {
         let polynomials = Polynomials::new(window, order, frames.nrows());
@@ -72,9 +100,27 @@ pub fn process(config: &PostProcessConfig, frames: &mut Array2<f32>, phase: Opti
         write_quaternions(config, frames, q);
         limit(config, frames);
     }
-    if config.coherence == Coherence::Derive {
+    if config.coherence.derives() {
         derive(frames);
     }
+    displacement
+}
+
+/// Puts the poses that agree best with all that was decoded in the place of the decoded ones.
+fn fuse(config: &PostProcessConfig, frames: &mut Array2<f32>, held: &Held) -> Displacement {
+    let variances = config.fusion_variances.unwrap_or_default();
+    let measured = Measured::of(frames.view());
+    let shifts_m = measured.shifts(&variances, held);
+    let mut position_m = measured.position.clone();
+    for (p, shift) in position_m.as_flattened_mut().iter_mut().zip(shifts_m.as_flattened()) {
+        *p += shift;
+    }
+    write_vectors(frames, Channel::Position, &position_m);
+    let q = measured.orientations(&variances, held);
+    let angle = |(from, to)| Displacement::angle(from, to);
+    let turns_rad: Vec<f64> = measured.orientation.iter().zip(&q).map(angle).collect();
+    write_quaternions(config, frames, q);
+    Displacement::new(&shifts_m, &turns_rad)
 }
 
 /// Holds poses to the speeds that they may have.
@@ -82,11 +128,7 @@ fn limit(config: &PostProcessConfig, frames: &mut Array2<f32>) {
     let Some(range) = config.range else { return };
     let mut position_m = vectors(frames, Channel::Position);
     range.limit_positions(&mut position_m);
-    for (mut row, p) in frames.rows_mut().into_iter().zip(position_m) {
-        for (i, x) in Channel::Position.range().zip(p) {
-            row[i] = x as f32;
-        }
-    }
+    write_vectors(frames, Channel::Position, &position_m);
     let mut q = quaternions(frames);
     range.limit_orientations(&mut q);
     write_quaternions(config, frames, q);
@@ -216,6 +258,14 @@ fn quaternions(frames: &Array2<f32>) -> Vec<Quaternion> {
     let of_row =
         |row: ndarray::ArrayView1<'_, f32>| std::array::from_fn(|c| f64::from(row[start + c]));
     frames.rows().into_iter().map(of_row).collect()
+}
+
+fn write_vectors(frames: &mut Array2<f32>, channel: Channel, vectors: &[[f64; 3]]) {
+    for (mut row, x) in frames.rows_mut().into_iter().zip(vectors) {
+        for (i, &x) in channel.range().zip(x) {
+            row[i] = x as f32;
+        }
+    }
 }
 
 /// Stores quaternions, with the signs of the configuration where it has the say.

@@ -57,6 +57,14 @@ pub fn from_axis_angle(axis: [f64; 3], angle_rad: f64) -> Quaternion {
     [cosine, axis[0] * sine, axis[1] * sine, axis[2] * sine]
 }
 
+/// Rotation by a vector, its axis times its angle: `exp(v / 2)`, the inverse of
+/// [`angular_velocity`]`(`[`IDENTITY`]`, q, 1)` up to half a turn.
+pub fn from_rotation_vector(v: [f64; 3]) -> Quaternion {
+    let angle = v.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let factor = if angle < 1e-12 { 0.5 } else { (angle / 2.0).sin() / angle };
+    [(angle / 2.0).cos(), v[0] * factor, v[1] * factor, v[2] * factor]
+}
+
 /// Flips signs so that `q[t] · q[t+1] >= 0` and the first `w >= 0`; the rotations stay the same.
 pub fn make_sign_continuous(q: &mut [Quaternion]) {
     for t in 1..q.len() {
@@ -157,6 +165,14 @@ mod tests {
         assert_eq!(angular_velocity(IDENTITY, IDENTITY, 30.0), [0.0; 3]);
         let tiny = from_axis_angle([0.0, 0.0, 1.0], 1e-10);
         assert_close(&angular_velocity(IDENTITY, tiny, 30.0), &[0.0, 0.0, 3e-9], 1e-22);
+    }
+
+    #[test]
+    fn a_rotation_vector_is_an_axis_times_an_angle() {
+        let q = from_rotation_vector([0.6 * 2.5, 0.0, 0.8 * 2.5]);
+        assert_close(&q, &from_axis_angle([0.6, 0.0, 0.8], 2.5), 1e-15);
+        assert_eq!(from_rotation_vector([0.0; 3]), IDENTITY);
+        assert_close(&from_rotation_vector([2e-13, 0.0, 0.0]), &[1.0, 1e-13, 0.0, 0.0], 1e-25);
     }
 
     #[test]

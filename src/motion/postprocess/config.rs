@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::variances::FusionVariances;
 use crate::motion::channels::Channel;
 use crate::motion::rates::MotionRange;
 use crate::motion::trajectory::ChannelLimits;
@@ -35,6 +36,9 @@ pub enum Coherence {
     /// All three are derived from position and orientation.
     #[default]
     Derive,
+    /// Positions and orientations become those that agree best with all that was decoded, by least squares;
+    /// then all three are derived from them.
+    Fuse,
 }
 
 impl Coherence {
@@ -44,7 +48,13 @@ impl Coherence {
             Self::Keep => "keep",
             Self::Blend => "blend",
             Self::Derive => "derive",
+            Self::Fuse => "fuse",
         }
+    }
+
+    /// Returns whether velocity, acceleration and angular velocity are derived from poses.
+    pub const fn derives(self) -> bool {
+        matches!(self, Self::Derive | Self::Fuse)
     }
 }
 
@@ -108,11 +118,15 @@ pub struct PostProcessConfig {
     pub apply_smoothing: bool,
     /// Frames of the moving average, odd, up to [`MAX_WINDOW_FRAMES`].
     pub smoothing_kernel_size: usize,
-    /// How positions and orientations are smoothed by polynomials, after the moving average; needs
-    /// [`Coherence::Derive`].
+    /// How positions and orientations are smoothed by polynomials, after the moving average and after fusion;
+    /// needs a coherence that derives velocities. [`Coherence::Fuse`] does not need it, and may have it.
     pub savitzky_golay: Option<SavitzkyGolay>,
     /// How fast the body may move and turn; before and after smoothing, which carries over its peaks.
     pub range: Option<MotionRange>,
+    /// What [`Coherence::Fuse`] weighs by; none for [`FusionVariances::default`]. No other coherence looks at
+    /// it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub fusion_variances: Option<FusionVariances>,
 }
 
 impl Default for PostProcessConfig {
@@ -138,14 +152,22 @@ impl Default for PostProcessConfig {
             smoothing_kernel_size: 3,
             savitzky_golay: None,
             range: None,
+            fusion_variances: None,
         }
     }
 }
 
 impl PostProcessConfig {
-    /// Returns the configuration without any step that moves poses, for motion that was smoothed before.
+    /// Returns the configuration without any step that moves poses, for motion that was smoothed or fused
+    /// before.
     pub fn without_smoothing(&self) -> Self {
+        let coherence = match self.coherence {
+            // What was fused is the poses; what follows from them may be derived again.
+            Coherence::Fuse => Coherence::Derive,
+            other => other,
+        };
         Self {
+            coherence,
             smooth_quaternions: false,
             apply_smoothing: false,
             savitzky_golay: None,
@@ -187,11 +209,14 @@ impl PostProcessConfig {
             if order >= window {
                 return Err(PostProcessError::Order { order, window, highest: window - 1 });
             }
-            if self.coherence != Coherence::Derive {
+            if !self.coherence.derives() {
                 return Err(PostProcessError::NotDerived { coherence: self.coherence.name() });
             }
         }
-        Ok(())
+        match self.fusion_variances.and_then(|variances| variances.unsound()) {
+            Some((name, variance)) => Err(PostProcessError::Variance { name, variance }),
+            None => Ok(()),
+        }
     }
 }
 
@@ -229,7 +254,12 @@ pub enum PostProcessError {
     Order { order: usize, window: usize, highest: usize },
     #[error(
         "savitzky_golay smooths positions and orientations, and coherence is {coherence}, which \
-         leaves velocities that no longer belong to them; set coherence to derive"
+         leaves velocities that no longer belong to them; set coherence to derive or fuse"
     )]
     NotDerived { coherence: &'static str },
+    #[error(
+        "{name} of fusion_variances is {variance}; fusion divides by it, so give a number above 0, a very \
+         large one for what shall not count"
+    )]
+    Variance { name: &'static str, variance: f64 },
 }

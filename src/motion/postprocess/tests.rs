@@ -307,13 +307,13 @@ fn what_is_not_finite_stays_to_be_found() {
 #[test]
 fn no_frames_and_one_frame_are_fine() {
     let savitzky_golay = Some(SavitzkyGolay { window: 9, order: 3 });
-    for coherence in [Coherence::Derive, Coherence::Blend] {
+    for coherence in [Coherence::Derive, Coherence::Fuse, Coherence::Blend] {
         let config = PostProcessConfig {
             coherence,
             smooth_quaternions: true,
             enforce_phase_monotonic: true,
             apply_smoothing: true,
-            savitzky_golay: savitzky_golay.filter(|_| coherence == Coherence::Derive),
+            savitzky_golay: savitzky_golay.filter(|_| coherence.derives()),
             ..PostProcessConfig::default()
         };
         for n in [0, 1] {
@@ -356,7 +356,16 @@ fn settings_without_sense_are_refused_in_a_sentence() {
             config.savitzky_golay = Some(SavitzkyGolay { window: 5, order: 2 });
         }),
         "savitzky_golay smooths positions and orientations, and coherence is keep, which leaves \
-         velocities that no longer belong to them; set coherence to derive"
+         velocities that no longer belong to them; set coherence to derive or fuse"
+    );
+    assert_eq!(
+        refusal(&|config| {
+            let mut variances = FusionVariances::default();
+            variances.orientation_rad2.vertical = -1.0;
+            config.fusion_variances = Some(variances);
+        }),
+        "orientation_rad2 of fusion_variances is -1; fusion divides by it, so give a number above 0, a \
+         very large one for what shall not count"
     );
     assert_eq!(
         refusal(&|config| (config.phase_min, config.phase_max) = (0.5, 0.25)),
@@ -393,7 +402,7 @@ fn a_configuration_is_read_by_name_and_defaults_to_ours() {
     let text = serde_json::to_string(&config).expect("a configuration");
     assert_eq!(read(&text).expect("what was written"), config);
     assert!(read(r#"{"max_position": 100.0}"#).is_err());
-    for coherence in [Coherence::Keep, Coherence::Blend, Coherence::Derive] {
+    for coherence in [Coherence::Keep, Coherence::Blend, Coherence::Derive, Coherence::Fuse] {
         let text = serde_json::to_string(&coherence).expect("a name");
         assert_eq!(text, format!("\"{}\"", coherence.name()));
     }

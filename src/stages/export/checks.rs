@@ -96,7 +96,7 @@ impl Checking<'_> {
         let decoder = path(file_names::DECODER);
         let onnx = OnnxEngine::open(runtime, (&unet, false), &decoder, &network.unet, plan)?;
         // What the files hold, which rounding has changed.
-        let eager = self.eager(
+        let of_files = (
             self.read_back(
                 file_names::UNET,
                 file_names::UNET_WEIGHTS,
@@ -107,7 +107,10 @@ impl Checking<'_> {
                 file_names::DECODER_WEIGHTS,
                 MotionDecoder::new(&network.decoder).1,
             )?,
-        )?;
+        );
+        let threads = machine.threads;
+        let eager_of = |weights| eager(self.trained, weights, threads);
+        let of_files = eager_of(of_files)?;
         let music = self.music()?;
         let schedule = Schedule::new(&network.diffusion)?;
         let window = network.window_frames;
@@ -117,7 +120,7 @@ impl Checking<'_> {
         progress.start("check", "checks", cases.len() as u64 + 3 + u64::from(is_rounded));
         let mut rows = Vec::new();
         for case in &cases {
-            rows.push(self.forward(&onnx, &eager, &music, case, schedule.len())?);
+            rows.push(self.forward(&onnx, &of_files, &music, case, schedule.len())?);
             progress.advance(1);
         }
         let case = Case { n_samples: 2, n_frames: window };
@@ -128,20 +131,19 @@ impl Checking<'_> {
             clip: true,
         };
         let asked = |guidance| Sampling { config: &config, schedule: &schedule, guidance };
-        let (row, latent) = self.sampled("sample", &onnx, &eager, &music, &case, asked(1.0))?;
+        let (row, latent) = self.sampled("sample", &onnx, &of_files, &music, &case, asked(1.0))?;
         rows.push(row);
         progress.advance(1);
-        rows.push(self.decoded(&onnx, &eager, latent.view())?);
+        rows.push(self.decoded(&onnx, &of_files, latent.view())?);
         progress.advance(1);
         let guided = asked(GUIDANCE);
-        rows.push(self.sampled("guided_sample", &onnx, &eager, &music, &case, guided)?.0);
+        rows.push(self.sampled("guided_sample", &onnx, &of_files, &music, &case, guided)?.0);
         progress.advance(1);
         if is_rounded {
-            let trained = self.eager(
-                self.trained.unet.parameters.clone(),
-                self.trained.decoder.parameters.clone(),
-            )?;
-            let (row, _) = self.sampled(ROUNDING, &trained, &eager, &music, &case, asked(1.0))?;
+            let Trained { unet, decoder, .. } = self.trained;
+            let trained = eager_of((unet.parameters.clone(), decoder.parameters.clone()))?;
+            let (row, _) =
+                self.sampled(ROUNDING, &trained, &of_files, &music, &case, asked(1.0))?;
             rows.push(OnnxCheckRow { onnx_s: None, ..row });
             progress.advance(1);
         }
@@ -151,21 +153,6 @@ impl Checking<'_> {
             row.runtime.clone_from(&build);
         }
         Ok(Held { rows, runtime: build })
-    }
-
-    fn eager(
-        &self,
-        unet: Parameters<f32>,
-        decoder: Parameters<f32>,
-    ) -> anyhow::Result<EagerEngine> {
-        let network = &self.trained.state.config.network;
-        let engine = EagerEngine::new(
-            (&network.unet, unet),
-            (MotionDecoder::new(&network.decoder).0, decoder),
-            &self.trained.state.scales.features,
-            (NonZeroUsize::MIN, self.params.machine.threads),
-        );
-        engine.context("while starting threads")
     }
 
     /// Reads weights out of the files, as the eager engine does.
@@ -319,6 +306,22 @@ impl Checking<'_> {
         let row = self.row("decode", &Case { n_samples, n_frames }, difference(a.view(), b.view()));
         Ok(OnnxCheckRow { onnx_s: Some(onnx_s), eager_s, ..row })
     }
+}
+
+/// Makes the engine of our own interpreter for a run's networks, with weights of UNet and decoder.
+pub fn eager(
+    trained: &Trained,
+    (unet, decoder): (Parameters<f32>, Parameters<f32>),
+    n_threads: NonZeroUsize,
+) -> anyhow::Result<EagerEngine> {
+    let network = &trained.state.config.network;
+    let engine = EagerEngine::new(
+        (&network.unet, unet),
+        (MotionDecoder::new(&network.decoder).0, decoder),
+        &trained.state.scales.features,
+        (NonZeroUsize::MIN, n_threads),
+    );
+    engine.context("while starting threads")
 }
 
 fn timed<T, E>(work: impl FnOnce() -> Result<T, E>) -> Result<(T, f64), E> {

@@ -9,8 +9,8 @@ use super::Params;
 use crate::autodiff::Parameters;
 use crate::diffusion::Schedule;
 use crate::generation::{
-    FileEntry, LearnedFrom, MODEL_FORMAT, ModelCard, Networks, Provenance, file_names,
-    own_channels, own_features,
+    FileEntry, LearnedFrom, MODEL_FORMAT, ModelCard, Networks, Provenance, SamplingDefaults,
+    file_names, own_channels, own_features,
 };
 use crate::model::ParameterId;
 use crate::motion::rates::MotionRange;
@@ -35,7 +35,7 @@ impl Files {
     pub fn make(
         trained: &Trained,
         params: &Params,
-        range: Option<MotionRange>,
+        (range, sampling): (Option<MotionRange>, Option<SamplingDefaults>),
         learned_from: Option<LearnedFrom>,
     ) -> anyhow::Result<Self> {
         let config = &trained.state.config.network;
@@ -82,7 +82,7 @@ impl Files {
             normalizer: scales.motion.clone(),
             feature_scale: scales.features.clone(),
             motion_range: range,
-            sampling: None,
+            sampling,
             licence: params.licence.clone(),
             files: Vec::new(),
         };

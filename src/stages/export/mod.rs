@@ -3,12 +3,13 @@
 mod checks;
 mod files;
 mod report;
+mod tuning;
 
 use std::path::PathBuf;
 
 use anyhow::{bail, ensure};
 
-use self::checks::{Checking, Held};
+use self::checks::{Checking, Held, eager};
 use self::files::Files;
 use self::report::{Planned, Report};
 use super::learned;
@@ -94,7 +95,13 @@ impl Stage for Export {
                 params.run
             ));
         }
-        let files = Files::make(&trained, &params, motion_range(&phrases.dataset)?, learned_from)?;
+        let network = &trained.state.config.network;
+        let (unet, decoder) = (&trained.unet.parameters, &trained.decoder.parameters);
+        let engine = eager(&trained, (unet.clone(), decoder.clone()), machine.threads)?;
+        let sampling = tuning::sampling_defaults(&engine, network, &phrases.dataset, progress)?;
+        drop(engine);
+        let measured = (motion_range(&phrases.dataset)?, sampling);
+        let files = Files::make(&trained, &params, measured, learned_from)?;
         if params.dry_run {
             return Ok(Box::new(Planned::new(&params, &files, &store)));
         }

@@ -1,8 +1,8 @@
 //! How a model is best sampled, measured on the songs that its checkpoints were chosen on.
 //!
 //! Guidance exaggerates what the music asks for; a model that hears the clock follows the bar as far as real
-//! motion does with little of it. What is decoded of position, velocity and acceleration has errors that differ
-//! from model to model, by which fusion weighs them.
+//! motion does with little of it. How much decoded positions are worth beside decoded velocities and accelerations
+//! differs from model to model: fusion weighs them so that motion is as fast and as smooth as real motion.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -11,10 +11,13 @@ use ndarray::{Array2, Array3, Axis, s};
 
 use crate::autodiff::Stream;
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
-use crate::evaluation::coupling::{Coupling, CouplingSums, CoupledPassage, Harmonics, Template};
+use crate::evaluation::body::{poses, turn_rates};
+use crate::evaluation::coupling::{CoupledPassage, Coupling, CouplingSums, Harmonics, Template};
+use crate::evaluation::window_range::Posture;
 use crate::generation::{Engine, RUN_WINDOWS, Sampling, SamplingDefaults, sample};
 use crate::model::condition;
 use crate::motion::clock::is_known;
+use crate::motion::kinematics::forward_differences;
 use crate::motion::phase::unwrapped;
 use crate::motion::postprocess::{Coherence, FusionVariances, PostProcessConfig, process};
 use crate::motion::{Channel, MOTION_DIM};
@@ -28,6 +31,9 @@ const N_WINDOWS: usize = 16;
 const GUIDANCES: [f64; 5] = [1.0, 1.5, 2.0, 3.0, 4.0];
 /// Steps of DPM-Solver++, as generate takes them by default.
 const N_STEPS: usize = 10;
+/// Powers of two by which variances are multiplied.
+const MULTIPLES: [f64; 17] =
+    [-8., -7., -6., -5., -4., -3., -2., -1., 0., 1., 2., 3., 4., 5., 6., 7., 8.];
 /// Seed of the noise.
 const SEED: u64 = 17;
 
@@ -74,22 +80,12 @@ pub fn sampling_defaults(
     }
     progress.start("tune", "guidances", GUIDANCES.len() as u64);
     let mut tried: Vec<(f64, f64)> = Vec::new();
-    let mut variances: Option<FusionVariances> = None;
+    let mut variances = FusionVariances::default();
     for guidance in GUIDANCES {
-        let mut decoded = decoded(engine, network, guidance, &windows)?;
-        if variances.is_none() {
-            variances = FusionVariances::of_decoded(decoded.iter().map(|motion| motion.view()));
-        }
-        let postprocess = PostProcessConfig {
-            coherence: Coherence::Fuse,
-            fusion_variances: variances,
-            relock_phase: false,
-            savitzky_golay: None,
-            ..PostProcessConfig::default()
-        };
-        decoded.iter_mut().for_each(|motion| process(&postprocess, motion, None));
+        let decoded = decoded(engine, network, guidance, &windows)?;
+        variances = variances_of(&windows, &decoded);
         progress.advance(1);
-        let Some(locked) = locked(&windows, &decoded) else { break };
+        let Some(locked) = locked(&windows, &fused(&decoded, variances)) else { break };
         tried.push((guidance, locked));
         if locked >= 1.0 {
             break;
@@ -97,10 +93,85 @@ pub fn sampling_defaults(
     }
     progress.finish();
     let guidance = rounded(guidance_of(&tried), 3);
-    Ok(variances.map(|variances| SamplingDefaults {
-        guidance,
-        fusion_variances: variances.map(|variance| rounded(variance, 3)),
-    }))
+    let fusion_variances = variances.map(|variance| rounded(variance, 3));
+    Ok(Some(SamplingDefaults { guidance, fusion_variances }))
+}
+
+/// Returns the variances with which fused motion is as fast and as smooth as real motion of the same music.
+///
+/// How much a decoder's positions and orientations are worth beside its velocities: the multiples 2^k, k = -8 …
+/// 8, of σ_p² and of σ_q² at which `Σ ln²(m̂ / m)` is least, with m the root mean square velocity along each axis
+/// and the mean jerk; the mean turn rate and the mean change of it. Of errors that are not independent from frame
+/// to frame, as those of networks are not, the likelihood's variances gave motion of half the speed.
+fn variances_of(windows: &[Window], decoded: &[Array2<f32>]) -> FusionVariances {
+    let mean = |motions: &[Array2<f32>], of: Moments| {
+        let moments: Vec<Vec<f64>> = motions.iter().map(of).collect();
+        let n = moments.len().max(1) as f64;
+        let width = moments.first().map_or(0, Vec::len);
+        (0..width).map(|i| moments.iter().map(|m| m[i]).sum::<f64>() / n).collect::<Vec<f64>>()
+    };
+    let real: Vec<Array2<f32>> = windows.iter().map(|window| window.motion.clone()).collect();
+    let least = |of: Moments, with: &dyn Fn(f64) -> FusionVariances| {
+        let wanted = mean(&real, of);
+        let miss = |multiple: f64| -> f64 {
+            let found = mean(&fused(decoded, with(multiple)), of);
+            found.iter().zip(&wanted).map(|(found, wanted)| (found / wanted).ln().powi(2)).sum()
+        };
+        let multiples = MULTIPLES.map(f64::exp2);
+        let misses = multiples.map(|multiple| (miss(multiple), multiple));
+        let finite = misses.iter().filter(|(miss, _)| miss.is_finite());
+        finite.min_by(|a, b| a.0.total_cmp(&b.0)).map_or(1.0, |(_, multiple)| *multiple)
+    };
+    let scaled = |position: f64, orientation: f64| {
+        let FusionVariances { position_m2, orientation_rad2, .. } = FusionVariances::default();
+        FusionVariances {
+            position_m2: position_m2.times(position),
+            orientation_rad2: orientation_rad2.times(orientation),
+            ..FusionVariances::default()
+        }
+    };
+    let position = least(path_moments, &|multiple| scaled(multiple, 1.0));
+    let orientation = least(turn_moments, &|multiple| scaled(position, multiple));
+    scaled(position, orientation)
+}
+
+/// Returns numbers of a motion.
+type Moments = fn(&Array2<f32>) -> Vec<f64>;
+
+/// Mean squares of the velocity along x, y and z, and mean jerk.
+fn path_moments(motion: &Array2<f32>) -> Vec<f64> {
+    let Some(posture) = poses(motion.view()).and_then(|poses| Posture::new(&poses)) else {
+        return vec![f64::NAN; 4];
+    };
+    let [x, y, z] = posture.axis_speed_m_s.map(|speed| speed * speed);
+    // The mean of squares is that of speeds over windows; jerk weighs as much as a speed.
+    vec![x, y, z, posture.jerk_m_s3 * posture.jerk_m_s3]
+}
+
+/// Mean turn rate, and mean change of it from frame to frame.
+fn turn_moments(motion: &Array2<f32>) -> Vec<f64> {
+    let Some(poses) = poses(motion.view()) else { return vec![f64::NAN; 2] };
+    let rates = turn_rates(&poses.orientation);
+    let change = forward_differences(&rates);
+    let mean = |values: &[[f64; 3]]| {
+        let lengths = values.iter().map(|x| x.iter().map(|x| x * x).sum::<f64>().sqrt());
+        lengths.sum::<f64>() / values.len().max(1) as f64
+    };
+    vec![mean(&rates), mean(&change)]
+}
+
+/// Returns motions with their poses fused, as post-processing does it.
+fn fused(decoded: &[Array2<f32>], variances: FusionVariances) -> Vec<Array2<f32>> {
+    let postprocess = PostProcessConfig {
+        coherence: Coherence::Fuse,
+        fusion_variances: Some(variances),
+        relock_phase: false,
+        savitzky_golay: None,
+        ..PostProcessConfig::default()
+    };
+    let mut motions = decoded.to_vec();
+    motions.iter_mut().for_each(|motion| process(&postprocess, motion, None));
+    motions
 }
 
 /// Returns the guidance at which the locked amplitude is 1; 1 where it is so without guidance, or unknown.
@@ -176,7 +247,9 @@ fn decoded(
         }
         let start = (x, schedule.len());
         let latent = sample(engine, sampling, start, heard.view(), None, |_, _| (), None)?;
-        made.extend(engine.decode(latent.view())?.axis_iter(Axis(0)).map(|motion| motion.to_owned()));
+        made.extend(
+            engine.decode(latent.view())?.axis_iter(Axis(0)).map(|motion| motion.to_owned()),
+        );
     }
     Ok(made)
 }
@@ -200,17 +273,13 @@ fn locked(windows: &[Window], motions: &[Array2<f32>]) -> Option<f64> {
                 harmonics.add(&window.passage(&rise, &bars));
             }
             let coupling = Coupling::Learned(Template::fit(&[harmonics])?);
-            let coefficient = |motion: &dyn Fn(&(&Window, &Array2<f32>)) -> Vec<f64>| {
-                let mut sums = CouplingSums::default();
-                for danced in song {
-                    let (rise, bars) = (motion(danced), danced.0.bars());
-                    sums.add(&coupling, &danced.0.passage(&rise, &bars));
-                }
-                sums.coefficient(0.0)
-            };
-            let real = coefficient(&|(window, _)| rise_m_s(&window.motion))?;
-            let made = coefficient(&|(_, motion)| rise_m_s(motion))?;
-            Some(made / real).filter(|ratio| ratio.is_finite())
+            let (mut real, mut made) = (CouplingSums::default(), CouplingSums::default());
+            for (window, motion) in song {
+                let bars = window.bars();
+                real.add(&coupling, &window.passage(&rise_m_s(&window.motion), &bars));
+                made.add(&coupling, &window.passage(&rise_m_s(motion), &bars));
+            }
+            Some(made.coefficient(0.0)? / real.coefficient(0.0)?).filter(|ratio| ratio.is_finite())
         })
         .collect();
     (!ratios.is_empty()).then(|| ratios.iter().sum::<f64>() / ratios.len() as f64)

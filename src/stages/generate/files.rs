@@ -195,6 +195,9 @@ fn facts(made: &Made) -> Vec<(String, String)> {
     ];
     facts.extend(row.score.map(|x| ("score", format!("{x:.3}"))));
     facts.extend(row.locking.map(|x| ("bar locking R²", format!("{x:.3}"))));
+    facts.extend(
+        made.displacement.map(|x| ("moved by fusion", format!("{:.1} mm", x.position_rms_mm))),
+    );
     facts.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
 }
 

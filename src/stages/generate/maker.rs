@@ -10,7 +10,7 @@ use crate::generation::{
     Constrained, Constraints, EngineError, Generator, ModelCard, Primed, Track,
 };
 use crate::model::condition;
-use crate::motion::postprocess::process;
+use crate::motion::postprocess::{Displacement, process, process_holding};
 use crate::motion::{Beats, Channel, MOTION_DIM, bar_phase, clock};
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::retrieval::{Primer, Priming};
@@ -38,6 +38,8 @@ pub struct Made {
     /// The same motion as it was decoded, before post-processing, \[T, 25\].
     pub decoded: Array2<f32>,
     pub rows: Vec<GenerationRow>,
+    /// How far fusion moved its poses, where they were fused.
+    pub displacement: Option<Displacement>,
     pub seconds: f64,
 }
 
@@ -98,6 +100,8 @@ impl Maker<'_> {
         let clock = clock.as_ref().map(|clock| clock.view());
         let heard = condition(&self.card.unet, music.features, clock);
         let priming = self.priming(music)?;
+        let kept = constraints.as_ref().filter(|_| !self.settings.soft);
+        let held = kept.map(|constraints| constraints.held(n_frames)).unwrap_or_default();
         let mut best: Option<Candidate> = None;
         let mut rows = Vec::with_capacity(self.settings.best_of);
         for candidate in 0..self.settings.best_of {
@@ -118,9 +122,9 @@ impl Maker<'_> {
                 derivative_error(decoded.view(), Channel::Position, Channel::Velocity);
             let mut frames = decoded.clone();
             let postprocess = &self.settings.postprocess;
-            process(postprocess, &mut frames, bars);
-            if let Some(constraints) = constraints.as_ref().filter(|_| !self.settings.soft) {
-                // Smoothing has moved it, by millimetres; what follows from poses follows again.
+            let displacement = process_holding(postprocess, &mut frames, bars, &held);
+            if let Some(constraints) = kept {
+                // Smoothing and limits have moved it, by millimetres; what follows from poses follows again.
                 constraints.bend(&mut frames, 0, 1.0);
                 process(&postprocess.without_smoothing(), &mut frames, bars);
             }
@@ -153,13 +157,14 @@ impl Maker<'_> {
             // The first of equals, so that one candidate more changes nothing else.
             let value = score.total.unwrap_or(f64::NEG_INFINITY);
             if best.as_ref().is_none_or(|known| value > known.value) {
-                best = Some(Candidate { value, candidate, frames, decoded });
+                best = Some(Candidate { value, candidate, frames, decoded, displacement });
             }
         }
-        let Candidate { candidate, frames, decoded, .. } =
+        let Candidate { candidate, frames, decoded, displacement, .. } =
             best.expect("at least one candidate is sampled");
         rows[candidate].selected = true;
-        Ok(Made { frames, decoded, rows, seconds: started.elapsed().as_secs_f64() })
+        let seconds = started.elapsed().as_secs_f64();
+        Ok(Made { frames, decoded, rows, displacement, seconds })
     }
 
     fn constraints(&self, music: &Music) -> Result<Option<Constraints>, Failure> {
@@ -269,6 +274,7 @@ struct Candidate {
     candidate: usize,
     frames: Array2<f32>,
     decoded: Array2<f32>,
+    displacement: Option<Displacement>,
 }
 
 /// What was found of a candidate.

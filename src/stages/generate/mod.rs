@@ -178,6 +178,12 @@ struct Done {
     n_frames: u64,
     n_candidates: u64,
     n_checks_failed: u64,
+    /// Frames that were fused.
+    n_fused: u64,
+    /// Sum over them of the squared shift of the position, mm².
+    fused_mm2: f64,
+    /// Of the frame that was moved farthest.
+    fused_max_mm: f64,
     is_interrupted: bool,
     /// A line on each motion that was written to files, and the files.
     told: Vec<(String, Vec<PathBuf>)>,
@@ -192,6 +198,11 @@ impl Done {
         self.n_candidates += made.rows.len() as u64;
         let failed = made.rows.iter().any(|row| row.selected && row.checks_passed < row.n_checks);
         self.n_checks_failed += u64::from(failed);
+        if let Some(moved) = made.displacement {
+            self.n_fused += made.frames.nrows() as u64;
+            self.fused_mm2 += made.frames.nrows() as f64 * moved.position_rms_mm.powi(2);
+            self.fused_max_mm = self.fused_max_mm.max(moved.position_max_mm);
+        }
     }
 
     fn add(&mut self, outcomes: &BTreeMap<String, Result<Made, Failure>>) {
@@ -254,6 +265,14 @@ impl Summary for Report {
         }
         if done.n_checks_failed > 0 {
             writeln!(out, "  {} of them fail a sanity check", done.n_checks_failed)?;
+        }
+        if done.n_fused > 0 {
+            writeln!(
+                out,
+                "  fusion moved positions by {:.1} mm (root mean square), {:.1} mm at most",
+                (done.fused_mm2 / done.n_fused as f64).sqrt(),
+                done.fused_max_mm
+            )?;
         }
         for (line, files) in done.told.iter().take(N_SHOWN) {
             writeln!(out, "  {line}")?;

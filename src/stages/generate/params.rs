@@ -13,7 +13,6 @@ use super::settings::{MotionSettings, OUTPUT_VERSION};
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
 use crate::generation::{ModelCard, OVERLAP_FRAMES};
 use crate::motion::postprocess::{Coherence, Hemisphere, PostProcessConfig, SavitzkyGolay};
-use crate::motion::rates::MotionRange;
 use crate::motion::style::STYLE_DIM;
 use crate::motion::{Channel, ChannelLimits};
 use crate::stages::ClientParams;
@@ -168,15 +167,16 @@ pub struct PostProcessParams {
     /// Leave the phase as it was decoded, instead of the phase of the music's bars.
     #[arg(long, help_heading = "Post-processing")]
     pub decoded_phase: bool,
-    /// Velocities, accelerations and angular velocities: as decoded, half of each as in the reference, or
-    /// derived from positions and orientations.
-    #[arg(long, value_enum, default_value_t = Coherence::Derive, help_heading = "Post-processing")]
-    pub coherence: Coherence,
+    /// Velocities, accelerations and angular velocities: as decoded, half of each as in the reference, derived
+    /// from positions and orientations, or fused with them by least squares and then
+    /// derived [default: fuse, by the errors that the model's card has; derive for one of release 0.1]
+    #[arg(long, value_enum, help_heading = "Post-processing")]
+    pub coherence: Option<Coherence>,
     /// Frames of the reference's moving average; an odd number [default: none]
     #[arg(long, value_name = "N", help_heading = "Post-processing")]
     pub moving_average: Option<usize>,
-    /// Smooths by polynomials of an order over a window of frames; 0 for none [default: 11,3 with --coherence
-    /// derive]
+    /// Smooths by polynomials of an order over a window of frames; 0 for none; with --coherence derive or
+    /// fuse [default: 11,3 with derive]
     #[arg(long, value_name = "WINDOW,ORDER", value_delimiter = ',', num_args = 1..,
           help_heading = "Post-processing")]
     pub savitzky_golay: Vec<usize>,
@@ -190,25 +190,30 @@ impl PostProcessParams {
             .expect("invariant: every flag of post-processing has a default")
     }
 
-    /// Returns the configuration, for a model whose motion is as fast as `range`.
+    /// Returns the configuration for a model.
     ///
     /// # Errors
     /// A window that is even or an order that is too high, in a sentence.
-    pub fn config(&self, range: Option<MotionRange>) -> anyhow::Result<PostProcessConfig> {
+    pub fn config(&self, card: &ModelCard) -> anyhow::Result<PostProcessConfig> {
+        let (range, measured) = (card.motion_range, card.fusion_variances());
+        // Of a model whose errors were not measured, as those of release 0.1, velocities are derived.
+        let usual = if measured.is_some() { Coherence::Fuse } else { Coherence::Derive };
+        let coherence = self.coherence.unwrap_or(usual);
         let mut config = PostProcessConfig {
             limits: self.limits,
             hemisphere: self.hemisphere,
             smooth_quaternions: self.smooth_quaternions.is_some(),
             enforce_phase_monotonic: self.monotonic_phase,
             relock_phase: !self.decoded_phase,
-            coherence: self.coherence,
+            coherence,
             apply_smoothing: self.moving_average.is_some(),
             savitzky_golay: match self.savitzky_golay[..] {
-                [] if self.coherence == Coherence::Derive => Some(SavitzkyGolay::default()),
+                [] if coherence == Coherence::Derive => Some(SavitzkyGolay::default()),
                 [] | [0] | [0, _] => None,
                 [window, order] => Some(SavitzkyGolay { window, order }),
                 _ => bail!("--savitzky-golay takes two numbers: WINDOW,ORDER, such as 7,3"),
             },
+            fusion_variances: (coherence == Coherence::Fuse).then(|| measured.unwrap_or_default()),
             range: range.filter(|range| range.is_sound() && !self.any_speed),
             ..PostProcessConfig::default()
         };
@@ -296,7 +301,7 @@ impl Settings {
             style: style(&params.style, card)?,
             overlap_frames: params.overlap,
             prime: None,
-            postprocess: params.postprocess.config(card.motion_range)?,
+            postprocess: params.postprocess.config(card)?,
             constraints,
             constraint_strength: strength,
             soft: params.soft,

@@ -141,6 +141,22 @@ fn check_numbers(params: &Params, config: &TrainConfig) -> anyhow::Result<()> {
     share("--decoder-dropout", config.network.decoder.dropout)?;
     share("--decoder-noised-to", config.decoder.noised_to)?;
     share("--decoder-sampled-from", config.decoder.sampled_from)?;
+    let losses = &params.config.diffusion;
+    ensure!(
+        losses.difference_losses.len() == 3,
+        "--difference-losses has {} weights; give three, for the first to the third difference",
+        losses.difference_losses.len()
+    );
+    let weights = [
+        ("--style-weight", losses.style_weight),
+        ("--vertical-weight", losses.vertical_weight),
+        ("--velocity-loss", losses.velocity_loss),
+        ("--acceleration-loss", losses.acceleration_loss),
+    ];
+    let differences = losses.difference_losses.iter().map(|&x| ("--difference-losses", x));
+    for (flag, x) in weights.into_iter().chain(differences) {
+        ensure!(x.is_finite() && x >= 0.0, "{flag} {x} is no weight; give 0 or more");
+    }
     for beta in d.optimizer.betas {
         share("--betas", beta)?;
     }

@@ -127,7 +127,7 @@ pub struct DiffusionParams {
     #[arg(long, value_name = "X", default_value_t = 0.0, help_heading = "Diffusion")]
     pub acceleration_loss: f64,
     /// Weights of the first, second and third differences of poses against the truth's.
-    #[arg(long, value_name = "X,X,X", value_delimiter = ',', num_args = 3, default_values_t = [0.0; 3],
+    #[arg(long, value_name = "X,X,X", value_delimiter = ',', num_args = 1.., default_values_t = [0.0; 3],
           help_heading = "Diffusion")]
     pub difference_losses: Vec<f64>,
     /// Probability that a window goes without its music, for guidance.

@@ -37,9 +37,12 @@ struct Digested<'a> {
     feature_scale: &'a FeatureScale,
     settings: &'a MotionSettings,
     seed: u64,
-    /// Phrase, first frame, and digests of features, phase and clock.
-    windows: Vec<(&'a str, usize, String, Option<String>, Option<String>)>,
+    windows: Vec<DigestedWindow<'a>>,
 }
+
+/// Phrase, first frame, and digests of features, phase and clock.
+#[derive(Serialize)]
+struct DigestedWindow<'a>(&'a str, usize, String, Option<String>, Option<String>);
 
 /// Returns the digest of a baseline.
 pub fn digest_of(baseline: Baseline, request: &Request, settings: &MotionSettings) -> String {
@@ -72,7 +75,7 @@ pub fn digest_of(baseline: Baseline, request: &Request, settings: &MotionSetting
             .iter()
             .map(|w| {
                 let (first, features, phase, clock) = window(w);
-                (w.phrase_id.as_str(), first, features, phase, clock)
+                DigestedWindow(&w.phrase_id, first, features, phase, clock)
             })
             .collect(),
     };
