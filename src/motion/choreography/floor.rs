@@ -5,7 +5,7 @@ use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 use super::super::kinematics::Poses;
 use super::super::quaternion::{from_axis_angle, make_sign_continuous, mul, rotate};
-use super::chance::Chance;
+use crate::chance::Chance;
 use super::primitive::UP;
 use super::selection::Phrase;
 use crate::units::frames_to_s;

@@ -12,7 +12,6 @@
 pub mod accent;
 pub mod activity;
 pub mod beat_grid;
-mod chance;
 pub mod floor;
 mod joining;
 pub mod primitive;
@@ -31,7 +30,7 @@ use super::style::{BodyMotion, style_channels};
 use crate::units::frames_to_s;
 pub use activity::activity;
 pub use beat_grid::{Beat, BeatGrid};
-use chance::Chance;
+use crate::chance::Chance;
 pub use floor::Turn;
 pub use primitive::{Primitive, PrimitiveError, Repertoire};
 pub use selection::Step;

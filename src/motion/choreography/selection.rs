@@ -3,7 +3,7 @@
 use std::ops::RangeInclusive;
 
 use super::beat_grid::BeatGrid;
-use super::chance::Chance;
+use crate::chance::Chance;
 use super::primitive::{Primitive, Repertoire};
 use crate::units::s_to_frames;
 
