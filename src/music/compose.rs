@@ -31,11 +31,24 @@ const RAMP: (f64, f64) = (0.02, 0.06);
 /// How much slower a song is at its end.
 const SLOWING: (f64, f64) = (0.1, 0.3);
 
+/// Longest song that is composed, in seconds: the length that it aims at, rounded to four bars, and slowing.
+pub const MAX_SONG_S: f64 = 110.0;
+
+/// Returns the style of a song and the tempo that it is in, in beats per minute, without composing it.
+pub fn heading(seed: u64, index: u64) -> (&'static str, f64) {
+    let style = style_of(seed, index);
+    (style.name, tempo(style, &mut stream(seed, index, TEMPO)).0)
+}
+
+fn stream(seed: u64, index: u64, part: u64) -> Chance {
+    Chance::new(seed, index.wrapping_mul(N_STREAMS).wrapping_add(part))
+}
+
 /// Composes song number `index` of a seed.
 ///
 /// Songs take turns: each of [`Style::all`] comes once in as many songs as there are styles.
 pub fn compose(seed: u64, index: u64) -> Score {
-    let stream = |part: u64| Chance::new(seed, index.wrapping_mul(N_STREAMS).wrapping_add(part));
+    let stream = |part: u64| stream(seed, index, part);
     let style = style_of(seed, index);
     let mut tempo_chance = stream(TEMPO);
     let (bpm, drift) = tempo(style, &mut tempo_chance);
@@ -63,7 +76,7 @@ fn style_of(seed: u64, index: u64) -> &'static Style {
     let mut styles: Vec<&'static Style> = Style::all().collect();
     let n = styles.len();
     let round = index / n as u64;
-    Chance::new(seed, round.wrapping_mul(N_STREAMS).wrapping_add(ORDER)).shuffle(&mut styles);
+    stream(seed, round, ORDER).shuffle(&mut styles);
     styles[index as usize % n]
 }
 

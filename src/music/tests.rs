@@ -55,7 +55,7 @@ fn songs_are_what_is_danced_to() {
     let n = Style::all().len() as u64;
     let mut styles = BTreeSet::new();
     let mut meters = BTreeSet::new();
-    for score in songs(4 * n) {
+    for (i, score) in songs(4 * n).enumerate() {
         let name = score.style;
         styles.insert(name);
         meters.insert(score.beats_per_bar);
@@ -65,7 +65,10 @@ fn songs_are_what_is_danced_to() {
         let (slowest, fastest) = style.tempo_bpm;
         let bpm = score.tempo_bpm();
         assert!(0.95 * slowest <= bpm && bpm <= 1.05 * fastest, "{name}: {bpm}");
-        assert!((30.0..110.0).contains(&score.end_s()), "{name}: {}", score.end_s());
+        let (heading, nominal_bpm) = compose::heading(11, i as u64);
+        assert_eq!(heading, name);
+        assert!((bpm / nominal_bpm - 1.0).abs() < 0.06, "{name}: {bpm} {nominal_bpm}");
+        assert!((30.0..compose::MAX_SONG_S).contains(&score.end_s()), "{name}: {}", score.end_s());
 
         let beats = score.beats();
         assert!(score.pickup_beats < score.beats_per_bar);
@@ -254,5 +257,5 @@ fn a_wav_file_holds_the_samples() {
     assert_eq!(bytes[4..8], 44_u32.to_le_bytes());
     let samples: Vec<i16> =
         bytes[44..].chunks(2).map(|b| i16::from_le_bytes([b[0], b[1]])).collect();
-    assert_eq!(samples, [0, 16_384, -32_767, 32_767]);
+    assert_eq!(samples, [0, 16_384, -32_768, 32_767]);
 }

@@ -23,7 +23,8 @@ pub fn wav(samples: &[f32]) -> Vec<u8> {
     }
     bytes.extend(b"data");
     bytes.extend(n_bytes.to_le_bytes());
-    let rounded = |y: &f32| (y.clamp(-1.0, 1.0) * 32_767.0).round() as i16;
+    // Full scale is 2¹⁵, as decoders have it.
+    let rounded = |y: &f32| (y * 32_768.0).round().clamp(-32_768.0, 32_767.0) as i16;
     bytes.extend(samples.iter().flat_map(|y| rounded(y).to_le_bytes()));
     bytes
 }
