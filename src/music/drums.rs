@@ -68,7 +68,7 @@ impl Drumming {
     }
 }
 
-fn velocity(letter: u8) -> f64 {
+pub(super) fn velocity(letter: u8) -> f64 {
     match letter {
         b'X' => 1.0,
         b'x' => 0.75,

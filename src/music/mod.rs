@@ -6,6 +6,8 @@
 //! Everything here is pure, and made of additions, multiplications and the functions of the crate `libm`, which
 //! are the same on every machine: same seed, same bytes.
 
+pub mod abc;
+pub mod arrange;
 pub mod compose;
 mod drums;
 pub mod harmony;
@@ -19,6 +21,7 @@ pub mod tempo;
 mod tests;
 pub mod wav;
 
+pub use arrange::arrange;
 pub use compose::compose;
 pub use score::{Beat, Note, Score, Section, SectionKind, Voice};
 pub use tempo::TempoMap;

@@ -30,6 +30,7 @@ macro_rules! kinds {
 }
 
 kinds! {
+    AbcFormat = "abc_format",
     AudioCodec = "audio_codec",
     AudioData = "audio_data",
     AudioHeader = "audio_header",

@@ -177,8 +177,8 @@ impl Job<'_> {
             let music = {
                 let _share = budget.take(input.needed_bytes());
                 let input = match &song.files {
-                    Files::Made { piece, .. } => {
-                        let performance = perform(song, piece)?;
+                    Files::Made { piece, seed, .. } => {
+                        let performance = perform(song, piece, *seed)?;
                         if let Some(folder) = &self.params.compose_audio
                             && let Err(e) = made::write(folder, song, &performance)
                         {

@@ -1,19 +1,34 @@
-//! Songs that are made here: composed from a seed, and played.
+//! Songs that are made here: composed from a seed or arranged from a tune, and played.
 
 use std::path::Path;
+use std::sync::Arc;
 
-use super::songs::{Files, Song};
+use anyhow::bail;
+use xxhash_rust::xxh3::{xxh3_64, xxh3_64_with_seed};
+
+use super::one::small_bytes;
+use super::songs::{Files, Song, slug};
 use super::split::TRAIN;
 use crate::motion::Beats;
+use crate::music::abc::{self, Found, Tune};
 use crate::music::{self, Score, compose, synth, wav};
 use crate::stages::failure::{Failure, FailureKind};
-use crate::store::write_file;
+use crate::store::{
+    ClientOptions, Content, Listing, Source, SourceFile, StoreError, digest, write_file,
+};
+
+/// Ending of the files that tunes are read from.
+const TUNE_EXTENSION: &str = "abc";
+/// Largest file of tunes that is read, in bytes.
+const MAX_FILE_BYTES: u64 = 16 << 20;
 
 /// Where a song's notes come from.
 #[derive(Clone, Debug)]
 pub enum Piece {
     /// Song number `index` of a seed.
     Composed { seed: u64, index: u64 },
+    /// A tune, to which accompaniment is made.
+    Tune(Arc<Tune>),
 }
 
 /// A song that was played.
@@ -32,36 +47,119 @@ pub fn composed(n: u32, seed: u64) -> impl Iterator<Item = Song> {
         let url = format!("composed:{seed}/{index}");
         Song {
             slug: id.clone(),
-            fingerprint: format!("{url} {}", music::VERSION),
-            url,
             id,
+            fingerprint: format!("{url} {}", music::VERSION),
             split: TRAIN,
             is_unidentified: false,
             problem: None,
             files: Files::Made {
                 piece: Piece::Composed { seed, index },
+                seed: xxh3_64(url.as_bytes()),
                 duration_s: compose::MAX_SONG_S,
             },
+            url,
         }
     })
 }
 
-/// Plays a song.
+/// Finds the tunes of every `.abc` file below a folder; one that cannot be read is a song with a problem.
+///
+/// # Errors
+/// When the folder cannot be listed or has no such file.
+pub fn tunes(url: &str, options: &ClientOptions, seed: u64) -> anyhow::Result<Vec<Song>> {
+    let source = Source::open(url, options, None)?;
+    let Listing { files, .. } = source.list()?;
+    let is_tune = |file: &SourceFile| {
+        file.path.rsplit_once('.').is_some_and(|(_, e)| e.eq_ignore_ascii_case(TUNE_EXTENSION))
+    };
+    let files: Vec<SourceFile> = files.into_iter().filter(is_tune).collect();
+    if files.is_empty() {
+        bail!(
+            "tunes folder {}: no .{TUNE_EXTENSION} file anywhere below it; name the folder of your tunes",
+            source.location()
+        );
+    }
+    let mut songs = Vec::new();
+    for (file, (content, _permit)) in files.iter().zip(source.read_in_order(files.clone())) {
+        let url = source.location().url_of(&file.path);
+        match tunes_of(file, content) {
+            Ok(found) => songs.extend(
+                found.into_iter().enumerate().map(|(i, tune)| tune_song(file, &url, i, tune, seed)),
+            ),
+            Err(failure) => songs.push(song_of_tune(
+                (file.path.clone(), url),
+                "",
+                Files::Missing,
+                Some(failure),
+            )),
+        }
+    }
+    Ok(songs)
+}
+
+fn tunes_of(
+    file: &SourceFile,
+    content: Result<Content, StoreError>,
+) -> Result<Vec<Found>, Failure> {
+    let path = file.path.as_str();
+    if file.size_bytes > MAX_FILE_BYTES {
+        let message = format!(
+            "{path} has {} bytes, more than the {MAX_FILE_BYTES} that are read; split the file",
+            file.size_bytes
+        );
+        return Err(Failure::new(FailureKind::TooLarge, path, message));
+    }
+    let found = abc::read(&small_bytes(file, content)?);
+    if found.is_empty() {
+        let message = format!("{path}: has no tune; a tune in ABC notation begins with X:1");
+        return Err(Failure::new(FailureKind::AbcFormat, path, message));
+    }
+    Ok(found)
+}
+
+/// Returns tune number `i` of a file as a song.
+fn tune_song(file: &SourceFile, url: &str, i: usize, found: Found, seed: u64) -> Song {
+    let id = format!("{}-{:04}", file.path, i + 1);
+    let url = format!("{url}#{}", i + 1);
+    let Found { line, text, tune } = found;
+    match tune {
+        Ok(tune) => {
+            let seed = xxh3_64_with_seed(text.as_bytes(), seed);
+            let duration_s = music::arrange(&tune, seed).end_s();
+            let files = Files::Made { piece: Piece::Tune(Arc::new(tune)), seed, duration_s };
+            song_of_tune((id, url), &text, files, None)
+        }
+        Err(e) => {
+            let message = format!("{id} (from line {line}): the tune {e}");
+            let failure = Failure::new(FailureKind::AbcFormat, &file.path, message);
+            song_of_tune((id, url), &text, Files::Missing, Some(failure))
+        }
+    }
+}
+
+fn song_of_tune(
+    (id, url): (String, String),
+    text: &str,
+    files: Files,
+    problem: Option<Failure>,
+) -> Song {
+    let fingerprint = format!("tune {} {}", digest(text.as_bytes()), music::VERSION);
+    let (slug, split) = (slug(&id), TRAIN);
+    Song { id, slug, url, fingerprint, split, is_unidentified: false, problem, files }
+}
+
+/// Plays a song; the seed chooses who plays it, and how.
 ///
 /// # Errors
 /// A [`Failure`] that names it.
-pub fn perform(song: &Song, piece: &Piece) -> Result<Performance, Failure> {
+pub fn perform(song: &Song, piece: &Piece, seed: u64) -> Result<Performance, Failure> {
     let score = match piece {
         Piece::Composed { seed, index } => music::compose(*seed, *index),
+        Piece::Tune(tune) => music::arrange(tune, seed),
     };
-    let samples = synth::render(&score, ensemble(song))
+    let samples = synth::render(&score, seed)
         .map_err(|e| Failure::new(FailureKind::TooLong, &song.id, format!("{}: {e}", song.id)))?;
     Ok(Performance { wav: wav::wav(&samples).into(), beats: beats_of(song, &score)? })
-}
-
-/// Returns the seed of the ensemble that plays a song: another song, another ensemble.
-fn ensemble(song: &Song) -> u64 {
-    xxhash_rust::xxh3::xxh3_64(song.url.as_bytes())
 }
 
 fn beats_of(song: &Song, score: &Score) -> Result<Beats, Failure> {

@@ -52,6 +52,10 @@ pub struct Params {
     /// three and four, whose beats are known. They are all for training. --seed chooses others.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub compose: u32,
+    /// Folder or bucket of tunes in ABC notation (any tree of .abc files): each is given chords, bass and drums,
+    /// is played, and danced to, too, for training alone.
+    #[arg(long, value_name = "DIR")]
+    pub tunes: Option<String>,
     /// Also write the songs that are composed or played in this run: NAME.wav and NAME.beats.txt.
     #[arg(long, value_name = "DIR")]
     pub compose_audio: Option<PathBuf>,
@@ -120,9 +124,15 @@ impl Stage for Library {
         };
         let mut songs = match &params.songs {
             Some(url) => Songs::of_folder(url, &options, &known)?,
-            None => Songs::of_store(&store, &mut known, params.compose == 0)?,
+            None => {
+                let is_needed = params.compose == 0 && params.tunes.is_none();
+                Songs::of_store(&store, &mut known, is_needed)?
+            }
         };
         songs.songs.extend(made::composed(params.compose, params.rules.seed));
+        if let Some(url) = &params.tunes {
+            songs.songs.extend(made::tunes(url, &options, params.rules.seed)?);
+        }
         prepare(&mut songs, &params)?;
         let job = Job { store: &store, ledger, known, params: &params, progress };
         let mut report = Report {

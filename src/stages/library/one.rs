@@ -168,7 +168,8 @@ fn no_beats(song: &Song, n_beats: usize, n_frames: usize) -> Failure {
     refused(song, &SongError::NoBeats { n_beats, duration_s: frames_to_s(n_frames) })
 }
 
-fn small_bytes(
+/// Reads a file that fits into memory.
+pub fn small_bytes(
     file: &SourceFile,
     content: Result<Content, StoreError>,
 ) -> Result<bytes::Bytes, Failure> {

@@ -55,9 +55,14 @@ pub enum Files {
         audio: SourceFile,
         beat_list: Option<SourceFile>,
     },
+    /// None that can be read.
+    Missing,
     /// None: it is played from a score.
     Made {
         piece: Piece,
+        /// Chooses who plays it, and how.
+        seed: u64,
+        /// At most.
         duration_s: f64,
     },
 }
@@ -227,7 +232,7 @@ impl Feeding {
 fn send_files(source: &Source, songs: Vec<Song>, sender: &SyncSender<(Song, Input)>) {
     let files = songs.iter().flat_map(|song| match &song.files {
         Files::Folder { audio, beat_list } => vec![Some(audio.clone()), beat_list.clone()],
-        Files::Store { .. } | Files::Made { .. } => Vec::new(),
+        Files::Store { .. } | Files::Made { .. } | Files::Missing => Vec::new(),
     });
     let mut reader = source.read_in_order(files.flatten().collect());
     for song in songs {
