@@ -50,7 +50,7 @@ const MAY_USE: [(&str, &[&str]); 19] = [
 ];
 
 /// Crates that only one place may name: crate, where.
-const KEPT_TO: [(&str, &str); 14] = [
+const KEPT_TO: [(&str, &str); 15] = [
     ("polars", "store/query.rs"),
     ("object_store", "store/"),
     ("parquet", "store/"),
@@ -64,6 +64,7 @@ const KEPT_TO: [(&str, &str); 14] = [
     ("rayon", "autodiff/"),
     ("safetensors", "weights.rs"),
     ("ort", "onnx/"),
+    ("rustysynth", "music/"),
     ("prost", "onnx/"),
 ];
 

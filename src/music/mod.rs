@@ -13,6 +13,8 @@ mod drums;
 pub mod harmony;
 mod parts;
 pub mod score;
+#[cfg(feature = "soundfont")]
+pub mod soundfont;
 pub mod style;
 mod styles;
 pub mod synth;

@@ -89,6 +89,14 @@ impl Desk {
         }
     }
 
+    /// A desk on which all is mixed already.
+    #[cfg(feature = "soundfont")]
+    pub fn of_mix(mix: Vec<f32>) -> Self {
+        let (bus, room, kicks) = (Vec::new(), Vec::new(), Vec::new());
+        let channels = [Channel { gain: 1.0, send: 0.0, ducking: 0.0 }; 4];
+        Self { bus, mix, room, channels, kicks, duck_s: 0.1, fade: None }
+    }
+
     /// Returns the bus from a sample on.
     pub fn from(&mut self, sample: usize) -> &mut [f32] {
         let begin = sample.min(self.bus.len());

@@ -55,6 +55,18 @@ pub fn onset_sample(score: &Score, note: &Note) -> usize {
     (score.onset_s(note) * RATE_HZ).round() as usize
 }
 
+/// Returns the sample on which a note is let go.
+pub fn release_sample(score: &Score, note: &Note) -> usize {
+    let end_s = score.tempo.time_s(note.onset_beats + note.duration_beats) + note.late_s;
+    (end_s.max(0.0) * RATE_HZ) as usize
+}
+
+/// Gives a whole mix the equalisation, saturation and noise of a song of its own.
+#[cfg(feature = "soundfont")]
+pub fn master(mix: Vec<f32>, chance: &mut Chance) -> Vec<f32> {
+    Desk::of_mix(mix).master(chance)
+}
+
 /// Plays a score: mono samples at 44.1 kHz, within ±1. The seed chooses the ensemble.
 ///
 /// # Errors
@@ -83,9 +95,7 @@ pub fn render(score: &Score, seed: u64) -> Result<Vec<f32>, RenderError> {
                     .collect();
                 for note in notes {
                     let onset = onset_sample(score, note);
-                    let end_beats = note.onset_beats + note.duration_beats;
-                    let end = score.tempo.time_s(end_beats) + note.late_s;
-                    let held = ((end * RATE_HZ) as usize).saturating_sub(onset);
+                    let held = release_sample(score, note).saturating_sub(onset);
                     let patch = patches.iter().find(|(voice, _)| *voice == note.voice);
                     if let Some((_, patch)) = patch {
                         tone::play(patch, note, held, desk.from(onset));

@@ -9,7 +9,7 @@ use anyhow::{Context as _, bail};
 use super::captures::{Captures, Loaded};
 use super::known::Known;
 use super::layout::Output;
-use super::made::{self, perform};
+use super::made::{self, Band, perform};
 use super::report::{Report, Tally};
 use super::songs::{Files, Input, Song, Songs};
 use super::write::{Refusal, Writer, fingerprint, is_settled};
@@ -28,6 +28,7 @@ pub struct Job<'a> {
     pub store: &'a Location,
     pub ledger: Ledger,
     pub known: Known,
+    pub band: Band,
     pub params: &'a Params,
     pub progress: &'a dyn Progress,
 }
@@ -178,7 +179,7 @@ impl Job<'_> {
                 let _share = budget.take(input.needed_bytes());
                 let input = match &song.files {
                     Files::Made { piece, seed, .. } => {
-                        let performance = perform(song, piece, *seed)?;
+                        let performance = perform(song, piece, *seed, &self.band)?;
                         if let Some(folder) = &self.params.compose_audio
                             && let Err(e) = made::write(folder, song, &performance)
                         {

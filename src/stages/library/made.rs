@@ -3,6 +3,8 @@
 use std::path::Path;
 use std::sync::Arc;
 
+#[cfg(feature = "soundfont")]
+use anyhow::Context as _;
 use anyhow::bail;
 use xxhash_rust::xxh3::{xxh3_64, xxh3_64_with_seed};
 
@@ -11,7 +13,11 @@ use super::songs::{Files, Song, slug};
 use super::split::TRAIN;
 use crate::motion::Beats;
 use crate::music::abc::{self, Found, Tune};
+#[cfg(feature = "soundfont")]
+use crate::music::soundfont::Instruments;
 use crate::music::{self, Score, compose, synth, wav};
+#[cfg(feature = "soundfont")]
+use crate::stages::failure::guarded;
 use crate::stages::failure::{Failure, FailureKind};
 use crate::store::{
     ClientOptions, Content, Listing, Source, SourceFile, StoreError, digest, write_file,
@@ -40,7 +46,7 @@ pub struct Performance {
 }
 
 /// Returns the first `n` songs of a seed, named `composed-00017-house-124bpm`.
-pub fn composed(n: u32, seed: u64) -> impl Iterator<Item = Song> {
+pub fn composed(n: u32, seed: u64, band: &Band) -> impl Iterator<Item = Song> {
     (0..u64::from(n)).map(move |index| {
         let (style, tempo_bpm) = compose::heading(seed, index);
         let id = format!("composed-{index:05}-{style}-{tempo_bpm:.0}bpm");
@@ -48,7 +54,7 @@ pub fn composed(n: u32, seed: u64) -> impl Iterator<Item = Song> {
         Song {
             slug: id.clone(),
             id,
-            fingerprint: format!("{url} {}", music::VERSION),
+            fingerprint: band.fingerprint(&url),
             split: TRAIN,
             is_unidentified: false,
             problem: None,
@@ -66,7 +72,12 @@ pub fn composed(n: u32, seed: u64) -> impl Iterator<Item = Song> {
 ///
 /// # Errors
 /// When the folder cannot be listed or has no such file.
-pub fn tunes(url: &str, options: &ClientOptions, seed: u64) -> anyhow::Result<Vec<Song>> {
+pub fn tunes(
+    url: &str,
+    options: &ClientOptions,
+    seed: u64,
+    band: &Band,
+) -> anyhow::Result<Vec<Song>> {
     let source = Source::open(url, options, None)?;
     let Listing { files, .. } = source.list()?;
     let is_tune = |file: &SourceFile| {
@@ -93,6 +104,9 @@ pub fn tunes(url: &str, options: &ClientOptions, seed: u64) -> anyhow::Result<Ve
                 Some(failure),
             )),
         }
+    }
+    for song in &mut songs {
+        song.fingerprint = band.fingerprint(&song.fingerprint);
     }
     Ok(songs)
 }
@@ -143,22 +157,66 @@ fn song_of_tune(
     files: Files,
     problem: Option<Failure>,
 ) -> Song {
-    let fingerprint = format!("tune {} {}", digest(text.as_bytes()), music::VERSION);
+    let fingerprint = format!("tune {}", digest(text.as_bytes()));
     let (slug, split) = (slug(&id), TRAIN);
     Song { id, slug, url, fingerprint, split, is_unidentified: false, problem, files }
 }
 
-/// Plays a song; the seed chooses who plays it, and how.
+/// Who plays.
+#[derive(Clone, Default)]
+pub struct Band {
+    #[cfg(feature = "soundfont")]
+    instruments: Option<Instruments>,
+    /// Digest of the soundfont; none where our own voices play.
+    hash: Option<String>,
+}
+
+impl Band {
+    /// Reads a soundfont, if one is given.
+    ///
+    /// # Errors
+    /// When it cannot be read.
+    #[cfg(feature = "soundfont")]
+    pub fn of(soundfont: Option<&Path>) -> anyhow::Result<Self> {
+        let Some(path) = soundfont else { return Ok(Self::default()) };
+        let name = path.display();
+        let bytes = std::fs::read(path).with_context(|| format!("soundfont {name}"))?;
+        let path = name.to_string();
+        // Its reader takes some damaged files for whole ones and breaks on them.
+        let instruments = guarded(&path, || {
+            let refused = |e| Failure::new(FailureKind::SoundFont, &path, format!("{path}: {e}"));
+            Instruments::read(&bytes).map_err(refused)
+        });
+        let instruments = instruments.map_err(|failure| anyhow::anyhow!(failure.message))?;
+        Ok(Self { instruments: Some(instruments), hash: Some(digest(&bytes)) })
+    }
+
+    /// Returns what tells songs of this band from those of another.
+    fn fingerprint(&self, of: &str) -> String {
+        let hash = self.hash.as_ref().map(|hash| format!(" {hash}")).unwrap_or_default();
+        format!("{of} {}{hash}", music::VERSION)
+    }
+
+    fn play(&self, score: &Score, seed: u64) -> Result<Vec<f32>, String> {
+        #[cfg(feature = "soundfont")]
+        if let Some(instruments) = &self.instruments {
+            return instruments.render(score, seed).map_err(|e| e.to_string());
+        }
+        synth::render(score, seed).map_err(|e| e.to_string())
+    }
+}
+
+/// Plays a song; the seed chooses the sound of the band.
 ///
 /// # Errors
 /// A [`Failure`] that names it.
-pub fn perform(song: &Song, piece: &Piece, seed: u64) -> Result<Performance, Failure> {
+pub fn perform(song: &Song, piece: &Piece, seed: u64, band: &Band) -> Result<Performance, Failure> {
     let score = match piece {
         Piece::Composed { seed, index } => music::compose(*seed, *index),
         Piece::Tune(tune) => music::arrange(tune, seed),
     };
-    let samples = synth::render(&score, seed)
-        .map_err(|e| Failure::new(FailureKind::TooLong, &song.id, format!("{}: {e}", song.id)))?;
+    let unplayed = |e| Failure::new(FailureKind::Unplayable, &song.id, format!("{}: {e}", song.id));
+    let samples = band.play(&score, seed).map_err(unplayed)?;
     Ok(Performance { wav: wav::wav(&samples).into(), beats: beats_of(song, &score)? })
 }
 

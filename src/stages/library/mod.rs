@@ -23,6 +23,7 @@ use crate::store::{Ledger, Location, StoreError, digest};
 use captures::Captures;
 use job::Job;
 use known::Known;
+use made::Band;
 use report::{Place, Report, Tally};
 use songs::{Files, Song, Songs};
 use split::Share;
@@ -56,6 +57,11 @@ pub struct Params {
     /// is played, and danced to, too, for training alone.
     #[arg(long, value_name = "DIR")]
     pub tunes: Option<String>,
+    /// Play composed songs and tunes with the instruments of a General MIDI soundfont (SF2), instead of our own
+    /// voices.
+    #[cfg(feature = "soundfont")]
+    #[arg(long, value_name = "FILE")]
+    pub soundfont: Option<PathBuf>,
     /// Also write the songs that are composed or played in this run: NAME.wav and NAME.beats.txt.
     #[arg(long, value_name = "DIR")]
     pub compose_audio: Option<PathBuf>,
@@ -129,12 +135,16 @@ impl Stage for Library {
                 Songs::of_store(&store, &mut known, is_needed)?
             }
         };
-        songs.songs.extend(made::composed(params.compose, params.rules.seed));
+        #[cfg(feature = "soundfont")]
+        let band = Band::of(params.soundfont.as_deref())?;
+        #[cfg(not(feature = "soundfont"))]
+        let band = Band::default();
+        songs.songs.extend(made::composed(params.compose, params.rules.seed, &band));
         if let Some(url) = &params.tunes {
-            songs.songs.extend(made::tunes(url, &options, params.rules.seed)?);
+            songs.songs.extend(made::tunes(url, &options, params.rules.seed, &band)?);
         }
         prepare(&mut songs, &params)?;
-        let job = Job { store: &store, ledger, known, params: &params, progress };
+        let job = Job { store: &store, ledger, known, band, params: &params, progress };
         let mut report = Report {
             place: Place { store: store.to_string(), output: params.output.clone() },
             dry_run: params.dry_run,
