@@ -148,9 +148,8 @@ impl Reader {
 
     fn field(&mut self, text: &str, line: usize) -> Result<(), AbcError> {
         let before = self.header.meter;
-        match text.chars().next() {
-            Some('K' | 'L' | 'M') => self.header.read(text, line)?,
-            _ => {}
+        if text.starts_with(['K', 'L', 'M']) {
+            self.header.read(text, line)?;
         }
         if self.header.meter != before { Err(AbcError::MeterChange { line }) } else { Ok(()) }
     }
