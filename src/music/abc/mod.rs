@@ -5,6 +5,7 @@
 //! changes of meter are not read; da capo and segno are played through.
 
 mod body;
+mod cursor;
 mod header;
 mod repeats;
 #[cfg(test)]
