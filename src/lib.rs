@@ -4,12 +4,14 @@
 
 pub mod audio;
 pub mod autodiff;
+pub mod chance;
 pub mod cli;
 pub mod diffusion;
 pub mod evaluation;
 pub mod generation;
 pub mod model;
 pub mod motion;
+pub mod music;
 pub mod onnx;
 pub mod plot;
 pub mod report;

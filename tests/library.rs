@@ -4,6 +4,7 @@
 mod bad_input;
 mod coupling;
 mod kill;
+mod made;
 mod output;
 mod store;
 

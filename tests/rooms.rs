@@ -4,15 +4,17 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Which rooms a room may use.
-const MAY_USE: [(&str, &[&str]); 17] = [
+const MAY_USE: [(&str, &[&str]); 19] = [
     ("units", &[]),
     ("audio", &["units"]),
     ("autodiff", &["model"]),
+    ("chance", &[]),
     ("diffusion", &[]),
     ("evaluation", &["motion", "units"]),
     ("generation", &["audio", "autodiff", "diffusion", "model", "motion", "onnx", "units"]),
     ("model", &["audio", "motion"]),
-    ("motion", &["units"]),
+    ("motion", &["chance", "units"]),
+    ("music", &["audio", "chance"]),
     ("onnx", &["audio", "model", "motion"]),
     ("plot", &["motion", "units"]),
     ("report", &[]),
@@ -33,6 +35,7 @@ const MAY_USE: [(&str, &[&str]); 17] = [
             "generation",
             "model",
             "motion",
+            "music",
             "onnx",
             "plot",
             "report",
@@ -47,7 +50,7 @@ const MAY_USE: [(&str, &[&str]); 17] = [
 ];
 
 /// Crates that only one place may name: crate, where.
-const KEPT_TO: [(&str, &str); 14] = [
+const KEPT_TO: [(&str, &str); 15] = [
     ("polars", "store/query.rs"),
     ("object_store", "store/"),
     ("parquet", "store/"),
@@ -61,6 +64,7 @@ const KEPT_TO: [(&str, &str); 14] = [
     ("rayon", "autodiff/"),
     ("safetensors", "weights.rs"),
     ("ort", "onnx/"),
+    ("rustysynth", "music/"),
     ("prost", "onnx/"),
 ];
 

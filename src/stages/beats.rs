@@ -23,10 +23,12 @@ pub enum BeatSource {
     Features,
     /// A beat list, which somebody wrote.
     BeatsFile,
+    /// The score that library played the song from.
+    Composed,
 }
 
 impl BeatSource {
-    const ALL: [Self; 3] = [Self::Tracker, Self::Features, Self::BeatsFile];
+    const ALL: [Self; 4] = [Self::Tracker, Self::Features, Self::BeatsFile, Self::Composed];
 
     /// Returns the source as the column `source` of `beats` spells it.
     pub fn name(self) -> &'static str {
@@ -34,6 +36,7 @@ impl BeatSource {
             Self::Tracker => "tracker",
             Self::Features => "features",
             Self::BeatsFile => "beats_file",
+            Self::Composed => "composed",
         }
     }
 

@@ -30,6 +30,7 @@ macro_rules! kinds {
 }
 
 kinds! {
+    AbcFormat = "abc_format",
     AudioCodec = "audio_codec",
     AudioData = "audio_data",
     AudioHeader = "audio_header",
@@ -68,6 +69,7 @@ kinds! {
     Pickle = "pickle",
     QuaternionNorm = "quaternion_norm",
     Shape = "shape",
+    SoundFont = "soundfont",
     Symlink = "symlink",
     /// A tempo that nobody dances to.
     Tempo = "tempo",
@@ -76,6 +78,8 @@ kinds! {
     TooLong = "too_long",
     TooShort = "too_short",
     Truncated = "truncated",
+    /// A score that could not be played.
+    Unplayable = "unplayable",
     Unreadable = "unreadable",
     Unwritable = "unwritable",
     /// What is in the store was written by another version of the program.

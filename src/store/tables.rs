@@ -39,9 +39,9 @@ rows! {
         n_feature_frames: Option<i64>, "frames", "Frames in the feature file, or of the features.";
         split: String, "", "`train` (90 %), `validation` (5 %) or `test` (5 %), by a stable hash of `phrase_id`; constructed phrases go with their song.";
         tempo_bpm: Option<f64>, "beats/min", "Tempo.";
-        tempo_source: Option<String>, "", "Where the tempo came from: `beats_file`, `features`, or `beat_tracker` (constructed phrases).";
+        tempo_source: Option<String>, "", "Where the tempo came from: `beats_file`, `features`, or, of constructed phrases, `beat_tracker` or `composed` (the song was played from a score).";
         beats_per_bar: Option<i32>, "beats", "Beats in a bar.";
-        beats_per_bar_source: Option<String>, "", "Where that came from: `beats_file` (numbered beats) or `default`.";
+        beats_per_bar_source: Option<String>, "", "Where that came from: `beats_file` (numbered beats), `composed` (the song was played from a score) or `default`.";
     }
 }
 
@@ -97,7 +97,7 @@ rows! {
         frame: i32, "frames", "The nearest frame of the phrase.";
         time_s: f64, "s", "Time of the beat; frame / 30 where the beat tracker found it. In a constructed phrase, from its begin, and beyond the first and last beat of the song at its median interval.";
         number: Option<i32>, "beats", "Number in the bar, 1 on the downbeat; none where nobody knows.";
-        source: Option<String>, "", "Where the beat came from: `beats_file` (ingest read the beat list), `features` (`beat_times` of a feature file) or `tracker` (found in the audio); of a constructed phrase, where those of its song came from. None in rows that release 0.1 wrote.";
+        source: Option<String>, "", "Where the beat came from: `beats_file` (ingest read the beat list), `features` (`beat_times` of a feature file) `tracker` (found in the audio) or `composed` (library played the song from a score that has it); of a constructed phrase, where those of its song came from. None in rows that release 0.1 wrote.";
     }
 }
 

@@ -257,7 +257,7 @@ fn nothing_to_dance_to_or_with_is_said_with_the_way_out() {
         format!(
             "error: store {place} has no songs: no phrase has audio and features; run first: motiongen \
              ingest --source MUSIC --store {place}, and then motiongen extract --store {place}; or name \
-             a folder of music with --songs\n"
+             a folder of music with --songs, or have some composed with --compose\n"
         )
     );
     assert_eq!(

@@ -5,9 +5,9 @@ use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 use super::super::kinematics::Poses;
 use super::super::quaternion::{from_axis_angle, make_sign_continuous, mul, rotate};
-use super::chance::Chance;
 use super::primitive::UP;
 use super::selection::Phrase;
+use crate::chance::Chance;
 use crate::units::frames_to_s;
 
 /// Half the side of the square that the dance never leaves, m.

@@ -3,8 +3,8 @@
 use std::ops::RangeInclusive;
 
 use super::beat_grid::BeatGrid;
-use super::chance::Chance;
 use super::primitive::{Primitive, Repertoire};
+use crate::chance::Chance;
 use crate::units::s_to_frames;
 
 /// Slowest and fastest that a primitive is danced, as a multiple of its captured speed.

@@ -9,8 +9,9 @@ use anyhow::{Context as _, bail};
 use super::captures::{Captures, Loaded};
 use super::known::Known;
 use super::layout::Output;
+use super::made::{self, Band, perform};
 use super::report::{Report, Tally};
-use super::songs::{Input, Song, Songs};
+use super::songs::{Files, Input, Song, Songs};
 use super::write::{Refusal, Writer, fingerprint, is_settled};
 use super::{Params, one, params_hash};
 use crate::stages::Progress;
@@ -27,6 +28,7 @@ pub struct Job<'a> {
     pub store: &'a Location,
     pub ledger: Ledger,
     pub known: Known,
+    pub band: Band,
     pub params: &'a Params,
     pub progress: &'a dyn Progress,
 }
@@ -43,7 +45,7 @@ impl Job<'_> {
         songs: &Songs,
         report: &mut Report,
     ) -> anyhow::Result<()> {
-        let Params { rules, output, force, dry_run, .. } = self.params;
+        let Params { rules, output, compose_audio, force, dry_run, .. } = self.params;
         let params_hash = params_hash(rules);
         let capture_names = captures.names();
         let (captures_origin, captures_print) =
@@ -52,6 +54,7 @@ impl Job<'_> {
             let print = fingerprint(song, &captures_print);
             !force
                 && output.is_none()
+                && (compose_audio.is_none() || !song.is_made())
                 && is_settled(song, &self.ledger, (&songs.origin, &params_hash), rules, &print)
         };
         let (sound, problems): (Vec<Song>, Vec<Song>) =
@@ -174,6 +177,19 @@ impl Job<'_> {
         let danced = guarded(&song.id, || {
             let music = {
                 let _share = budget.take(input.needed_bytes());
+                let input = match &song.files {
+                    Files::Made { piece, seed, .. } => {
+                        let performance = perform(song, piece, *seed, &self.band)?;
+                        if let Some(folder) = &self.params.compose_audio
+                            && let Err(e) = made::write(folder, song, &performance)
+                        {
+                            let e = anyhow::Error::new(e).context("while writing --compose-audio");
+                            return Ok(Err(Refusal::Store(e)));
+                        }
+                        Input::Performed(performance)
+                    }
+                    _ => input,
+                };
                 one::read(song, input)?
             };
             Ok(writer.song(song, &music))
@@ -232,6 +248,10 @@ impl Input {
     fn needed_bytes(&self) -> u64 {
         match self {
             Input::Features(_) => 0,
+            Input::Unplayed { duration_s } => {
+                needed_bytes(*duration_s, 0) + made::needed_bytes(*duration_s)
+            }
+            Input::Performed(_) => 0,
             // Its length is not known before it is decoded: room for what is held of the longest.
             Input::Files { .. } => needed_bytes(360.0, 0),
         }

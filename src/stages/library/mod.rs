@@ -5,6 +5,7 @@ mod captures;
 mod job;
 mod known;
 mod layout;
+mod made;
 mod one;
 mod report;
 mod rows;
@@ -22,6 +23,7 @@ use crate::store::{Ledger, Location, StoreError, digest};
 use captures::Captures;
 use job::Job;
 use known::Known;
+use made::Band;
 use report::{Place, Report, Tally};
 use songs::{Files, Song, Songs};
 use split::Share;
@@ -47,6 +49,22 @@ pub struct Params {
     /// Folder or bucket of motion captures: any tree of .bvh and .npy ([frames, 25]) files.
     #[arg(long, value_name = "DIR")]
     pub captures: Option<String>,
+    /// Compose so many songs, play them, and dance to them, too: 22 styles of 70 to 180 bpm, in bars of
+    /// three and four, whose beats are known. They are all for training. --seed chooses others.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub compose: u32,
+    /// Folder or bucket of tunes in ABC notation (any tree of .abc files): each is given chords, bass and drums,
+    /// is played, and danced to, too, for training alone.
+    #[arg(long, value_name = "DIR")]
+    pub tunes: Option<String>,
+    /// Play composed songs and tunes with the instruments of a General MIDI soundfont (SF2), instead of our own
+    /// voices.
+    #[cfg(feature = "soundfont")]
+    #[arg(long, value_name = "FILE")]
+    pub soundfont: Option<PathBuf>,
+    /// Also write the songs that are composed or played in this run: NAME.wav and NAME.beats.txt.
+    #[arg(long, value_name = "DIR")]
+    pub compose_audio: Option<PathBuf>,
     /// Also write the phrases as files, in the layout that ingest reads.
     #[arg(long, value_name = "DIR")]
     pub output: Option<PathBuf>,
@@ -112,10 +130,21 @@ impl Stage for Library {
         };
         let mut songs = match &params.songs {
             Some(url) => Songs::of_folder(url, &options, &known)?,
-            None => Songs::of_store(&store, &mut known)?,
+            None => {
+                let is_needed = params.compose == 0 && params.tunes.is_none();
+                Songs::of_store(&store, &mut known, is_needed)?
+            }
         };
+        #[cfg(feature = "soundfont")]
+        let band = Band::of(params.soundfont.as_deref())?;
+        #[cfg(not(feature = "soundfont"))]
+        let band = Band::default();
+        songs.songs.extend(made::composed(params.compose, params.rules.seed, &band));
+        if let Some(url) = &params.tunes {
+            songs.songs.extend(made::tunes(url, &options, params.rules.seed, &band)?);
+        }
         prepare(&mut songs, &params)?;
-        let job = Job { store: &store, ledger, known, params: &params, progress };
+        let job = Job { store: &store, ledger, known, band, params: &params, progress };
         let mut report = Report {
             place: Place { store: store.to_string(), output: params.output.clone() },
             dry_run: params.dry_run,
@@ -143,15 +172,18 @@ fn prepare(songs: &mut Songs, params: &Params) -> anyhow::Result<()> {
         }
     }
     // A song that cannot be danced to takes no place in a split.
-    let names: Vec<String> =
-        songs.songs.iter().filter(|s| s.problem.is_none()).map(|s| s.id.clone()).collect();
+    // Music of our own is for training: a verdict rests on real songs.
+    let real = songs.songs.iter().filter(|song| song.problem.is_none() && !song.is_made());
+    let names: Vec<String> = real.map(|song| song.id.clone()).collect();
     let of =
         split::assign(names.iter().map(String::as_str), params.validation_songs, params.test_songs)
             .map_err(anyhow::Error::msg)?;
     for song in &mut songs.songs {
         song.split = of.get(song.id.as_str()).copied().unwrap_or(split::TRAIN);
     }
-    if names.len() < 3 {
+    if names.is_empty() {
+        tracing::warn!("no song is real, so none is for validation and for the test");
+    } else if names.len() < 3 {
         tracing::warn!("{} songs are too few to split: all of them are for training", names.len());
     }
     Ok(())

@@ -6,6 +6,7 @@ use std::time::Duration;
 use ndarray::{Array2, ArrayView1, s};
 use xxhash_rust::xxh3::xxh3_64_with_seed;
 
+use super::made::{Performance, beats_text};
 use super::songs::{Files, Input, Song};
 use super::{Rules, unreadable};
 use crate::audio::BLOCKS;
@@ -53,6 +54,9 @@ pub struct Constructed {
 impl Music {
     /// Returns where the number of beats in a bar came from, as `phrases` spells it.
     pub fn beats_per_bar_source(&self) -> &'static str {
+        if self.beat_source == BeatSource::Composed {
+            return self.beat_source.name();
+        }
         match self.beats.beats_per_bar_source() {
             BeatsPerBarSource::Given | BeatsPerBarSource::Numbers => BeatSource::BeatsFile.name(),
             BeatsPerBarSource::Default => beats::DEFAULT,
@@ -63,7 +67,9 @@ impl Music {
     pub fn tempo_source(&self) -> &'static str {
         match self.beat_source {
             BeatSource::Tracker => "beat_tracker",
-            BeatSource::Features | BeatSource::BeatsFile => self.beat_source.name(),
+            BeatSource::Features | BeatSource::BeatsFile | BeatSource::Composed => {
+                self.beat_source.name()
+            }
         }
     }
 }
@@ -89,8 +95,6 @@ pub fn read(song: &Song, input: Input) -> Result<Music, Failure> {
             Input::Files { audio: content, beat_list: list, .. },
         ) => {
             let mut lines = String::new();
-            let rules =
-                extract::Rules { tuning: None, max_duration_s: MAX_DURATION_S, timeout: TIMEOUT };
             let list = match (beat_list, list) {
                 (Some(file), Some(content)) => {
                     let bytes = small_bytes(file, content)?;
@@ -99,26 +103,46 @@ pub fn read(song: &Song, input: Input) -> Result<Music, Failure> {
                 }
                 _ => None,
             };
-            let mut song_hash = None;
-            let see = |hash: &str| {
-                song_hash = Some(hash.to_owned());
-                lines += &format!("audio {hash}\n");
-                true
-            };
-            let found = extract::extract(extract::Origin::Audio, audio, content, see, &rules)?;
-            let (features, input_hash) = (found.frames, digest(lines.as_bytes()));
-            match list {
-                Some(beats) => {
-                    let beat_source = BeatSource::BeatsFile;
-                    Ok(Music { features, beats, beat_source, input_hash, song_hash })
-                }
-                None => {
-                    let tracked_s = found.beats.iter().map(|beat| beat.1).collect();
-                    tracked(song, features, tracked_s, Digests { input_hash, song_hash })
-                }
-            }
+            let list = list.map(|beats| (beats, BeatSource::BeatsFile));
+            listen(song, audio, content, list, lines)
+        }
+        (Files::Made { .. }, Input::Performed(Performance { wav, beats, .. })) => {
+            let size_bytes = wav.len() as u64;
+            let (path, fingerprint) = (format!("{}.wav", song.id), String::new());
+            let audio = SourceFile { path, size_bytes, fingerprint };
+            let lines = format!("beats {}\n", digest(beats_text(&beats).as_bytes()));
+            let known = Some((beats, BeatSource::Composed));
+            listen(song, &audio, Ok(Content::Bytes(wav)), known, lines)
         }
         _ => Err(Failure::new(FailureKind::Unreadable, &song.id, "was not read")),
+    }
+}
+
+/// Hears a song whose beats may be known; `lines` tell what else it was read from.
+fn listen(
+    song: &Song,
+    audio: &SourceFile,
+    content: Result<Content, StoreError>,
+    known: Option<(Beats, BeatSource)>,
+    mut lines: String,
+) -> Result<Music, Failure> {
+    let rules = extract::Rules { tuning: None, max_duration_s: MAX_DURATION_S, timeout: TIMEOUT };
+    let mut song_hash = None;
+    let see = |hash: &str| {
+        song_hash = Some(hash.to_owned());
+        lines += &format!("audio {hash}\n");
+        true
+    };
+    let found = extract::extract(extract::Origin::Audio, audio, content, see, &rules)?;
+    let (features, input_hash) = (found.frames, digest(lines.as_bytes()));
+    match known {
+        Some((beats, beat_source)) => {
+            Ok(Music { features, beats, beat_source, input_hash, song_hash })
+        }
+        None => {
+            let tracked_s = found.beats.iter().map(|beat| beat.1).collect();
+            tracked(song, features, tracked_s, Digests { input_hash, song_hash })
+        }
     }
 }
 
@@ -144,7 +168,8 @@ fn no_beats(song: &Song, n_beats: usize, n_frames: usize) -> Failure {
     refused(song, &SongError::NoBeats { n_beats, duration_s: frames_to_s(n_frames) })
 }
 
-fn small_bytes(
+/// Reads a file that fits into memory.
+pub fn small_bytes(
     file: &SourceFile,
     content: Result<Content, StoreError>,
 ) -> Result<bytes::Bytes, Failure> {

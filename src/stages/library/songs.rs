@@ -7,6 +7,7 @@ use anyhow::bail;
 use ndarray::Array2;
 
 use super::Known;
+use super::made::{Performance, Piece};
 use crate::motion::Beats;
 use crate::stages::beats::BeatSource;
 use crate::stages::failure::{Failure, FailureKind};
@@ -54,6 +55,16 @@ pub enum Files {
         audio: SourceFile,
         beat_list: Option<SourceFile>,
     },
+    /// None that can be read.
+    Missing,
+    /// None: it is played from a score.
+    Made {
+        piece: Piece,
+        /// Chooses who plays it, and how.
+        seed: u64,
+        /// At most.
+        duration_s: f64,
+    },
 }
 
 /// What was read of a song.
@@ -65,6 +76,11 @@ pub enum Input {
         /// The read-ahead budget of the files, given back when the song is done.
         _permits: Vec<Box<dyn Send>>,
     },
+    /// The song has still to be played.
+    Unplayed {
+        duration_s: f64,
+    },
+    Performed(Performance),
 }
 
 /// Songs that were found.
@@ -77,6 +93,7 @@ pub struct Songs {
     place: Place,
 }
 
+#[derive(Clone)]
 enum Place {
     Store(Location),
     Folder(Source),
@@ -86,9 +103,9 @@ impl Songs {
     /// Finds the songs of a store: phrases with audio whose features extract has.
     ///
     /// # Errors
-    /// When there is none.
-    pub fn of_store(store: &Location, known: &mut Known) -> anyhow::Result<Self> {
-        if known.songs.is_empty() {
+    /// When there is none and one is needed.
+    pub fn of_store(store: &Location, known: &mut Known, is_needed: bool) -> anyhow::Result<Self> {
+        if known.songs.is_empty() && is_needed {
             let hint = match known.n_without_features {
                 0 => {
                     format!("run first: motiongen ingest --source MUSIC --store {store}, and then")
@@ -97,7 +114,8 @@ impl Songs {
             };
             bail!(
                 "store {store} has no songs: no phrase has audio and features; {hint} motiongen \
-                 extract --store {store}; or name a folder of music with --songs"
+                 extract --store {store}; or name a folder of music with --songs, or have some composed with \
+                 --compose"
             );
         }
         let songs = std::mem::take(&mut known.songs);
@@ -171,17 +189,23 @@ impl Songs {
 
     /// Splits off what reads the songs `todo`.
     pub fn feeding(&self, todo: Vec<Song>) -> Feeding {
-        match &self.place {
-            Place::Store(store) => Feeding::Store { store: store.clone(), songs: todo },
-            Place::Folder(source) => Feeding::Folder { source: source.clone(), songs: todo },
-        }
+        let (made, read) = todo.into_iter().partition(Song::is_made);
+        Feeding { place: self.place.clone(), read, made }
+    }
+}
+
+impl Song {
+    /// Returns whether the song is played here, and not read.
+    pub fn is_made(&self) -> bool {
+        matches!(self.files, Files::Made { .. })
     }
 }
 
 /// Songs on their way to the workers.
-pub enum Feeding {
-    Store { store: Location, songs: Vec<Song> },
-    Folder { source: Source, songs: Vec<Song> },
+pub struct Feeding {
+    place: Place,
+    read: Vec<Song>,
+    made: Vec<Song>,
 }
 
 impl Feeding {
@@ -190,20 +214,25 @@ impl Feeding {
     /// # Errors
     /// [`StoreError`] when the table of features cannot be read.
     pub fn run(self, sender: &SyncSender<(Song, Input)>) -> Result<(), StoreError> {
-        match self {
-            Feeding::Folder { source, songs } => {
-                send_files(&source, songs, sender);
-                Ok(())
-            }
-            Feeding::Store { store, songs } => send_features(&store, songs, sender),
+        match &self.place {
+            _ if self.read.is_empty() => {}
+            Place::Folder(source) => send_files(source, self.read, sender),
+            Place::Store(store) => send_features(store, self.read, sender)?,
         }
+        for song in self.made {
+            let Files::Made { duration_s, .. } = song.files else { continue };
+            if sender.send((song, Input::Unplayed { duration_s })).is_err() {
+                break;
+            }
+        }
+        Ok(())
     }
 }
 
 fn send_files(source: &Source, songs: Vec<Song>, sender: &SyncSender<(Song, Input)>) {
     let files = songs.iter().flat_map(|song| match &song.files {
         Files::Folder { audio, beat_list } => vec![Some(audio.clone()), beat_list.clone()],
-        Files::Store { .. } => Vec::new(),
+        Files::Store { .. } | Files::Made { .. } | Files::Missing => Vec::new(),
     });
     let mut reader = source.read_in_order(files.flatten().collect());
     for song in songs {
