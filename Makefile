@@ -27,6 +27,10 @@ build: ## build the executables (dev profile)
 demo: build setup ## from tests/data to tables, a library, trained networks, a plot and answers (build/demo)
 	@$(MAKE) --file pipelines/demo.mk BIN=$(BIN)
 
+.PHONY: pretrained
+pretrained: build setup ## train the model that ships with the program again (models/pretrained)
+	@$(MAKE) --file pipelines/pretrained.mk BIN=$(BIN)
+
 .PHONY: ingest
 ingest: build ## ingest your own files: make ingest SOURCE=… STORE=… [SHARDS=8 -j4]
 	@$(MAKE) --file pipelines/ingest.mk BIN=$(BIN)

@@ -1,6 +1,6 @@
 # The demo: real music and real motion capture (tests/data) become tables, the music's features are
-# extracted, phrases to train on are constructed from both, small networks are trained on them and
-# fine-tuned, they become ONNX files, motion is made for all songs and evaluated, and queries answer.
+# extracted, phrases to train on are constructed from both, small networks are trained on them, they
+# become ONNX files, motion is made for all songs and evaluated, and queries answer.
 #
 #   make demo                              builds first
 #   make -f pipelines/demo.mk BIN=…        with executables that are there already
@@ -49,20 +49,17 @@ LIBRARY := $(STAMPS)/library.done
 $(LIBRARY): $(EXTRACTED) $(CONFIG) $(MOTIONGEN)
 	$(call stage,$(MOTIONGEN) library --config $(CONFIG) --store $(STORE))
 
-# train, finetune: a network that is small enough to learn in minutes.
+# train: a network that is small enough to learn in minutes.
 TRAINED := $(STAMPS)/train-$(RUN).done
 $(TRAINED): $(LIBRARY) $(CONFIG) $(MOTIONGEN)
 	$(call stage,$(MOTIONGEN) train --config $(CONFIG) --store $(STORE) --run $(RUN))
-FINETUNED := $(STAMPS)/finetune-$(RUN).done
-$(FINETUNED): $(TRAINED) $(CONFIG) $(MOTIONGEN)
-	$(call stage,$(MOTIONGEN) finetune --config $(CONFIG) --store $(STORE) --run $(RUN))
 PLOT := $(OUT)/training-$(RUN).png
-$(PLOT): $(FINETUNED)
+$(PLOT): $(TRAINED)
 	$(MOTIONGEN) plot training --store $(STORE) --run $(RUN) --output $@
 
 # export: the networks as ONNX files, held against the interpreter that trained them.
 EXPORTED := $(STAMPS)/export-$(MODEL).done
-$(EXPORTED): $(FINETUNED) $(CONFIG) $(MOTIONGEN)
+$(EXPORTED): $(TRAINED) $(CONFIG) $(MOTIONGEN)
 	$(call stage,$(MOTIONGEN) export --config $(CONFIG) --store $(STORE) --run $(RUN) --model $(MODEL) --force)
 
 # generate: motion for every song in tables, and for one of them in files that can be looked at.
@@ -136,7 +133,7 @@ comma := ,
 ask = @{ echo; echo '$(1)'; $(MOTIONGEN) query --config $(CONFIG) --store $(STORE) \
 	'$(subst $(newline), ,$($(2)))'; } | tee --append $@.new
 
-$(ANSWERS): $(INGESTED) $(EXTRACTED) $(LIBRARY) $(FINETUNED) $(EXPORTED) $(PLOT) $(GENERATED) $(PAGE) $(REPORT)
+$(ANSWERS): $(INGESTED) $(EXTRACTED) $(LIBRARY) $(TRAINED) $(EXPORTED) $(PLOT) $(GENERATED) $(PAGE) $(REPORT)
 	@rm -f $@.new
 	@{ echo; echo 'What is there?'; $(MOTIONGEN) query --store $(STORE) --tables; } | tee $@.new
 	$(call ask,How much is in each split?,SPLITS)

@@ -1,4 +1,4 @@
-# Trains and fine-tunes on the phrases of a store, and draws how it went.
+# Trains on the phrases of a store, fine-tunes where that is asked for, and draws how it went.
 #
 #   make train STORE=gs://bucket/tables RUN=night                 a run of 20 minutes
 #   make train STORE=… RUN=… TRAIN='--preset base --epochs 100' FINETUNE='--epochs 50'
@@ -9,7 +9,8 @@ STORE    ?=
 RUN      ?=
 CONFIG   ?=
 TRAIN    ?= --preset small --minutes 20
-FINETUNE ?= --minutes 10
+# Flags of finetune; none, and the run is left as it was trained.
+FINETUNE ?=
 OUT      ?= build/train/$(RUN)
 
 .DEFAULT_GOAL := train
@@ -28,8 +29,8 @@ train:
 TRAINED := $(STAMPS)/train.done
 $(TRAINED): $(CONFIG) $(MOTIONGEN)
 	$(call stage,$(MOTIONGEN) train $(SETTINGS) $(TRAIN))
-FINETUNED := $(STAMPS)/finetune.done
-$(FINETUNED): $(TRAINED)
+FINETUNED := $(if $(FINETUNE),$(STAMPS)/finetune.done,$(TRAINED))
+$(STAMPS)/finetune.done: $(TRAINED)
 	$(call stage,$(MOTIONGEN) finetune $(SETTINGS) $(FINETUNE))
 $(PLOT): $(FINETUNED)
 	$(MOTIONGEN) plot training --store '$(STORE)' --run '$(RUN)' --output $@

@@ -377,6 +377,70 @@ fn a_song_becomes_files_and_a_stream() {
     assert!(again.stdout.contains("nothing to do: 1 motions are up to date"), "{again:?}");
 }
 
+/// The clock is heard: without it, and with the bars a beat later, the same noise becomes another motion.
+#[test]
+fn the_clock_is_heard_unless_it_is_withheld() {
+    let dir = Dir::new();
+    let store = modelled(&dir);
+    let model = store.join("models/m").display().to_string();
+    let song = dir.write("song.wav", crate::support::files::wav(3.1)).display().to_string();
+    let dance = |name: &str, beats: &str, more: &[&str]| {
+        dir.write("song.beats.txt", beats);
+        let out = dir.at(name);
+        let mut command = motiongen();
+        command.args(["generate", "--model", &model, "--audio", &song, "--quiet", "--overlap=7"]);
+        command.args(["--engine=eager", "--steps=3", "--format=npy", "--raw", "--output"]).arg(&out);
+        let output = finish(command.args(more));
+        assert_eq!(output.code, 0, "{output:?}");
+        std::fs::read(out.join("song.npy")).expect("a motion")
+    };
+    let list = |first: usize| {
+        let line = |i: usize| format!("{} {}\n", 0.25 + 0.5 * i as f64, (i + first) % 4 + 1);
+        (0..6).map(line).collect::<String>()
+    };
+    let heard = dance("heard", &list(0), &[]);
+    assert_eq!(heard, dance("again", &list(0), &[]));
+    assert_ne!(heard, dance("later", &list(1), &[]));
+    let withheld = dance("withheld", &list(0), &["--no-clock"]);
+    assert_ne!(heard, withheld);
+    // Whoever does not hear the bars dances alike to all.
+    assert_eq!(withheld, dance("withheld_later", &list(1), &["--no-clock"]));
+}
+
+/// With nothing but the executable and a song.
+#[cfg(feature = "pretrained")]
+#[test]
+fn a_song_is_danced_to_by_the_model_of_the_program() {
+    let dir = Dir::new();
+    let song = dir.write("song.wav", crate::support::files::wav(3.1)).display().to_string();
+    let out = dir.at("out");
+    let mut command = motiongen();
+    command.env_remove("ORT_DYLIB_PATH").env("HOME", dir.at("home"));
+    command.args(["generate", "--audio", &song, "--output"]).arg(&out).args(["--quiet"]);
+    let output = finish(command.args(["--format", "npy,glb,html"]));
+    assert_eq!(output.code, 0, "{output:?}");
+    assert!(output.stdout.contains("model pretrained, eager ("), "{output:?}");
+    assert!(!output.stderr.contains("onnxruntime"), "{output:?}");
+    for extension in ["npy", "glb", "html"] {
+        assert!(out.join(format!("song.{extension}")).exists(), "{extension}");
+    }
+    assert!(!dir.at("home").exists(), "nothing is written but the output");
+    // In a store the model is known by its name.
+    let store = make_store(&dir);
+    let output = finish(&mut command_of_store(&store));
+    assert_eq!(output.code, 0, "{output:?}");
+    let generations = generations(&store);
+    assert!(generations.iter().all(|row| row.run == "pretrained" && row.model == "pretrained"));
+    assert_eq!(generations.len(), 16);
+}
+
+#[cfg(feature = "pretrained")]
+fn command_of_store(store: &Path) -> Command {
+    let mut command = motiongen();
+    command.args(["generate", "--quiet", "--steps=2", "--guidance=1", "--store"]).arg(store);
+    command
+}
+
 #[test]
 fn a_motion_is_continued_and_a_broken_one_refused() {
     let dir = Dir::new();

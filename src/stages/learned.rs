@@ -1,10 +1,13 @@
 //! What a run learns from, what its model's card says of it, and what evaluate may believe.
 
+use bytes::Bytes;
+
 use super::generate::weights_digest;
 use super::model_files::{folder_of, is_model_name};
 use super::train::session::{Looker, MachineParams, read_phrases};
 use super::trained::{Trained, Tuned};
-use super::{Progress, Stage as _, finetune::Finetune, train::Train};
+use super::{Progress, Stage as _, finetune::Finetune, pretrained, train::Train};
+
 use crate::generation::{CardError, LearnedFrom, ModelCard, Purpose, file_names};
 use crate::store::{Location, Patience, StoreError};
 use crate::training::{Dataset, Split};
@@ -153,9 +156,7 @@ pub fn of_model(
     weights: &str,
 ) -> Result<Result<LearnedFrom, NotKnown>, StoreError> {
     let path = format!("{}/{}", folder_of(model), file_names::CARD);
-    // The name is from a table, where a foreign one may say anything.
-    let bytes = if is_model_name(model) { store.read_if_there(&path)? } else { None };
-    let Some(bytes) = bytes else {
+    let Some(bytes) = card_of(store, model)? else {
         let (store, model) = (store.to_string(), model.to_owned());
         return Ok(Err(NotKnown::NoModel { store, model }));
     };
@@ -183,7 +184,18 @@ pub fn of_model(
 /// [`StoreError`] when the store cannot be read.
 pub fn has_weights(store: &Location, model: &str, weights: &str) -> Result<bool, StoreError> {
     let path = format!("{}/{}", folder_of(model), file_names::CARD);
-    let bytes = if is_model_name(model) { store.read_if_there(&path)? } else { None };
-    let card = bytes.and_then(|bytes| ModelCard::read(&bytes, &store.url_of(&path)).ok());
+    let card = card_of(store, model)?;
+    let card = card.and_then(|bytes| ModelCard::read(&bytes, &store.url_of(&path)).ok());
     Ok(card.is_some_and(|card| weights_digest(&card) == weights))
+}
+
+/// Returns the card of a model of the store, or of the one that ships with the program.
+fn card_of(store: &Location, model: &str) -> Result<Option<Bytes>, StoreError> {
+    // The name is from a table, where a foreign one may say anything.
+    if !is_model_name(model) {
+        return Ok(None);
+    }
+    let path = format!("{}/{}", folder_of(model), file_names::CARD);
+    let of_program = || (model == pretrained::NAME).then(|| pretrained::file(file_names::CARD));
+    Ok(store.read_if_there(&path)?.or_else(|| of_program().flatten()))
 }

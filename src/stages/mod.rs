@@ -15,6 +15,7 @@ pub mod model;
 mod model_files;
 mod motion_source;
 pub mod plot;
+mod pretrained;
 #[cfg(feature = "query")]
 pub mod query;
 mod retrieval;

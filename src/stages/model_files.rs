@@ -8,7 +8,7 @@ use anyhow::{Context as _, bail};
 use bytes::Bytes;
 use sha2::{Digest as _, Sha256};
 
-use super::all_threads;
+use super::{all_threads, pretrained};
 use crate::autodiff::Parameters;
 use crate::generation::{
     CardError, EagerEngine, Engine, FileEntry, ModelCard, OnnxEngine, SessionPlan, file_names,
@@ -66,11 +66,18 @@ pub fn default_model_cache() -> PathBuf {
 /// A model whose files are at hand on this machine.
 pub struct OpenModel {
     pub card: ModelCard,
-    folder: PathBuf,
+    source: Source,
     /// What messages call it.
     place: String,
     /// Whether the files' digests are known to be those of the card.
     is_verified: bool,
+}
+
+/// Where a model's files are.
+enum Source {
+    Folder(PathBuf),
+    /// Within the program.
+    Pretrained,
 }
 
 /// Returns where a model lies below a store.
@@ -94,6 +101,9 @@ impl OpenModel {
         let folder = folder_of(name);
         let path = format!("{folder}/{}", file_names::CARD);
         let bytes = match store.read(&path) {
+            Err(StoreError::NotFound { .. }) if name == pretrained::NAME => {
+                return Self::pretrained();
+            }
             Err(StoreError::NotFound { .. }) => bail!(
                 "store {store} has no model \"{name}\"{}; run motiongen export --store {store} --run RUN \
                  --model {name} first",
@@ -104,7 +114,8 @@ impl OpenModel {
         let card = ModelCard::read(&bytes, &store.url_of(&path))?;
         let place = store.url_of(&folder);
         if let Some(root) = store.local_path() {
-            return Ok(Self { card, folder: root.join(folder), place, is_verified: false });
+            let source = Source::Folder(root.join(folder));
+            return Ok(Self { card, source, place, is_verified: false });
         }
         let key = format!("model-{}", &sha256(&bytes)[..32]);
         let fetched = prepared(cache, &key, |into| {
@@ -117,7 +128,7 @@ impl OpenModel {
             }
             anyhow::Ok(())
         })?;
-        Ok(Self { card, folder: fetched, place, is_verified: true })
+        Ok(Self { card, source: Source::Folder(fetched), place, is_verified: true })
     }
 
     /// Opens a model in a folder of this machine.
@@ -129,7 +140,52 @@ impl OpenModel {
         let bytes = store.read(file_names::CARD)?;
         let card = ModelCard::read(&bytes, &store.url_of(file_names::CARD))?;
         let place = folder.display().to_string();
-        Ok(Self { card, folder: folder.to_owned(), place, is_verified: false })
+        let source = Source::Folder(folder.to_owned());
+        Ok(Self { card, source, place, is_verified: false })
+    }
+
+    /// Opens the model that ships with the program.
+    ///
+    /// # Errors
+    /// When the program was built without it.
+    pub fn pretrained() -> anyhow::Result<Self> {
+        let Some(bytes) = pretrained::file(file_names::CARD) else {
+            bail!(
+                "this program was built without a model (feature pretrained); name one: --model NAME of a store, or \
+                 the folder of one"
+            )
+        };
+        let card = ModelCard::read(&bytes, pretrained::PLACE)?;
+        let place = pretrained::PLACE.to_owned();
+        Ok(Self { card, source: Source::Pretrained, place, is_verified: false })
+    }
+
+    /// Returns the folder of the files; those of the program are written into the cache first.
+    fn folder(&self, cache: &Path) -> anyhow::Result<PathBuf> {
+        if let Source::Folder(folder) = &self.source {
+            return Ok(folder.clone());
+        }
+        let key = format!("model-{}", &sha256(&serde_json::to_vec(&self.card)?)[..32]);
+        prepared(cache, &key, |into| {
+            for file in &self.card.files {
+                let bytes = self.bytes(&file.name)?;
+                verify(file, &sha256(&bytes), &self.place)?;
+                let to = into.join(&file.name);
+                crate::store::write_file(&to, |out| out.write_all(&bytes))
+                    .with_context(|| to.display().to_string())?;
+            }
+            anyhow::Ok(())
+        })
+    }
+
+    /// Reads a file as it is.
+    fn bytes(&self, name: &str) -> anyhow::Result<Bytes> {
+        match &self.source {
+            Source::Folder(folder) => Ok(Location::local(folder)?.read(name)?),
+            Source::Pretrained => {
+                pretrained::file(name).with_context(|| format!("{} has no file {name}", self.place))
+            }
+        }
     }
 
     /// Makes an engine: onnxruntime's or ours, and what to tell of the choice.
@@ -147,7 +203,10 @@ impl OpenModel {
         let eager = || -> anyhow::Result<Box<dyn Engine>> {
             Ok(Box::new(self.eager(n_workers, n_threads)?))
         };
-        if params.engine == EngineChoice::Eager {
+        // What the program has in itself needs nothing beside it.
+        let needs_nothing =
+            params.engine == EngineChoice::Auto && matches!(self.source, Source::Pretrained);
+        if params.engine == EngineChoice::Eager || needs_nothing {
             return Ok((eager()?, None));
         }
         let asked = Device::from_environment()?;
@@ -241,7 +300,7 @@ impl OpenModel {
     /// Reads a file and holds it against the card.
     fn read(&self, name: &'static str) -> anyhow::Result<Bytes> {
         let entry = self.card.file(name, &self.place)?;
-        let bytes = Location::local(&self.folder)?.read(name)?;
+        let bytes = self.bytes(name)?;
         if !self.is_verified {
             verify(entry, &sha256(&bytes), &self.place)?;
         }
@@ -259,8 +318,9 @@ impl OpenModel {
         cache: &Path,
     ) -> anyhow::Result<OnnxEngine> {
         let config = &self.card.unet;
-        let unet = self.folder.join(file_names::UNET);
-        let decoder = self.folder.join(file_names::DECODER);
+        let folder = self.folder(cache)?;
+        let unet = folder.join(file_names::UNET);
+        let decoder = folder.join(file_names::DECODER);
         // Files are looked through while onnxruntime loads what it has of them already.
         std::thread::scope(|scope| {
             let verified = scope.spawn(|| self.verify());
@@ -304,9 +364,8 @@ impl OpenModel {
         if self.is_verified {
             return Ok(());
         }
-        let folder = Location::local(&self.folder)?;
         for file in &self.card.files {
-            verify(file, &sha256(&folder.read(&file.name)?), &self.place)?;
+            verify(file, &sha256(&self.bytes(&file.name)?), &self.place)?;
         }
         Ok(())
     }

@@ -105,6 +105,19 @@ fn a_run_becomes_a_model_that_was_checked() {
     assert!(rounding.len() == 1 && rounding[0].rms > 0.0 && rounding[0].precision == "fp16");
 }
 
+/// A style that is not asked for is one of zeros in the files and in the interpreter: the projection has a bias.
+#[test]
+fn a_run_with_a_style_becomes_a_model_too() {
+    let dir = Dir::new();
+    let store = make_store(&dir);
+    let output = train(&store, "run", &[&TRAINED[..], &["--style", "--no-clock"]].concat());
+    assert_eq!(output.code, 0, "{output:?}");
+    let output = export(&store, &[]);
+    assert_eq!(output.code, 0, "{output:?}");
+    assert_eq!(card(&store)["unet"]["style_dim"], 8);
+    assert_eq!(card(&store)["unet"]["clock"], false);
+}
+
 fn sha256_by_python(path: &Path) -> String {
     let code =
         "import hashlib, sys; print(hashlib.sha256(open(sys.argv[1], 'rb').read()).hexdigest())";

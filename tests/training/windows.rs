@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 
+use motiongen::model::{Preset, UNetConfig};
 use motiongen::motion::{Channel, MOTION_DIM, Normalizer};
 use motiongen::training::{Augmentation, Dataset, Loader, Split, Windows, fit_scales};
 use ndarray::{Array2, s};
@@ -62,6 +63,51 @@ fn longer_phrases_have_several_windows_and_shorter_ones_are_held() {
     let mean = batch.noise.iter().sum::<f32>() / n;
     let square = batch.noise.iter().map(|z| z * z).sum::<f32>() / n;
     assert!(mean.abs() < 5.0 / n.sqrt() && (square - 1.0).abs() < 5.0 * (2.0 / n).sqrt());
+}
+
+#[test]
+fn a_network_that_hears_the_clock_gets_that_of_the_frames_it_sees() {
+    let hears = UNetConfig { clock: true, ..Preset::Tiny.config() };
+    let stretched = Augmentation { stretch: 0.25, mirror: true, ..PLAIN };
+    // Bars of 66 frames; motion of nothing else.
+    let motion = |n: usize| {
+        let mut frames = Array2::<f32>::zeros((n, MOTION_DIM));
+        for (t, mut row) in frames.rows_mut().into_iter().enumerate() {
+            row[Channel::Quaternion.range().start] = 1.0;
+            row[Channel::Phase.range().start] = (t as f32 / 66.0 + 0.3).fract();
+        }
+        frames
+    };
+    let phrase = |n: usize| ("a", Split::Train, motion(n), Array2::zeros((n, 163)));
+    let dataset = Arc::new(Dataset::in_memory([phrase(200)]).expect("in memory"));
+    let windows = Windows::new(dataset, Normalizer::identity(), stretched, 50, 7);
+    assert_eq!(windows.train(&[(0, 0)]).expect("at hand").audio.len(), 50 * 163);
+    let windows = windows.heard_by(&hears);
+    let batch = windows.train(&[(0, 0), (1, 0), (2, 0)]).expect("at hand");
+    assert_eq!(batch.audio.len(), 3 * 50 * hears.condition_dim());
+    let mut tempi = Vec::new();
+    for window in 0..3 {
+        for t in 0..50 {
+            let row = window * 50 + t;
+            let phase = batch.motion[row * MOTION_DIM + Channel::Phase.range().start];
+            let heard = &batch.audio[row * 173..(row + 1) * 173][163..];
+            let angle = std::f32::consts::TAU * phase;
+            // Single precision, four times.
+            assert!((heard[0] - angle.cos()).abs() < 1e-5 && (heard[1] - angle.sin()).abs() < 1e-5);
+            assert!((heard[6] - (4.0 * angle).cos()).abs() < 1e-5, "{heard:?}");
+            assert_eq!(heard[9], 1.0);
+            tempi.push(120.0 * f64::from(heard[8]).exp());
+        }
+    }
+    // Four beats in 66 frames are 109.1 beats a minute, and a quarter faster or slower.
+    assert!(tempi.iter().all(|tempo| (109.0 * 0.75..110.0 * 1.25).contains(tempo)), "{tempi:?}");
+    assert!((tempi[0] - tempi[149]).abs() > 1.0, "windows of other rates have other tempi");
+    // Validation sees phrases as they are.
+    let phrase = ("a", Split::Validation, motion(50), Array2::zeros((50, 163)));
+    let dataset = Arc::new(Dataset::in_memory([phrase]).expect("in memory"));
+    let windows = Windows::new(dataset, Normalizer::identity(), PLAIN, 50, 7).heard_by(&hears);
+    let heard = windows.validation(0..1).expect("at hand").audio[163 + 8];
+    assert!((120.0 * f64::from(heard).exp() - 4.0 * 1800.0 / 66.0).abs() < 1e-2, "{heard}");
 }
 
 #[test]

@@ -147,16 +147,17 @@ impl Stage for Generate {
 
 /// Opens the model of a store, or in a folder.
 fn open_model(params: &Params, store: Option<&Location>) -> anyhow::Result<OpenModel> {
-    let folder = Path::new(&params.model);
+    let Some(model) = &params.model else { return OpenModel::pretrained() };
+    let folder = Path::new(model);
     if folder.join(file_names::CARD).is_file() {
         return OpenModel::of_folder(folder);
     }
     match store {
-        Some(store) => OpenModel::of_store(store, &params.model, &params.engine.cache()),
+        Some(store) => OpenModel::of_store(store, model, &params.engine.cache()),
         None => bail!(
             "there is no model in the folder {}; name the folder of a model (STORE/models/NAME), or give \
              --store beside its name",
-            params.model
+            model
         ),
     }
 }

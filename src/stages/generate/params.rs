@@ -50,9 +50,9 @@ pub struct Params {
     /// Folder or bucket of the tables; its model and, without --audio, its phrases.
     #[arg(long, value_name = "URL")]
     pub store: Option<String>,
-    /// Name of a model of the store, or the folder of one.
+    /// Name of a model of the store, or the folder of one [default: the model that ships with the program]
     #[arg(long, value_name = "NAME|DIR")]
-    pub model: String,
+    pub model: Option<String>,
     /// Audio files to dance to, instead of the store's phrases.
     #[arg(long, value_name = "FILE", num_args = 1.., requires = "output")]
     pub audio: Vec<PathBuf>,

@@ -358,7 +358,8 @@ impl ConfigParams {
                     stretch: a.time_stretch,
                 },
                 condition_dropout: d.condition_dropout,
-                clock_dropout: d.clock_dropout,
+                // A network without a clock has none to withhold, so that runs of release 0.1 go on.
+                clock_dropout: if network.no_clock { 0.0 } else { d.clock_dropout },
                 style_dropout: d.style_dropout,
                 batch_size: o.batch_size.get(),
                 accumulate: o.accumulate.get(),

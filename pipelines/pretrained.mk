@@ -1,0 +1,37 @@
+# The model that ships with the program (models/pretrained): the demo's library, trained longer, its weights
+# rounded to half precision.
+#
+#   make pretrained                        builds first
+#   make -f pipelines/pretrained.mk BIN=…  with executables that are there already
+#
+# The same phrases, seed and steps give the same weights where processors have the same instructions.
+
+DATA    ?= tests/data
+OUT     ?= build/pretrained
+STORE   ?= $(OUT)/store
+CONFIG  ?= pipelines/demo.toml
+RUN     := pretrained
+LICENCE := MIT OR Apache-2.0; learned from the music and captures listed in LICENSES.md
+# A model is chosen on its validation songs, so that more steps than it needs do no harm.
+TRAIN   := --steps 4000 --decoder-steps 2000
+INTO    ?= models/pretrained
+
+.DEFAULT_GOAL := pretrained
+include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
+
+.PHONY: pretrained
+pretrained:
+	@mkdir -p $(STAMPS)
+	for source in phrases music; do \
+	  $(MOTIONGEN) ingest --config $(CONFIG) --source $(DATA)/$$source --store $(STORE); done
+	$(MOTIONGEN) extract --config $(CONFIG) --store $(STORE)
+	$(MOTIONGEN) library --config $(CONFIG) --store $(STORE)
+	$(MOTIONGEN) train --config $(CONFIG) --store $(STORE) --run $(RUN) $(TRAIN)
+	$(MOTIONGEN) export --store $(STORE) --run $(RUN) --model $(RUN) --weights train \
+	  --precision fp16 --licence '$(LICENCE)' --force
+	$(MOTIONGEN) generate --store $(STORE) --model $(RUN) --samples 8 --overlap 30
+	$(MOTIONGEN) evaluate --store $(STORE) --run $(RUN) --report $(OUT)/report.html
+	mkdir -p $(INTO)
+	cp $(STORE)/models/$(RUN)/* $(INTO)/
+	@echo "model   $(INTO)"
+	@echo "report  $(OUT)/report.html"
