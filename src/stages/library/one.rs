@@ -54,7 +54,7 @@ impl Music {
     /// Returns where the number of beats in a bar came from, as `phrases` spells it.
     pub fn beats_per_bar_source(&self) -> &'static str {
         match self.beats.beats_per_bar_source() {
-            BeatsPerBarSource::Given | BeatsPerBarSource::Numbers => BeatSource::BeatsFile.name(),
+            BeatsPerBarSource::Given | BeatsPerBarSource::Numbers => self.beat_source.name(),
             BeatsPerBarSource::Default => beats::DEFAULT,
         }
     }
@@ -106,6 +106,7 @@ pub fn read(song: &Song, input: Input) -> Result<Music, Failure> {
                 true
             };
             let found = extract::extract(extract::Origin::Audio, audio, content, see, &rules)?;
+            let beats = found.counted_beats();
             let (features, input_hash) = (found.frames, digest(lines.as_bytes()));
             match list {
                 Some(beats) => {
@@ -113,31 +114,15 @@ pub fn read(song: &Song, input: Input) -> Result<Music, Failure> {
                     Ok(Music { features, beats, beat_source, input_hash, song_hash })
                 }
                 None => {
-                    let tracked_s = found.beats.iter().map(|beat| beat.1).collect();
-                    tracked(song, features, tracked_s, Digests { input_hash, song_hash })
+                    let n_beats = found.pulse.len();
+                    let beats = beats.ok_or_else(|| no_beats(song, n_beats, features.nrows()))?;
+                    let beat_source = BeatSource::Tracker;
+                    Ok(Music { features, beats, beat_source, input_hash, song_hash })
                 }
             }
         }
         _ => Err(Failure::new(FailureKind::Unreadable, &song.id, "was not read")),
     }
-}
-
-/// What a song's files are told by.
-struct Digests {
-    input_hash: String,
-    song_hash: Option<String>,
-}
-
-/// Returns a song with the beats that were found in its audio.
-fn tracked(
-    song: &Song,
-    features: Array2<f32>,
-    tracked_s: Vec<f64>,
-    Digests { input_hash, song_hash }: Digests,
-) -> Result<Music, Failure> {
-    let (n_beats, n_frames) = (tracked_s.len(), features.nrows());
-    let beats = Beats::new(tracked_s, None, None).map_err(|_| no_beats(song, n_beats, n_frames))?;
-    Ok(Music { features, beats, beat_source: BeatSource::Tracker, input_hash, song_hash })
 }
 
 fn no_beats(song: &Song, n_beats: usize, n_frames: usize) -> Failure {
