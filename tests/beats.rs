@@ -100,13 +100,16 @@ fn a_beat_list_takes_the_place_of_what_the_tracker_finds() {
     assert_listed(&dir);
     extracted(&dir);
     assert_listed(&dir);
-    // `extractions` keeps what the tracker found, which is something else.
+    // `extractions` counts the beats that belong to the features, which are others.
     assert!((5..17).contains(&n_tracked(&dir)), "{}", n_tracked(&dir));
     let others = rows_of(&dir, "other");
     assert!(others.len() > 5);
     for row in &others {
         assert_eq!((row.number, row.source.as_deref()), (None, Some("tracker")));
-        assert_eq!(row.time_s, f64::from(row.frame) / 30.0);
+        // The song's clicks, to 20 ms.
+        let click = (row.time_s - 0.25) * 93.7 / 60.0;
+        assert!((click - click.round()).abs() * 60.0 / 93.7 < 0.02, "{row:?}");
+        assert_eq!(f64::from(row.frame), (row.time_s * 30.0).round());
     }
 
     // The phase is the list's, with its downbeat at 0.9 s.
@@ -151,7 +154,8 @@ fn beats_follow_a_list_that_comes_and_goes() {
     ingested(&dir);
     extracted(&dir);
     let tracked = rows_of(&dir, "song");
-    assert_eq!(tracked.len(), n_tracked(&dir));
+    // Seventeen clicks, of which the first and the last are hardly heard.
+    assert!((14..=17).contains(&tracked.len()), "{}", tracked.len());
     assert!(tracked.iter().all(|row| row.source.as_deref() == Some("tracker")));
     let store = dir.at("store");
     assert_eq!(read(&store, "song").source(), Some(BeatSource::Tracker));
@@ -235,7 +239,7 @@ fn a_store_of_release_0_1_is_read_and_gets_the_beats_of_its_lists() {
     write_source(&dir);
     let store = old_store(&dir);
     let (old, others) = (rows_of(&dir, "song"), rows_of(&dir, "other"));
-    assert_eq!(old.len(), n_tracked(&dir));
+    assert!(old.len() > 5);
     assert!(old.iter().chain(&others).all(|row| row.number.is_none() && row.source.is_none()));
     assert_eq!(read(&store, "song").source(), None);
     let (n, m) = (old.len(), others.len());

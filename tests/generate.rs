@@ -389,7 +389,9 @@ fn the_clock_is_heard_unless_it_is_withheld() {
         let out = dir.at(name);
         let mut command = motiongen();
         command.args(["generate", "--model", &model, "--audio", &song, "--quiet", "--overlap=7"]);
-        command.args(["--engine=eager", "--steps=3", "--format=npy", "--raw", "--output"]).arg(&out);
+        command
+            .args(["--engine=eager", "--steps=3", "--format=npy", "--raw", "--output"])
+            .arg(&out);
         let output = finish(command.args(more));
         assert_eq!(output.code, 0, "{output:?}");
         std::fs::read(out.join("song.npy")).expect("a motion")

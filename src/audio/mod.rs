@@ -2,7 +2,8 @@
 //!
 //! Data flow: `decode` → `resample` → `features`, whose first pass collects spectra
 //! (`spectral`: mel, RMS, centroid) and the tuning, and whose second pass adds chroma. Onsets, MFCC
-//! and beats follow from the mel bands of the whole file.
+//! and beats follow from the mel bands of the whole file. Apart from them, `meter` finds the beats and bars that motion
+//! follows.
 
 pub mod beat;
 pub mod chroma;
@@ -13,6 +14,7 @@ pub mod features;
 pub mod framing;
 pub mod header;
 pub mod mel;
+pub mod meter;
 pub mod mfcc;
 pub mod onset;
 pub mod recording;
@@ -27,6 +29,7 @@ pub use beat::Rhythm;
 pub use features::{
     BLOCKS, Block, FEATURE_DIM, FeatureError, Features, RawFeatures, extract, feature_names,
 };
+pub use meter::Meter;
 pub use tuning::Tuning;
 
 /// Rate at which everything is computed, in Hz.

@@ -5,6 +5,7 @@ use std::io::{self, Read, Seek};
 use super::SAMPLE_RATE_HZ;
 use super::decode::{DecodeError, Decoder};
 use super::features::{FeatureError, FirstPass, RawFeatures};
+use super::meter::{Meter, MeterPass};
 use super::resample::Resampler;
 use super::tuning::Tuning;
 
@@ -38,6 +39,8 @@ pub struct Options<'a> {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Recording {
     pub raw: RawFeatures,
+    /// The beats and bars that motion follows.
+    pub meter: Meter,
     pub encoding: Encoding,
 }
 
@@ -117,10 +120,12 @@ impl Recording {
     ) -> Result<Self, RecordingError> {
         let mut held = Some(Vec::new());
         let mut first = FirstPass::new(options.tuning);
+        let mut meter = MeterPass::new();
         let mut digest = Digest::default();
         let input = open().map_err(RecordingError::Open)?;
         let encoding = decode(input, extension_hint, options, |samples| {
             first.push(samples);
+            meter.push(samples);
             digest.add(samples);
             let fits = |kept: &Vec<f32>| kept.len() + samples.len() <= options.max_held_samples;
             held = held.take().filter(fits);
@@ -129,6 +134,7 @@ impl Recording {
             }
         })?;
         let mut second = first.finish()?;
+        let meter = meter.finish();
         match held {
             Some(samples) => {
                 for block in samples.chunks(BLOCK_SAMPLES) {
@@ -147,7 +153,7 @@ impl Recording {
                 }
             }
         }
-        Ok(Self { raw: second.finish(), encoding })
+        Ok(Self { raw: second.finish(), meter, encoding })
     }
 }
 

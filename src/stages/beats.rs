@@ -115,7 +115,9 @@ impl PhraseBeats {
     pub fn in_bars(&self, row: &PhraseRow) -> Option<Beats> {
         let stated = row.beats_per_bar.and_then(|n| u32::try_from(n).ok());
         let is_default = row.beats_per_bar_source.as_deref() == Some(DEFAULT);
-        self.counted(stated, is_default, row.tempo_bpm)
+        // Beats of a whole song tell more of its bars than nobody does; those of an excerpt may lack the highest number.
+        let is_guess = is_default && !row.is_constructed() && self.is_numbered();
+        self.counted(stated.filter(|_| !is_guess), is_default, row.tempo_bpm)
     }
 
     fn counted(
@@ -139,6 +141,11 @@ impl PhraseBeats {
             numbers = Some(vec![number, number % i64::from(beats_per_bar) + 1]);
         }
         Beats::new(times_s, numbers, beats_per_bar).ok()
+    }
+
+    /// Tempo of the beats, 60 / median interval, beats/min; none for fewer than two.
+    pub fn tempo_bpm(&self) -> Option<f64> {
+        Beats::new(self.times_s.clone(), None, None).ok().map(|beats| beats.tempo_bpm())
     }
 
     /// Returns a text that tells these beats from all others.

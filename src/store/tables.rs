@@ -41,7 +41,7 @@ rows! {
         tempo_bpm: Option<f64>, "beats/min", "Tempo.";
         tempo_source: Option<String>, "", "Where the tempo came from: `beats_file`, `features`, or, of constructed phrases, `beat_tracker` or `composed` (the song was played from a score).";
         beats_per_bar: Option<i32>, "beats", "Beats in a bar.";
-        beats_per_bar_source: Option<String>, "", "Where that came from: `beats_file` (numbered beats), `composed` (the song was played from a score) or `default`.";
+        beats_per_bar_source: Option<String>, "", "Where that came from: `beats_file` (numbered beats), `composed` (the song was played from a score), `tracker` (found in the audio) or `default`.";
     }
 }
 
@@ -80,8 +80,8 @@ rows! {
         duration_s: f64, "s", "Length of the audio; without audio, frames / 30.";
         tuning: Option<f64>, "1/36 octave", "Deviation from A440 with which the chroma was made, from -0.5 to below 0.5.";
         tuning_source: Option<String>, "", "`estimated` or `given` (by --tuning).";
-        tempo_bpm: Option<f64>, "beats/min", "Tempo of the beat tracker, 1800 / whole frames; none without onsets.";
-        n_beats: i32, "beats", "Beats that the tracker found, or that the feature file has; they are in `beats` unless the phrase has a beat list.";
+        tempo_bpm: Option<f64>, "beats/min", "Tempo that belongs to the features, librosa's: 1800 / whole frames; none without onsets.";
+        n_beats: i32, "beats", "Beats that belong to the features: librosa's, or those of the feature file. Those that motion follows are in `beats`.";
         audio_codec: Option<String>, "", "Codec that was decoded.";
         sample_rate_hz: Option<i32>, "Hz", "Sample rate of the file.";
         n_channels: Option<i32>, "channels", "Channels of the file.";
@@ -95,9 +95,9 @@ rows! {
         phrase_id: String, "", "The phrase, as in `phrases`.";
         beat: i32, "beats", "Index within the phrase, from 0.";
         frame: i32, "frames", "The nearest frame of the phrase.";
-        time_s: f64, "s", "Time of the beat; frame / 30 where the beat tracker found it. In a constructed phrase, from its begin, and beyond the first and last beat of the song at its median interval.";
+        time_s: f64, "s", "Time of the beat. In a constructed phrase, from its begin, and beyond the first and last beat of the song at its median interval.";
         number: Option<i32>, "beats", "Number in the bar, 1 on the downbeat; none where nobody knows.";
-        source: Option<String>, "", "Where the beat came from: `beats_file` (ingest read the beat list), `features` (`beat_times` of a feature file) `tracker` (found in the audio) or `composed` (library played the song from a score that has it); of a constructed phrase, where those of its song came from. None in rows that release 0.1 wrote.";
+        source: Option<String>, "", "Where the beat came from: `beats_file` (ingest read the beat list), `features` (`beat_times` of a feature file), `tracker` (found in the audio, by hypotheses over the whole song) or `composed` (library played the song from a score that has it); of a constructed phrase, where those of its song came from. None in rows that release 0.1 wrote.";
     }
 }
 

@@ -293,6 +293,7 @@ fn nothing_to_dance_to_or_with_is_said_with_the_way_out() {
         )
     );
     dir.write("brief/a.wav", clicks(100.0, 1.0));
+    dir.write("brief/a.beats.txt", "0.25\n0.85\n");
     let told = refused(&from(&dir.at("brief"), &captures, &["-q"]));
     let start = "error: none of the 1 songs can be danced to (a.wav: has 31 frames (1.0 s), ";
     assert!(told.starts_with(start), "{told}");

@@ -7,6 +7,7 @@ use ndarray::{Array2, s};
 
 use crate::audio::recording::{Encoding, MAX_HELD_SAMPLES, Options, Recording};
 use crate::audio::{BLOCKS, FEATURE_DIM, Tuning};
+use crate::motion::Beats;
 use crate::stages::beats::BeatSource;
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::feature_file::read_features;
@@ -54,9 +55,12 @@ pub struct Extracted {
     pub origin: Origin,
     /// [T, 163].
     pub frames: Array2<f32>,
+    /// librosa's, as it belongs to the features.
     pub tempo_bpm: Option<f64>,
-    /// Frame and time of every beat.
+    /// Frame and time of every beat, librosa's as well.
     pub beats: Vec<(usize, f64)>,
+    /// Time of every beat that motion follows, s, and its number in the bar if known.
+    pub pulse: Vec<(f64, Option<i64>)>,
     /// What only audio tells.
     pub audio: Option<Heard>,
 }
@@ -72,6 +76,12 @@ pub struct Heard {
 }
 
 impl Extracted {
+    /// Returns the beats that motion follows, in their bars; none for too few.
+    pub fn counted_beats(&self) -> Option<Beats> {
+        let (times_s, numbers): (Vec<f64>, Vec<Option<i64>>) = self.pulse.iter().copied().unzip();
+        Beats::new(times_s, numbers.into_iter().collect(), None).ok()
+    }
+
     /// Returns the length of the audio, or of the frames.
     pub fn duration_s(&self) -> f64 {
         self.audio.map_or_else(
@@ -83,8 +93,9 @@ impl Extracted {
 
 /// Bytes of a work in progress that do not depend on the file.
 const BASE_BYTES: u64 = 24 << 20;
-/// Bytes per frame: two sets of mel bands, the features, and what follows from them.
-const FRAME_BYTES: u64 = 2048;
+/// Bytes per frame: two sets of mel bands, the features, what follows from them, and three times a third of a frame
+/// of the spectra and envelopes in which beats are found.
+const FRAME_BYTES: u64 = 2048 + 1024;
 
 /// Returns an estimate of the memory that a file of `duration_s` takes while it is worked on.
 pub fn needed_bytes(duration_s: f64, file_bytes: u64) -> u64 {
@@ -170,13 +181,15 @@ fn from_audio(path: &str, content: Content, rules: &Rules) -> Result<Extracted, 
             Recording::analyse(open, extension, &options)
         }
     };
-    let Recording { raw, encoding } = recording.map_err(|e| Failure::of(path, e.kind(), &e))?;
+    let Recording { raw, meter, encoding } =
+        recording.map_err(|e| Failure::of(path, e.kind(), &e))?;
     let features = raw.normalize();
     let beats = features.rhythm.beat_frames.iter().map(|&frame| (frame, frames_to_s(frame)));
     Ok(Extracted {
         origin: Origin::Audio,
         tempo_bpm: Some(features.rhythm.tempo_bpm).filter(|&bpm| bpm > 0.0),
         beats: beats.collect(),
+        pulse: meter.numbered().collect(),
         audio: Some(Heard {
             n_samples: features.n_samples,
             tuning: features.tuning,
@@ -211,11 +224,13 @@ fn from_feature_file(path: &str, content: Content) -> Result<Extracted, Failure>
     let last = file.n_frames.saturating_sub(1);
     let frame = |time_s: f64| (s_to_frames(time_s).round() as usize).min(last);
     let beats = file.beat_times_s.iter().map(|&time_s| (frame(time_s), time_s)).collect();
+    let pulse = file.beat_times_s.iter().map(|&time_s| (time_s, None)).collect();
     Ok(Extracted {
         origin: Origin::FeatureFile,
         frames,
         tempo_bpm: file.tempo_bpm,
         beats,
+        pulse,
         audio: None,
     })
 }

@@ -405,6 +405,6 @@ fn extraction_row(id: &str, task: &Task, extracted: &Extracted) -> ExtractionRow
 }
 
 fn beat_rows<'a>(id: &'a str, extracted: &'a Extracted) -> impl Iterator<Item = BeatRow> + 'a {
-    let beats = extracted.beats.iter().map(|&(_, time_s)| (time_s, None));
+    let beats = extracted.pulse.iter().copied();
     beats::rows(id, beats, extracted.frames.nrows(), extracted.origin.beat_source())
 }

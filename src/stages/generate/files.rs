@@ -161,8 +161,7 @@ pub(in crate::stages) fn listen(path: &Path) -> Heard {
         let text = std::fs::read_to_string(&beside).map_err(|e| read(&e))?;
         Some(Beats::parse(&text).map_err(|e: BeatsError| read(&e))?)
     } else {
-        let times_s: Vec<f64> = extracted.beats.iter().map(|beat| beat.1).collect();
-        Beats::new(times_s, None, None).ok()
+        extracted.counted_beats()
     };
     Ok((extracted, beats))
 }

@@ -58,7 +58,7 @@ impl Music {
             return self.beat_source.name();
         }
         match self.beats.beats_per_bar_source() {
-            BeatsPerBarSource::Given | BeatsPerBarSource::Numbers => BeatSource::BeatsFile.name(),
+            BeatsPerBarSource::Given | BeatsPerBarSource::Numbers => self.beat_source.name(),
             BeatsPerBarSource::Default => beats::DEFAULT,
         }
     }
@@ -134,34 +134,17 @@ fn listen(
         true
     };
     let found = extract::extract(extract::Origin::Audio, audio, content, see, &rules)?;
+    let (counted, n_beats) = (found.counted_beats(), found.pulse.len());
     let (features, input_hash) = (found.frames, digest(lines.as_bytes()));
     match known {
         Some((beats, beat_source)) => {
             Ok(Music { features, beats, beat_source, input_hash, song_hash })
         }
         None => {
-            let tracked_s = found.beats.iter().map(|beat| beat.1).collect();
-            tracked(song, features, tracked_s, Digests { input_hash, song_hash })
+            let beats = counted.ok_or_else(|| no_beats(song, n_beats, features.nrows()))?;
+            Ok(Music { features, beats, beat_source: BeatSource::Tracker, input_hash, song_hash })
         }
     }
-}
-
-/// What a song's files are told by.
-struct Digests {
-    input_hash: String,
-    song_hash: Option<String>,
-}
-
-/// Returns a song with the beats that were found in its audio.
-fn tracked(
-    song: &Song,
-    features: Array2<f32>,
-    tracked_s: Vec<f64>,
-    Digests { input_hash, song_hash }: Digests,
-) -> Result<Music, Failure> {
-    let (n_beats, n_frames) = (tracked_s.len(), features.nrows());
-    let beats = Beats::new(tracked_s, None, None).map_err(|_| no_beats(song, n_beats, n_frames))?;
-    Ok(Music { features, beats, beat_source: BeatSource::Tracker, input_hash, song_hash })
 }
 
 fn no_beats(song: &Song, n_beats: usize, n_frames: usize) -> Failure {

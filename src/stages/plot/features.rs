@@ -123,13 +123,13 @@ fn from_audio(path: &Path, tuning: Option<Tuning>) -> anyhow::Result<Subject> {
         Recording::analyse(|| File::open(path), extension, &options)
             .map_err(|e| Failure::of(&place, e.kind(), &e))
     });
-    let features = recording.map_err(|failure| anyhow!(failure.message))?.raw.normalize();
-    let rhythm = features.rhythm;
+    let Recording { raw, meter, .. } = recording.map_err(|failure| anyhow!(failure.message))?;
+    let features = raw.normalize();
     Ok(Subject {
         title: path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned(),
         frames: features.frames,
-        tempo_bpm: Some(rhythm.tempo_bpm).filter(|&bpm| bpm > 0.0),
-        beat_times_s: rhythm.beat_frames.into_iter().map(frames_to_s).collect(),
+        tempo_bpm: meter.tempo_bpm(),
+        beat_times_s: meter.beat_times_s,
     })
 }
 
@@ -152,6 +152,7 @@ fn from_store(store: &Location, phrase: &str, tuning: Option<Tuning>) -> anyhow:
     // The tempo goes with the beats.
     let tempo_bpm = match beats.source() {
         Some(BeatSource::BeatsFile) => rows.rows::<PhraseRow>()?.pop().and_then(|p| p.tempo_bpm),
+        Some(BeatSource::Tracker) => beats.tempo_bpm(),
         _ => extraction.and_then(|e| e.tempo_bpm),
     };
     Ok(Subject {

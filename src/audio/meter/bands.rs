@@ -1,0 +1,144 @@
+//! What a song sounds like at 100 frames per second: magnitudes in 36 mel bands, and of the 12 notes.
+
+use super::super::framing::Framer;
+use super::super::mel::{hz_to_mel, mel_to_hz};
+use super::super::stft::{Dft, hann_power};
+use super::super::{N_FFT, SAMPLE_RATE_HZ};
+use super::HOP;
+
+/// Bands of the spectrum.
+pub const N_BANDS: usize = 36;
+/// Notes of the octave.
+pub const N_NOTES: usize = 12;
+/// Range of the bands, in Hz.
+const BANDS_HZ: (f64, f64) = (30.0, 11_000.0);
+/// Range of the notes, in Hz: a bin is a semitone wide at 360 Hz, and two at 180 Hz.
+const NOTES_HZ: (f64, f64) = (180.0, 2500.0);
+/// Magnitudes are heard relative to a loud frame, and log(1 + 1000 x) of them counts.
+const COMPRESSION: f32 = 1000.0;
+/// The share of frames that are not louder than a loud one.
+const LOUD_QUANTILE: f64 = 0.95;
+
+/// Returns the centre frequencies of the bands, in Hz.
+pub fn centres_hz() -> [f64; N_BANDS] {
+    let e = edges_hz();
+    std::array::from_fn(|i| e[i + 1])
+}
+
+fn edges_hz() -> Vec<f64> {
+    let (low, high) = (hz_to_mel(BANDS_HZ.0), hz_to_mel(BANDS_HZ.1));
+    let step = (high - low) / (N_BANDS + 1) as f64;
+    (0..N_BANDS + 2).map(|j| mel_to_hz(low + step * j as f64)).collect()
+}
+
+fn bin_hz(k: usize) -> f64 {
+    k as f64 * f64::from(SAMPLE_RATE_HZ) / N_FFT as f64
+}
+
+/// The spectra of a song; T frames, frame t centred at t/100 s.
+pub struct Spectra {
+    /// [T, 36] row by row.
+    pub bands: Vec<f32>,
+    /// [T, 12] row by row, C first.
+    pub notes: Vec<f32>,
+}
+
+impl Spectra {
+    pub fn n_frames(&self) -> usize {
+        self.bands.len() / N_BANDS
+    }
+
+    /// Returns the bands as ln(1 + 1000 x / r), r being the strongest band of a loud frame; none for silence.
+    pub fn compressed(mut self) -> Option<Self> {
+        let strongest = |row: &[f32]| row.iter().copied().fold(0f32, f32::max);
+        let mut levels: Vec<f32> = self.bands.chunks_exact(N_BANDS).map(strongest).collect();
+        let at = (LOUD_QUANTILE * levels.len() as f64) as usize;
+        if at >= levels.len() {
+            return None;
+        }
+        let loud = *levels.select_nth_unstable_by(at, f32::total_cmp).1;
+        if loud <= 0.0 {
+            return None;
+        }
+        for x in &mut self.bands {
+            *x = (*x / loud * COMPRESSION).ln_1p();
+        }
+        Some(self)
+    }
+}
+
+/// Collects the spectra of a stream.
+pub struct BandPass {
+    framer: Framer,
+    dft: Dft,
+    power: Vec<f64>,
+    /// First bin and weights of every band; the weights of a band sum to 1.
+    bank: Vec<(usize, Vec<f64>)>,
+    /// First bin of the notes; of every bin the note below and the share of the note above.
+    notes: (usize, Vec<(usize, f64)>),
+    found: Spectra,
+}
+
+impl BandPass {
+    pub fn new() -> Self {
+        let e = edges_hz();
+        let band = |i: usize| {
+            let weight = |k: usize| {
+                let hz = bin_hz(k);
+                ((hz - e[i]) / (e[i + 1] - e[i])).min((e[i + 2] - hz) / (e[i + 2] - e[i + 1]))
+            };
+            let bins: Vec<usize> = (0..=N_FFT / 2).filter(|&k| weight(k) > 0.0).collect();
+            let sum: f64 = bins.iter().map(|&k| weight(k)).sum();
+            let weights = bins.iter().map(|&k| weight(k) / sum).collect();
+            (bins.first().copied().unwrap_or(0), weights)
+        };
+        let is_note = |&k: &usize| (NOTES_HZ.0..=NOTES_HZ.1).contains(&bin_hz(k));
+        let first = (0..N_FFT / 2).find(is_note).unwrap_or(0);
+        let note = |k: usize| {
+            // MIDI's numbers: 69 is A of 440 Hz, 60 a C.
+            let pitch = 69.0 + 12.0 * (bin_hz(k) / 440.0).log2();
+            (pitch.floor() as usize % N_NOTES, pitch.fract())
+        };
+        let notes = (first..N_FFT / 2).take_while(is_note).map(note).collect();
+        Self {
+            framer: Framer::new(N_FFT, HOP),
+            dft: Dft::new(N_FFT),
+            power: vec![0.0; N_FFT / 2 + 1],
+            bank: (0..N_BANDS).map(band).collect(),
+            notes: (first, notes),
+            found: Spectra { bands: Vec::new(), notes: Vec::new() },
+        }
+    }
+
+    /// Takes the next samples at 44.1 kHz.
+    pub fn push(&mut self, samples: &[f32]) {
+        self.with(|framer, visit| framer.push(samples, visit));
+    }
+
+    /// Ends the signal.
+    pub fn finish(mut self) -> Spectra {
+        self.with(|framer, visit| framer.finish(visit));
+        self.found
+    }
+
+    fn with(&mut self, frames: impl FnOnce(&mut Framer, &mut dyn FnMut(&[f32]))) {
+        let Self { framer, dft, power, bank, notes, found } = self;
+        let n_bins = bank.iter().map(|(first, w)| first + w.len()).max().unwrap_or(0);
+        frames(framer, &mut |frame| {
+            hann_power(dft.of(frame), power);
+            let magnitude = &mut power[..n_bins];
+            magnitude.iter_mut().for_each(|p| *p = p.sqrt());
+            for (first, weights) in bank.iter() {
+                let bins = &magnitude[*first..];
+                let sum: f64 = bins.iter().zip(weights).map(|(m, w)| m * w).sum();
+                found.bands.push(sum as f32);
+            }
+            let mut strengths = [0.0; N_NOTES];
+            for (m, &(note, share)) in magnitude[notes.0..].iter().zip(&notes.1) {
+                strengths[note] += m * (1.0 - share);
+                strengths[(note + 1) % N_NOTES] += m * share;
+            }
+            found.notes.extend(strengths.map(|x| x as f32));
+        });
+    }
+}
