@@ -145,8 +145,11 @@ def rendered(songs: pathlib.Path) -> list[Song]:
             continue
         file = songs / f"midi_{path.stem}.wav"
         if not file.exists():
-            flags = ["-ni", "-g", "0.6", "-r", str(RATE_HZ), "-F", file, font, path]
-            subprocess.run(["fluidsynth", *flags], check=True, capture_output=True)
+            part = OUT / "part.wav"
+            flags = ["-ni", "-g", "0.6", "-r", str(RATE_HZ), "-F", part, font, path]
+            # Its output is thrown away: with pipes it was seen to hang when it was done.
+            subprocess.run(["fluidsynth", *flags], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            part.rename(file)
         bpm = 60 / np.median(np.diff(beats[:, 0]))
         # The half that the tracker's weights were fitted to.
         is_fitted = int(hashlib.md5(path.stem.encode()).hexdigest(), 16) % 2 == 1

@@ -220,7 +220,7 @@ fn settings_are_kept_and_a_run_of_release_0_1_has_none() {
     assert_eq!(said["sampler"]["spacing"], "trailing");
     assert_eq!((&said["guidance"], &said["soft"]), (&2.5.into(), &true.into()));
     assert_eq!((&said["overlap_frames"], &said["best_of"]), (&7.into(), &1.into()));
-    assert_eq!(said["postprocess"]["coherence"], "derive");
+    assert_eq!(said["postprocess"]["coherence"], "fuse");
     assert_eq!(said["constraints"].as_str().map(str::len), Some(64), "a digest");
     assert!(said.get("seed").is_none() && said.get("weights").is_none(), "{said}");
 

@@ -34,6 +34,11 @@ pub struct EstimateLosses {
 }
 
 impl EstimateLosses {
+    /// What a run is trained with unless it says otherwise (docs/training.md has what it was chosen by).
+    pub const fn usual() -> Self {
+        Self { velocity: 0.03, acceleration: 0.03, differences: [0.03, 0.003, 0.0003] }
+    }
+
     /// Returns whether nothing is added.
     pub fn is_none(&self) -> bool {
         let Self { velocity, acceleration, differences } = self;
