@@ -26,7 +26,9 @@ use crate::training::{Dataset, NetworkConfig, Phrase, Split};
 use crate::units::FPS;
 
 /// Most windows that are sampled for each guidance.
-const N_WINDOWS: usize = 16;
+const N_WINDOWS: usize = 32;
+/// Most phrases from which it is learned what motion owes to the bar.
+const MAX_FITTED_PHRASES: usize = 400;
 /// Guidances that are tried, until motion is locked to the bar as far as real motion is.
 const GUIDANCES: [f64; 5] = [1.0, 1.5, 2.0, 3.0, 4.0];
 /// Steps of DPM-Solver++, as generate takes them by default.
@@ -45,18 +47,6 @@ struct Window {
     motion: Array2<f32>,
     /// \[T, condition_dim\]
     heard: Array2<f32>,
-}
-
-impl Window {
-    /// Vertical velocity of frames, and the bars of this window's music.
-    fn passage<'a>(&self, rise_m_s: &'a [f64], bars: &'a [f64]) -> CoupledPassage<'a> {
-        CoupledPassage { rise_m_s, bars, beats_per_bar: self.beats_per_bar, activity: None }
-    }
-
-    fn bars(&self) -> Vec<f64> {
-        let phase = self.motion.column(Channel::Phase.range().start);
-        unwrapped(&phase.iter().map(|&x| f64::from(x)).collect::<Vec<f64>>())
-    }
 }
 
 /// Measures how a model is best sampled; none without validation phrases as long as a window, or where motion is
@@ -78,6 +68,7 @@ pub fn sampling_defaults(
     if windows.is_empty() {
         return Ok(None);
     }
+    let couplings = couplings(dataset)?;
     progress.start("tune", "guidances", GUIDANCES.len() as u64);
     let mut tried: Vec<(f64, f64)> = Vec::new();
     let mut variances = FusionVariances::default();
@@ -85,7 +76,7 @@ pub fn sampling_defaults(
         let decoded = decoded(engine, network, guidance, &windows)?;
         variances = variances_of(&windows, &decoded);
         progress.advance(1);
-        let Some(locked) = locked(&windows, &fused(&decoded, variances)) else { break };
+        let Some(locked) = locked(&couplings, &windows, &fused(&decoded, variances)) else { break };
         tried.push((guidance, locked));
         if locked >= 1.0 {
             break;
@@ -211,12 +202,7 @@ fn windows(network: &NetworkConfig, dataset: &Dataset) -> anyhow::Result<Vec<Win
             let clock = phrase.clock_of(motion.view());
             let features = dataset.features(phrase, 0, n_frames)?;
             let heard = condition(&network.unet, features.view(), Some(clock.view()));
-            Ok(Window {
-                song: phrase.song_hash.clone().unwrap_or_else(|| Arc::clone(&phrase.id)),
-                beats_per_bar: phrase.beats_per_bar,
-                motion,
-                heard,
-            })
+            Ok(Window { song: song_of(phrase), beats_per_bar: phrase.beats_per_bar, motion, heard })
         })
         .collect()
 }
@@ -254,35 +240,68 @@ fn decoded(
     Ok(made)
 }
 
-/// Returns the mean coefficient over songs of motions on what the real motion of the song owes to the bar, that of
-/// real motion being 1; none where no window has a clock.
-fn locked(windows: &[Window], motions: &[Array2<f32>]) -> Option<f64> {
-    let mut songs: BTreeMap<&str, Vec<(&Window, &Array2<f32>)>> = BTreeMap::new();
-    for (window, motion) in windows.iter().zip(motions).filter(|(window, _)| {
-        let phase = window.motion.column(Channel::Phase.range().start);
-        is_known(&phase.iter().map(|&x| f64::from(x)).collect::<Vec<f64>>(), window.beats_per_bar)
-    }) {
-        songs.entry(&window.song).or_default().push((window, motion));
+/// Returns what vertical velocity owes to the bar in each song: a fit to all of its validation phrases whose phase
+/// tells a clock.
+///
+/// To all, not to the windows that are sampled: a template of a few windows is of their noise too, on which no
+/// other motion can lie.
+fn couplings(dataset: &Dataset) -> anyhow::Result<BTreeMap<Arc<str>, Coupling>> {
+    let mut songs: BTreeMap<Arc<str>, Harmonics> = BTreeMap::new();
+    let validation = dataset.phrases().iter().filter(|phrase| phrase.split == Split::Validation);
+    for phrase in validation.take(MAX_FITTED_PHRASES) {
+        let motion = dataset.motion(phrase, 0, phrase.n_frames)?;
+        let phase = phase_of(&motion);
+        if is_known(&phase, phrase.beats_per_bar) {
+            let (rise, bars) = (rise_m_s(&motion), unwrapped(&phase));
+            let passage = passage(&rise, &bars, phrase.beats_per_bar);
+            songs.entry(song_of(phrase)).or_default().add(&passage);
+        }
     }
-    let ratios: Vec<f64> = songs
-        .values()
-        .filter_map(|song| {
-            let mut harmonics = Harmonics::default();
-            for (window, _) in song {
-                let (rise, bars) = (rise_m_s(&window.motion), window.bars());
-                harmonics.add(&window.passage(&rise, &bars));
+    let coupling =
+        |(song, harmonics)| Some((song, Coupling::Learned(Template::fit(&[harmonics])?)));
+    Ok(songs.into_iter().filter_map(coupling).collect())
+}
+
+/// Returns the mean coefficient over songs of motions on what vertical velocity owes to the bar, that of real motion
+/// being 1; none where no window has a clock.
+fn locked(
+    couplings: &BTreeMap<Arc<str>, Coupling>,
+    windows: &[Window],
+    motions: &[Array2<f32>],
+) -> Option<f64> {
+    let mut songs: BTreeMap<&str, [CouplingSums; 2]> = BTreeMap::new();
+    for (window, motion) in windows.iter().zip(motions) {
+        let phase = phase_of(&window.motion);
+        let Some(coupling) = couplings.get(&window.song) else { continue };
+        if is_known(&phase, window.beats_per_bar) {
+            let bars = unwrapped(&phase);
+            let sums = songs.entry(&window.song).or_default();
+            for (sums, motion) in sums.iter_mut().zip([&window.motion, motion]) {
+                let rise = rise_m_s(motion);
+                sums.add(coupling, &passage(&rise, &bars, window.beats_per_bar));
             }
-            let coupling = Coupling::Learned(Template::fit(&[harmonics])?);
-            let (mut real, mut made) = (CouplingSums::default(), CouplingSums::default());
-            for (window, motion) in song {
-                let bars = window.bars();
-                real.add(&coupling, &window.passage(&rise_m_s(&window.motion), &bars));
-                made.add(&coupling, &window.passage(&rise_m_s(motion), &bars));
-            }
-            Some(made.coefficient(0.0)? / real.coefficient(0.0)?).filter(|ratio| ratio.is_finite())
-        })
-        .collect();
+        }
+    }
+    let ratio = |[real, made]: &[CouplingSums; 2]| {
+        let ratio = made.coefficient(0.0)? / real.coefficient(0.0)?;
+        Some(ratio).filter(|ratio| ratio.is_finite())
+    };
+    let ratios: Vec<f64> = songs.values().filter_map(ratio).collect();
     (!ratios.is_empty()).then(|| ratios.iter().sum::<f64>() / ratios.len() as f64)
+}
+
+/// Vertical velocity of frames, and the bars of its music.
+fn passage<'a>(rise_m_s: &'a [f64], bars: &'a [f64], beats_per_bar: u32) -> CoupledPassage<'a> {
+    CoupledPassage { rise_m_s, bars, beats_per_bar, activity: None }
+}
+
+/// Bar phase of frames.
+fn phase_of(motion: &Array2<f32>) -> Vec<f64> {
+    motion.column(Channel::Phase.range().start).iter().map(|&x| f64::from(x)).collect()
+}
+
+fn song_of(phrase: &Phrase) -> Arc<str> {
+    phrase.song_hash.clone().unwrap_or_else(|| Arc::clone(&phrase.id))
 }
 
 /// Vertical velocity from frame to frame, m/s.
@@ -326,7 +345,11 @@ mod tests {
             motion: motion(1.0),
             heard: Array2::zeros((n, 1)),
         };
-        let found = |scale| locked(std::slice::from_ref(&window), &[motion(scale)]);
+        let phrase = ("a", Split::Validation, motion(1.0), Array2::zeros((n, 163)));
+        let dataset = Dataset::in_memory([phrase]).expect("in memory");
+        let couplings = couplings(&dataset).expect("a fit");
+        let window = Window { song: "a".into(), ..window };
+        let found = |scale| locked(&couplings, std::slice::from_ref(&window), &[motion(scale)]);
         for scale in [1.0, 0.5, -0.25] {
             let found = found(scale).expect("a coefficient");
             assert!((found - f64::from(scale)).abs() < 1e-4, "{found}");
@@ -334,6 +357,6 @@ mod tests {
         let mut still = window.motion.clone();
         still.column_mut(16).fill(0.0);
         let window = Window { motion: still, ..window };
-        assert_eq!(locked(&[window], &[motion(1.0)]), None);
+        assert_eq!(locked(&couplings, &[window], &[motion(1.0)]), None);
     }
 }
