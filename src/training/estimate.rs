@@ -34,11 +34,6 @@ pub struct EstimateLosses {
 }
 
 impl EstimateLosses {
-    /// What a run is trained with unless it says otherwise (docs/training.md has what it was chosen by).
-    pub const fn usual() -> Self {
-        Self { velocity: 0.03, acceleration: 0.03, differences: [0.03, 0.003, 0.0003] }
-    }
-
     /// Returns whether nothing is added.
     pub fn is_none(&self) -> bool {
         let Self { velocity, acceleration, differences } = self;
@@ -48,7 +43,8 @@ impl EstimateLosses {
     /// Returns the weighted sum of the losses of a prediction; none where all weights are 0.
     ///
     /// With ẑ the estimate and z the motion in units of their spread, s the spread of a channel in its own unit,
-    /// f = 30 Hz, D the difference to the next frame, and means over frames that count:
+    /// f = 30 Hz, D the difference to the next frame, and ⟨x⟩ the sum over differences whose frames all count over
+    /// the number of frames that count, so that the losses of parts of a batch add up:
     ///
     /// - velocity ⟨(v̂ − f D p̂)² / s_v²⟩, acceleration ⟨(â − f D v̂)² / s_a²⟩
     /// - differences k = 1, 2, 3: ⟨(f^k D^k (p̂ − p))² / u_k²⟩ with u = s_v, s_a, 20 s_a, over positions, and over
@@ -188,7 +184,7 @@ fn times<I: Interpreter>(
     g.apply(Binary::new(Pair::Multiply), &[x, &factors])
 }
 
-/// ⟨x²⟩ over rows of differences of an order all of whose frames count.
+/// ⟨x²⟩: the sum over rows of differences of an order all of whose frames count, over the frames that count.
 fn mean_square<I: Interpreter>(
     g: &mut I,
     x: &Tensor<I::Element>,
@@ -200,9 +196,12 @@ fn mean_square<I: Interpreter>(
         .chunks_exact(rows + order)
         .flat_map(|mask| mask.windows(order + 1).map(|frames| frames.iter().product()))
         .collect();
+    let sum = |values: &[f32]| values.iter().map(|&w| f64::from(w)).sum::<f64>();
+    let share = sum(&weights) / sum(mask).max(1.0);
     let weights = constant(g, &[batch, rows], &weights);
     let zero = g.constant(x.shape(), &vec![I::Element::ZERO; x.len()]);
-    g.apply(Loss::new(Cost::Squared), &[x, &zero, &weights])
+    let mean = g.apply(Loss::new(Cost::Squared), &[x, &zero, &weights])?;
+    g.scale(&mean, share)
 }
 
 fn constant<I: Interpreter>(g: &I, shape: &[usize], values: &[f32]) -> Tensor<I::Element> {
@@ -262,18 +261,17 @@ mod tests {
         let said = |b, t, i| at(&|k| estimate[k], b, t, i);
         let true_at = |b, t, i| at(&|k| f64::from(motion[k]), b, t, i);
         let mean = |order: usize, of: &dyn Fn(usize, usize) -> Vec<f64>| {
-            let (mut sum, mut count) = (0.0, 0.0);
+            let mut sum = 0.0;
             for b in 0..2 {
                 for t in 0..FRAMES - order {
                     let counts = (t..=t + order).all(|t| mask[b * FRAMES + t] == 1.0);
                     if counts {
                         let values = of(b, t);
                         sum += values.iter().map(|x| x * x).sum::<f64>() / values.len() as f64;
-                        count += 1.0;
                     }
                 }
             }
-            sum / count
+            sum / mask.iter().map(|&w| f64::from(w)).sum::<f64>()
         };
         let scale = |i: usize| f64::from(n.scale[i]);
         let velocity = mean(1, &|b, t| {

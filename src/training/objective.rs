@@ -45,11 +45,6 @@ impl Default for ChannelWeights {
 }
 
 impl ChannelWeights {
-    /// What a run is trained with unless it says otherwise: the style weighs as much as one channel.
-    pub const fn usual() -> Self {
-        Self { style: 0.125, vertical: 1.0 }
-    }
-
     /// Returns the weight of each channel; their mean is 1.
     pub fn weights(&self) -> [f64; MOTION_DIM] {
         let mut weights = [1.0; MOTION_DIM];

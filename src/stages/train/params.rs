@@ -115,24 +115,24 @@ pub struct DiffusionParams {
     #[arg(long, value_name = "GAMMA", help_heading = "Diffusion")]
     pub min_snr_gamma: Option<f64>,
     /// Weight of each style channel; all others but the vertical ones have 1.
-    #[arg(long, value_name = "X", default_value_t = ChannelWeights::usual().style,
+    #[arg(long, value_name = "X", default_value_t = ChannelWeights::default().style,
           help_heading = "Diffusion")]
     pub style_weight: f64,
     /// Weight of vertical position, velocity and acceleration.
-    #[arg(long, value_name = "X", default_value_t = ChannelWeights::usual().vertical,
+    #[arg(long, value_name = "X", default_value_t = ChannelWeights::default().vertical,
           help_heading = "Diffusion")]
     pub vertical_weight: f64,
     /// Weight of velocities against differences of positions, of the estimate of clean motion.
-    #[arg(long, value_name = "X", default_value_t = EstimateLosses::usual().velocity,
+    #[arg(long, value_name = "X", default_value_t = EstimateLosses::default().velocity,
           help_heading = "Diffusion")]
     pub velocity_loss: f64,
     /// Weight of accelerations against differences of velocities.
-    #[arg(long, value_name = "X", default_value_t = EstimateLosses::usual().acceleration,
+    #[arg(long, value_name = "X", default_value_t = EstimateLosses::default().acceleration,
           help_heading = "Diffusion")]
     pub acceleration_loss: f64,
     /// Weights of the first, second and third differences of poses against the truth's.
     #[arg(long, value_name = "X,X,X", value_delimiter = ',', num_args = 1..,
-          default_values_t = EstimateLosses::usual().differences, help_heading = "Diffusion")]
+          default_values_t = EstimateLosses::default().differences, help_heading = "Diffusion")]
     pub difference_losses: Vec<f64>,
     /// Probability that a window goes without its music, for guidance.
     #[arg(long, value_name = "P", default_value_t = 0.1, help_heading = "Diffusion")]
