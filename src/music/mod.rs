@@ -1,6 +1,6 @@
 //! Music of our own: scores with known bars, and their sound.
 //!
-//! Data flow: [`compose()`] draws a [`Score`] from a seed, or [`abc`] reads one and [`arrange`] gives it
+//! Data flow: [`compose()`] draws a [`Score`] from a seed, or [`abc`] reads one and [`arrange()`] gives it
 //! accompaniment; [`synth::render`] plays it. Time is counted in beats; [`TempoMap`] alone knows seconds.
 //!
 //! Everything here is pure, and made of additions, multiplications and the functions of the crate `libm`, which
