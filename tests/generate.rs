@@ -405,7 +405,7 @@ fn the_clock_is_heard_unless_it_is_withheld() {
     assert_ne!(heard, dance("later", &list(1), &[]));
     let withheld = dance("withheld", &list(0), &["--no-clock"]);
     assert_ne!(heard, withheld);
-    // Whoever does not hear the bars dances alike to all.
+    // With the clock withheld, other bars change nothing.
     assert_eq!(withheld, dance("withheld_later", &list(1), &["--no-clock"]));
 }
 

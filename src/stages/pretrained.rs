@@ -1,4 +1,4 @@
-//! The model that ships with the program, for whoever has none: `models/pretrained`.
+//! The model that ships with the program, used where no model is named: `models/pretrained`.
 
 use bytes::Bytes;
 
