@@ -49,8 +49,7 @@ struct Window {
     heard: Array2<f32>,
 }
 
-/// Measures how a model is best sampled; none without validation phrases as long as a window, or where motion is
-/// not finite.
+/// Measures how a model is best sampled; none without validation phrases as long as a window.
 ///
 /// Guidance is where the mean coefficient of vertical velocity on what it owes to the bar in real motion of the
 /// same song, harmonics 1 to 4, is that of real motion, interpolated between those tried; the highest where none
