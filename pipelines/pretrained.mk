@@ -3,8 +3,6 @@
 #
 #   make pretrained                        builds first
 #   make -f pipelines/pretrained.mk BIN=…  with executables that are there already
-#
-# The same phrases, seed and steps give the same weights where processors have the same instructions.
 
 DATA    ?= tests/data
 OUT     ?= build/pretrained
