@@ -12,7 +12,7 @@ const MAY_USE: [(&str, &[&str]); 19] = [
     ("diffusion", &[]),
     ("evaluation", &["motion", "units"]),
     ("generation", &["audio", "autodiff", "diffusion", "model", "motion", "onnx", "units"]),
-    ("model", &["audio", "motion"]),
+    ("model", &["audio", "motion", "units"]),
     ("motion", &["chance", "units"]),
     ("music", &["audio", "chance"]),
     ("onnx", &["audio", "model", "motion"]),

@@ -259,6 +259,13 @@ proptest! {
             g.mul(&head, &tail)
         });
         check(&[x()], &none(), |g, x| g.hold_frames(&x[0], 4));
+        for (shift, spare) in [(0, 1), (1, 0), (2, 3)] {
+            check(&[x()], &none(), |g, x| g.later_frames(&x[0], shift, spare));
+        }
+        let kernel = std::sync::Arc::new(ndarray::Array2::from_shape_fn((channels, 5), |(c, j)| {
+            0.3 * c as f64 - 0.2 * j as f64 + 0.1
+        }));
+        check(&[x()], &none(), |g, x| g.filter_frames(&x[0], &kernel));
         check(&[x(), fixed(&[batch, 1, 2], vec![0.0; 2 * batch])], &none(), |g, x| {
             g.crop_frames(&x[0], &x[1])
         });

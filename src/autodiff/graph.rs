@@ -16,6 +16,7 @@ use super::op::channels::{Concat, TakeChannels};
 use super::op::conv::Product;
 use super::op::dropout::Dropout;
 use super::op::elementwise::{Function, Map};
+use super::op::filter::FilterFrames;
 use super::op::frames::{FrameMask, StrideMask, TakeFrames};
 use super::op::group_norm::NormFilmActivate;
 use super::op::layer_norm::LayerNormalize;
@@ -174,6 +175,23 @@ impl<I: Interpreter> Graph for I {
     fn crop_frames(&mut self, x: &Self::Tensor, like: &Self::Tensor) -> Result<Self::Tensor> {
         let alike = x.shape().len() == 3 && x.shape().get(1) == like.shape().get(1);
         if alike { Ok(x.clone()) } else { self.apply(TakeFrames::crop(), &[x, like]) }
+    }
+
+    fn later_frames(
+        &mut self,
+        x: &Self::Tensor,
+        shift: usize,
+        spare: usize,
+    ) -> Result<Self::Tensor> {
+        self.apply(TakeFrames::later(shift, spare), &[x])
+    }
+
+    fn filter_frames(
+        &mut self,
+        x: &Self::Tensor,
+        kernel: &Arc<Array2<f64>>,
+    ) -> Result<Self::Tensor> {
+        self.apply(FilterFrames(Arc::clone(kernel)), &[x])
     }
 
     fn frame_mask(

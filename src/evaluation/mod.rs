@@ -26,5 +26,7 @@ pub mod window;
 pub mod window_range;
 
 pub use measured::Measured;
-pub use sanity::{Check, CheckSet, checks, derivative_error, holds_by_construction};
+pub use sanity::{
+    Check, CheckSet, checks, derivative_error, holds_by_construction, holds_by_derivation,
+};
 pub use score::{Score, score};

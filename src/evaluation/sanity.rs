@@ -177,6 +177,14 @@ pub fn checks(frames: ArrayView2<f32>, limits: ChannelLimits) -> Vec<Check> {
     reference.into_iter().chain(strict).collect()
 }
 
+/// Returns whether a check holds of every motion whose velocities are derived from its poses.
+pub fn holds_by_derivation(check: &str) -> bool {
+    matches!(
+        check,
+        "velocity" | "acceleration" | "angular_velocity" | "velocity_coherence" | "accel_coherence"
+    )
+}
+
 /// Returns whether post-processing makes a check pass whatever was decoded, so that passing is no merit.
 ///
 /// `has_phase` tells whether the phase of the music was known, to which `relock_phase` sets that of the motion.
@@ -184,8 +192,7 @@ pub fn holds_by_construction(check: &str, config: &PostProcessConfig, has_phase:
     let is_derived = config.coherence.derives();
     let is_relocked = config.relock_phase && has_phase;
     match check {
-        "velocity" | "acceleration" | "angular_velocity" | "velocity_coherence"
-        | "accel_coherence" => is_derived,
+        check if holds_by_derivation(check) => is_derived,
         "quaternion" => config.normalize_quaternions,
         "quaternion_continuity" => config.normalize_quaternions && config.range.is_some(),
         "phase" => is_relocked || config.clamp_phase,

@@ -12,7 +12,7 @@ use ndarray::{Array2, Array3, ArrayView2, Axis, s};
 use crate::autodiff::Stream;
 use crate::diffusion::Refine;
 use crate::motion::style::STYLE_DIM;
-use crate::motion::{MOTION_DIM, Normalizer, Placement};
+use crate::motion::{Channel, MOTION_DIM, Normalizer, Placement};
 
 use super::control::Constraints;
 use super::engine::{Engine, EngineError};
@@ -44,6 +44,8 @@ pub struct Generator<'a> {
 pub struct Track<'a> {
     /// What the network hears: features as the table has them, then the clock if it hears one, \[T, condition_dim\].
     pub condition: ArrayView2<'a, f32>,
+    /// Bar phase of the music, in [0, 1), \[T\]: motion is sampled with this phase, for a network that hears the clock.
+    pub phase: Option<&'a [f64]>,
     pub seed: u64,
     /// Normalised style, for a model that takes one.
     pub style: Option<[f32; STYLE_DIM]>,
@@ -109,7 +111,9 @@ impl Generator<'_> {
             let decoded = self.engine.decode(latent.view())?;
             for (i, window) in run.clone().zip(decoded.outer_iter()) {
                 let shift = windows.shift(i);
-                give(joiner.push(window.to_owned(), shift), &mut emit)?;
+                let mut window = window.to_owned();
+                continue_signs(&mut window);
+                give(joiner.push(window, shift), &mut emit)?;
             }
             let motions = self.motions(&latent);
             let place = job.places(&motions).pop().unwrap_or(first);
@@ -138,16 +142,17 @@ impl Generator<'_> {
             x = self.sampling.schedule.add_noise(x0.view(), x.view(), &vec![n_left - 1; n]);
         }
         let mut refine = |x0: &mut Array3<f32>| self.refine(track, run, x0);
-        let has_company = n > 1 || run.before.is_some() || track.constraints.is_some();
-        let refine: Option<Refine> = if has_company { Some(&mut refine) } else { None };
+        let is_refined =
+            n > 1 || run.before.is_some() || track.constraints.is_some() || track.phase.is_some();
+        let refine: Option<Refine> = if is_refined { Some(&mut refine) } else { None };
         // Draw 0 is the noise that sampling begins with.
         let noise = |draw: usize, z: &mut [f32]| run.fill(track.seed, draw as u64 + 1, z);
         let style = style.as_ref().map(|style| style.view());
         sample(self.engine, self.sampling, (x, n_left), audio.view(), style, noise, refine)
     }
 
-    /// Brings the estimates of a run's windows to agree with each other, with what came before, and with what
-    /// is asked of the track.
+    /// Brings the estimates of a run's windows to agree with each other, with what came before, with the phase of
+    /// the music, and with what is asked of the track.
     fn refine(&self, track: &Track, run: &Run, x0: &mut Array3<f32>) {
         let estimated = self.motions(x0);
         let mut motions = estimated.clone();
@@ -166,6 +171,15 @@ impl Generator<'_> {
                     place.restore(motion);
                     constraints.bend(motion, frames.start, strength);
                     place.remove(motion);
+                }
+            }
+        }
+        if let Some(phase) = track.phase {
+            for (i, motion) in run.range.clone().zip(&mut motions) {
+                let frames = run.windows.frames(i);
+                let column = motion.column_mut(Channel::Phase.range().start);
+                for (x, phase) in column.into_iter().zip(&phase[frames]) {
+                    *x = *phase as f32;
                 }
             }
         }
@@ -236,6 +250,17 @@ impl Run<'_> {
         let size = self.windows.length() * MOTION_DIM;
         for (i, z) in self.range.clone().zip(z.chunks_exact_mut(size)) {
             stream.normal(self.windows.frames(i).start * MOTION_DIM, z);
+        }
+    }
+}
+
+/// Gives each orientation of a window the sign that is nearer to the one before: q and −q are one orientation.
+fn continue_signs(window: &mut Array2<f32>) {
+    let columns = Channel::Quaternion.range();
+    for t in 1..window.nrows() {
+        let dot: f32 = columns.clone().map(|i| window[[t - 1, i]] * window[[t, i]]).sum();
+        if dot < 0.0 {
+            window.slice_mut(s![t, columns.clone()]).mapv_inplace(|x| -x);
         }
     }
 }

@@ -1,12 +1,16 @@
 //! The decoder from a sampled latent to the 25 channels of motion.
 
+mod fusion;
+
 use serde::{Deserialize, Serialize};
 
+use crate::motion::postprocess::FusionVariances;
 use crate::motion::{Channel, ChannelLimits, MOTION_DIM};
 
 use super::graph::{Activation, Graph, Result};
 use super::layers::{LayerNorm, Linear};
 use super::parameter::{ParameterList, Scope};
+use fusion::{Kinematics, PoseFusion};
 
 /// Below this norm a quaternion is divided by it instead (PyTorch's `normalize`).
 const QUATERNION_EPSILON: f64 = 1e-12;
@@ -23,6 +27,10 @@ pub struct DecoderConfig {
     pub dropout: f64,
     /// The ranges that velocities and accelerations are kept within.
     pub limits: ChannelLimits,
+    /// Errors that the heads leave, by which poses and derivatives are brought together in the last layer; without
+    /// them each head speaks for itself, as in training. Measured by `export`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fusion: Option<FusionVariances>,
 }
 
 impl Default for DecoderConfig {
@@ -35,6 +43,7 @@ impl Default for DecoderConfig {
             expansion: 4,
             dropout: 0.1,
             limits: ChannelLimits::Wide,
+            fusion: None,
         }
     }
 }
@@ -46,6 +55,7 @@ pub struct MotionDecoder {
     blocks: Vec<Block>,
     heads: Vec<(Channel, Linear)>,
     limits: ChannelLimits,
+    fusion: Option<PoseFusion>,
 }
 
 /// x + W₂ GELU(W₁ LN(x)), dropout after each of the two.
@@ -99,13 +109,15 @@ impl MotionDecoder {
             let mut scope = root.at(format!("{}_head", channel.name()));
             (channel, Linear::new(&mut scope, config.hidden_dim, channel.width()))
         });
-        Self { input_proj, blocks, heads: heads.into(), limits: config.limits }
+        let fusion = config.fusion.as_ref().map(PoseFusion::new);
+        Self { input_proj, blocks, heads: heads.into(), limits: config.limits, fusion }
     }
 
     /// Decodes a latent.
     ///
     /// Velocity, acceleration and angular velocity are limit · tanh, the quaternion has unit norm,
-    /// the phase is a sigmoid; position and style are free.
+    /// the phase is a sigmoid; position and style are free. With fusion, velocity, acceleration and angular velocity
+    /// are then those of the fused poses, which no tanh holds.
     ///
     /// # Shapes
     /// `latent`: \[batch, frames, input_dim\] → \[batch, frames, 25\]
@@ -127,6 +139,26 @@ impl MotionDecoder {
                 Channel::Quaternion => g.normalize(&x, QUATERNION_EPSILON)?,
                 Channel::Phase => g.activation(&x, Activation::Sigmoid)?,
             });
+        }
+        if let Some(fusion) = &self.fusion {
+            let [position, velocity, acceleration, quaternion, angular_velocity, ..] =
+                parts.as_slice()
+            else {
+                unreachable!("invariant: a head for each channel of Channel::ALL, in its order")
+            };
+            let fused = fusion.forward(
+                g,
+                &Kinematics {
+                    position: position.clone(),
+                    velocity: velocity.clone(),
+                    acceleration: acceleration.clone(),
+                    quaternion: quaternion.clone(),
+                    angular_velocity: angular_velocity.clone(),
+                },
+            )?;
+            let Kinematics { position, velocity, acceleration, quaternion, angular_velocity } =
+                fused;
+            parts.splice(..5, [position, velocity, acceleration, quaternion, angular_velocity]);
         }
         let parts: Vec<_> = parts.iter().collect();
         g.concat(&parts)

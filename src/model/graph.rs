@@ -222,6 +222,26 @@ pub trait Graph: Sized {
     /// Drops frames beyond those that `like` has.
     fn crop_frames(&mut self, x: &Self::Tensor, like: &Self::Tensor) -> Result<Self::Tensor>;
 
+    /// y\[t\] = x\[clamp(t + shift, 0, frames − 1 − spare)\]: frames that come later, the last of those that are
+    /// not spared held.
+    ///
+    /// \[batch, frames, channels\] → the same
+    fn later_frames(
+        &mut self,
+        x: &Self::Tensor,
+        shift: usize,
+        spare: usize,
+    ) -> Result<Self::Tensor>;
+
+    /// y\[t, c\] = Σ_j h\[c, j\] x\[t + j − ⌊taps / 2⌋, c\], zero beyond either end: a fixed filter for each channel.
+    ///
+    /// `kernel`: h, \[channels, taps\], an odd number of taps. \[batch, frames, channels\] → the same
+    fn filter_frames(
+        &mut self,
+        x: &Self::Tensor,
+        kernel: &Arc<Array2<f64>>,
+    ) -> Result<Self::Tensor>;
+
     /// Says which frames of [`Graph::hold_frames`] count: 1 where `mask`, or all of x, has one, else 0.
     ///
     /// `x`: \[batch, frames, …\]; `mask`: \[batch, frames\] → \[batch, frames held\]

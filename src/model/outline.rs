@@ -204,7 +204,12 @@ impl Graph for Outline<'_> {
     }
 
     fn add(&mut self, a: &Vec<usize>, b: &Vec<usize>) -> Result<Vec<usize>> {
-        Ok(self.result(if a.len() >= b.len() { a } else { b }.clone()))
+        let (long, short) = if a.len() >= b.len() { (a, b) } else { (b, a) };
+        let mut shape = long.clone();
+        for (n, m) in shape.iter_mut().rev().zip(short.iter().rev()) {
+            *n = (*n).max(*m);
+        }
+        Ok(self.result(shape))
     }
 
     fn mul(&mut self, a: &Vec<usize>, b: &Vec<usize>) -> Result<Vec<usize>> {
@@ -282,6 +287,17 @@ impl Graph for Outline<'_> {
         let [batch, _, channels] = three("crop_frames", x)?;
         let [_, frames, _] = three("crop_frames", like)?;
         Ok(vec![batch, frames, channels])
+    }
+
+    fn later_frames(&mut self, x: &Vec<usize>, _shift: usize, _spare: usize) -> Result<Vec<usize>> {
+        Ok(self.result(x.clone()))
+    }
+
+    fn filter_frames(&mut self, x: &Vec<usize>, kernel: &Arc<Array2<f64>>) -> Result<Vec<usize>> {
+        let [batch, frames, channels] = three("filter_frames", x)?;
+        let flops = 2 * (batch * frames * channels * kernel.ncols()) as u64;
+        self.layer("filter_frames", &[], x, flops);
+        Ok(self.result(x.clone()))
     }
 
     fn frame_mask(

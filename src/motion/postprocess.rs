@@ -26,7 +26,7 @@ use ndarray::{Array2, s};
 pub use config::{
     Coherence, Hemisphere, MAX_WINDOW_FRAMES, PostProcessConfig, PostProcessError, SavitzkyGolay,
 };
-pub use fusion::{Displacement, Held};
+pub use fusion::{Displacement, FusionFilters, Held};
 pub use variances::{AxisVariances, FusionVariances};
 
 use super::channels::{Channel, MOTION_DIM};

@@ -340,6 +340,51 @@ impl Graph for Builder<'_> {
         self.map(*x, x.channels, |g, x| g.node("Slice", &[x, &starts, &ends, &axes], vec![]))
     }
 
+    fn later_frames(&mut self, x: &Value, shift: usize, spare: usize) -> Result<Value> {
+        self.begin("later_frames", None);
+        expect("later_frames", *x, Axes::Frames)?;
+        let frames = self.n_frames(*x)?;
+        let places = self.places(&frames);
+        let [shift, spare, zero] = [shift, spare + 1, 0].map(|n| self.integers(&[n as i64]));
+        let last = self.node("Sub", &[&frames, &spare], vec![]);
+        let last = self.node("Max", &[&last, &zero], vec![]);
+        let places = self.node("Add", &[&places, &shift], vec![]);
+        let places = self.node("Min", &[&places, &last], vec![]);
+        let axis = if self.has_last(*x) { 1 } else { self.frames_axis() };
+        self.map(*x, x.channels, |g, x| {
+            g.node("Gather", &[x, &places], vec![integer("axis", axis)])
+        })
+    }
+
+    fn filter_frames(&mut self, x: &Value, kernel: &Arc<Array2<f64>>) -> Result<Value> {
+        self.begin("filter_frames", None);
+        let (channels, taps) = kernel.dim();
+        if x.channels != channels || taps % 2 == 0 {
+            let problem = format!(
+                "input has {} channels, the filter has {channels} with {taps} taps, of which an odd number is asked",
+                x.channels
+            );
+            return Err(GraphError::shape("filter_frames", problem));
+        }
+        let name = self.first("filter_frames", *x)?;
+        let numbers: Vec<f32> = kernel.iter().map(|&h| h as f32).collect();
+        let half = (taps / 2) as i64;
+        let (dims, shape, pads) = match self.form {
+            Form::Line => (vec![channels, 1, taps], vec![taps as i64], vec![half, half]),
+            Form::Image => {
+                (vec![channels, 1, 1, taps], vec![1, taps as i64], vec![0, half, 0, half])
+            }
+        };
+        let kernel = self.table(&dims, &numbers);
+        let attributes = vec![
+            integers("kernel_shape", &shape),
+            integers("pads", &pads),
+            integer("group", channels as i64),
+        ];
+        let y = self.node("Conv", &[&name, &kernel], attributes);
+        Ok(self.new_first(channels, y))
+    }
+
     fn frame_mask(&mut self, x: &Value, mask: Option<&Value>, multiple: usize) -> Result<Value> {
         self.begin("frame_mask", None);
         let frames = self.n_frames(*x)?;

@@ -33,6 +33,11 @@ enum Choice {
         skip: usize,
         drop: usize,
     },
+    /// Those that come later; past the last that is not spared, that one.
+    Later {
+        shift: usize,
+        spare: usize,
+    },
 }
 
 impl TakeFrames {
@@ -54,6 +59,11 @@ impl TakeFrames {
     /// All frames but the first `skip` and the last `drop`.
     pub fn inner(skip: usize, drop: usize) -> Self {
         Self::new("inner_frames", Choice::Inner { skip, drop })
+    }
+
+    /// Frame t + `shift` at t, but none of the last `spare`: the one before them is held.
+    pub fn later(shift: usize, spare: usize) -> Self {
+        Self::new("later_frames", Choice::Later { shift, spare })
     }
 
     fn new(name: &'static str, choose: Choice) -> Self {
@@ -88,6 +98,10 @@ impl<E: Element> Operation<E> for TakeFrames {
                     return Err(GraphError::shape(self.name, problem));
                 }
                 (0..wanted).collect()
+            }
+            Choice::Later { shift, spare } => {
+                let last = (frames - 1).saturating_sub(spare);
+                (0..frames).map(|i| (i + shift).min(last)).collect()
             }
             Choice::Inner { skip, drop } if skip + drop < frames => (skip..frames - drop).collect(),
             Choice::Inner { skip, drop } => {

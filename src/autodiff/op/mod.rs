@@ -7,6 +7,7 @@ pub mod channels;
 pub mod conv;
 pub mod dropout;
 pub mod elementwise;
+pub mod filter;
 pub mod frames;
 pub mod group_norm;
 pub mod layer_norm;

@@ -85,7 +85,8 @@ fn run(
         overlap_frames: overlap,
     };
     let features = numbered(engine.track.nrows());
-    let track = Track { condition: features.view(), seed, style: None, constraints, primed: None };
+    let condition = features.view();
+    let track = Track { condition, phase: None, seed, style: None, constraints, primed: None };
     let mut parts: Vec<Array2<f32>> = Vec::new();
     generator
         .run(&track, |frames| {
@@ -222,9 +223,14 @@ fn a_track_begins_from_the_motion_of_its_windows_each_in_its_own_place() {
     // How far the motion is from the walk, in units of its spread.
     let off = |n_left: Option<usize>| {
         let primed = n_left.map(|n_left| Primed { motion: own.view(), n_left });
-        let features = features.view();
-        let track_of =
-            Track { condition: features, seed: 5, style: None, constraints: None, primed };
+        let track_of = Track {
+            condition: features.view(),
+            phase: None,
+            seed: 5,
+            style: None,
+            constraints: None,
+            primed,
+        };
         let mut motion = Array2::zeros((0, MOTION_DIM));
         let take = |frames: Array2<f32>| {
             motion.append(Axis(0), frames.view()).expect("25 channels");

@@ -19,9 +19,11 @@
 //! their bits. Equations with a value that is not finite are left out, and a pose that is not finite, or an
 //! orientation without direction, stays as it is: motion falls apart into two there.
 
+use ndarray::Array2;
+
 use super::banded::{Equation, SPAN, Solution};
 use super::turning::Turning;
-use super::variances::FusionVariances;
+use super::variances::{AxisVariances, FusionVariances};
 use crate::motion::quaternion::{Quaternion, angular_velocity, normalize};
 use crate::units::FPS;
 
@@ -134,6 +136,62 @@ impl Measured {
             .zip(kept)
             .map(|(q, (free, decoded))| if *free { q } else { *decoded })
             .collect()
+    }
+}
+
+/// Frames on either side that the filters of fusion see: two seconds.
+const FILTER_HALF_FRAMES: usize = 60;
+
+/// Fusion far from the ends of a motion, where the solution of its equations is a filter.
+///
+/// With r_v = v̂ − Dp̂ and r_a = â − D²p̂ the shift of positions is h_v ∗ r_v + h_a ∗ r_a, and with
+/// r_ω = ω̂ − FPS log(q̂\[t+1\] q̂\[t\]*) the turn of orientations, to first order, h_ω ∗ r_ω;
+/// (h ∗ r)\[t\] = Σ_j h\[j\] r\[t + j − m\] over 2m + 1 taps. Axis by axis, \[3, taps\].
+#[derive(Clone, Debug, PartialEq)]
+pub struct FusionFilters {
+    /// h_v, s.
+    pub velocity: Array2<f64>,
+    /// h_a, s².
+    pub acceleration: Array2<f64>,
+    /// h_ω, s.
+    pub angular_velocity: Array2<f64>,
+}
+
+impl FusionFilters {
+    /// Returns the filters of variances: what one residual moves in a motion without any other.
+    pub fn new(variances: &FusionVariances) -> Self {
+        let m = FILTER_HALF_FRAMES;
+        // Shifts are wanted m frames to either side of the residual, where the ends no longer tell.
+        let (n, middle) = (4 * m + 1, 2 * m);
+        let filter = |variances: &FusionVariances, is_velocity: bool| {
+            let still = vec![[0.0; 3]; n];
+            let mut residual = still.clone();
+            residual[middle] = [1.0; 3];
+            let (velocity, acceleration) =
+                if is_velocity { (residual, still.clone()) } else { (still.clone(), residual) };
+            let measured = Measured {
+                position: still.clone(),
+                velocity,
+                acceleration,
+                orientation: Vec::new(),
+                angular_velocity: Vec::new(),
+            };
+            let shifts = measured.shifts(variances, &Held::default());
+            Array2::from_shape_fn((3, 2 * m + 1), |(axis, j)| shifts[middle + m - j][axis])
+        };
+        // Rotation vectors are to angular velocities what positions are to velocities; nothing is known of their
+        // second differences.
+        let turns = FusionVariances {
+            position_m2: variances.orientation_rad2,
+            velocity_m2_s2: variances.angular_velocity_rad2_s2,
+            acceleration_m2_s4: AxisVariances::even(f64::INFINITY),
+            ..*variances
+        };
+        Self {
+            velocity: filter(variances, true),
+            acceleration: filter(variances, false),
+            angular_velocity: filter(&turns, true),
+        }
     }
 }
 

@@ -159,6 +159,7 @@ fn of_columns(row: &GenerationRow, card: &ModelCard) -> anyhow::Result<MotionSet
         constraint_strength: 1.0,
         soft: false,
         no_clock: false,
+        decoder_derives: card.decoder.fusion.is_some(),
     })
 }
 
@@ -243,8 +244,10 @@ fn sample_all(
             let clock = window.clock.as_ref().filter(|_| !settings.no_clock);
             let clock = clock.map(|clock| clock.view());
             let heard = condition(&card.unet, window.features.view(), clock);
+            let hears_clock = card.unet.clock && clock.is_some();
             let track = Track {
                 condition: heard.view(),
+                phase: window.phase.as_deref().filter(|_| hears_clock),
                 seed: seed_of(*seed, &window.phrase_id, window.first_frame, 0),
                 style: settings.style,
                 constraints: None,

@@ -14,9 +14,9 @@ use super::params::Params;
 use super::rows::{self, Rows, RunName};
 use super::splits::{MusicSplit, telling};
 use super::truth::{self, Truth};
-use crate::evaluation::holds_by_construction;
 use crate::evaluation::metrics::PhaseOrigin;
 use crate::evaluation::window::own_window_frames;
+use crate::evaluation::{holds_by_construction, holds_by_derivation};
 use crate::generation::LearnedFrom;
 use crate::motion::postprocess::PostProcessConfig;
 use crate::stages::Progress;
@@ -48,6 +48,8 @@ pub struct Evaluand {
     n_frames: Vec<usize>,
     /// How motions were processed; nothing was done to those of another program.
     postprocess: PostProcessConfig,
+    /// Whether decoded motion agrees with itself by construction.
+    decoder_derives: bool,
     /// Files of motions of another program.
     files: Option<ForeignMotions>,
     /// Whether motions say a phase.
@@ -97,6 +99,7 @@ impl Evaluand {
                 .iter()
                 .map(|row| usize::try_from(row.n_frames).unwrap_or(0))
                 .collect(),
+            decoder_derives: settings.iter().any(|settings| settings.decoder_derives),
             postprocess: settings.into_iter().next().map(|s| s.postprocess).unwrap_or_default(),
             generations,
             files: None,
@@ -175,6 +178,7 @@ impl Evaluand {
             refused,
             n_frames,
             postprocess: PostProcessConfig::nothing(),
+            decoder_derives: false,
             files: Some(files),
             has_phase,
         })
@@ -276,8 +280,8 @@ impl Evaluand {
         for (motion, found) in self.motions.iter().zip(&evaluated) {
             let (id, sample) = (motion.phrase_id.as_str(), motion.sample);
             if let Some(decoded) = &found.decoded {
-                let none = |_: &str| false;
-                let raw = rows::checks(name, id, sample, MadeAt::Raw, &decoded.checks, &none);
+                let derived = |check: &str| self.decoder_derives && holds_by_derivation(check);
+                let raw = rows::checks(name, id, sample, MadeAt::Raw, &decoded.checks, &derived);
                 rows.checks.extend(raw);
             }
             let is = rows::checks(name, id, sample, MadeAt::Final, &found.is.checks, &holds);

@@ -82,7 +82,7 @@ impl Stage for Export {
         check_run_name(&params.run)?;
         check_model_name(&params.model)?;
         let store = Location::open(&params.store, &params.client.options())?;
-        let trained = Trained::read(&store, &params.run, params.weights)?;
+        let mut trained = Trained::read(&store, &params.run, params.weights)?;
         let machine = &params.machine;
         let watch = Looker(progress);
         let most = Some(MAX_TRAIN_PHRASES);
@@ -100,6 +100,9 @@ impl Stage for Export {
         let engine = eager(&trained, (unet.clone(), decoder.clone()), machine.threads)?;
         let sampling = tuning::sampling_defaults(&engine, network, &phrases.dataset, progress)?;
         drop(engine);
+        // The model's decoder fuses by what it was measured to leave; in training its heads speak for themselves.
+        trained.state.config.network.decoder.fusion =
+            sampling.as_ref().map(|sampling| sampling.fusion_variances);
         let measured = (motion_range(&phrases.dataset)?, sampling);
         let files = Files::make(&trained, &params, measured, learned_from)?;
         if params.dry_run {

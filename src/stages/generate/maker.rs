@@ -67,6 +67,14 @@ pub fn seed_of(seed: u64, phrase_id: &str, sample: usize, candidate: usize) -> u
         .expect("a digest has hexadecimal digits")
 }
 
+/// What a network hears of a track, and the bar phase that its motion is sampled with.
+#[derive(Clone, Copy)]
+struct Heard<'a> {
+    /// \[T, condition_dim\]
+    condition: ArrayView2<'a, f32>,
+    phase: Option<&'a [f64]>,
+}
+
 impl Maker<'_> {
     /// Makes one sample; `watch` sees the frames of its first candidate as they are final.
     ///
@@ -99,6 +107,10 @@ impl Maker<'_> {
         let clock = known.map(|(bars, beats)| clock(bars, beats.beats_per_bar()));
         let clock = clock.as_ref().map(|clock| clock.view());
         let heard = condition(&self.card.unet, music.features, clock);
+        let heard = Heard {
+            condition: heard.view(),
+            phase: bars.filter(|_| self.card.unet.clock && clock.is_some()),
+        };
         let priming = self.priming(music)?;
         let kept = constraints.as_ref().filter(|_| !self.settings.soft);
         let held = kept.map(|constraints| constraints.held(n_frames)).unwrap_or_default();
@@ -110,14 +122,8 @@ impl Maker<'_> {
             let mut unseen = |_: ArrayView2<f32>| Ok(());
             let watcher: &mut dyn FnMut(ArrayView2<f32>) -> std::io::Result<()> =
                 if candidate == 0 { &mut *watch } else { &mut unseen };
-            let decoded = self.sample(
-                music,
-                heard.view(),
-                seed,
-                constraints.as_ref(),
-                priming.as_ref(),
-                watcher,
-            )?;
+            let decoded =
+                self.sample(music, heard, seed, constraints.as_ref(), priming.as_ref(), watcher)?;
             let velocity_error =
                 derivative_error(decoded.view(), Channel::Position, Channel::Velocity);
             let mut frames = decoded.clone();
@@ -191,7 +197,7 @@ impl Maker<'_> {
     fn sample(
         &self,
         music: &Music,
-        heard: ArrayView2<f32>,
+        heard: Heard,
         seed: u64,
         constraints: Option<&Constraints>,
         priming: Option<&Priming>,
@@ -199,7 +205,8 @@ impl Maker<'_> {
     ) -> Result<Array2<f32>, Failure> {
         let strength = self.settings.constraint_strength;
         let track = Track {
-            condition: heard,
+            condition: heard.condition,
+            phase: heard.phase,
             seed,
             style: self.settings.style,
             constraints: constraints.map(|constraints| Constrained { constraints, strength }),

@@ -255,6 +255,7 @@ pub struct Settings {
     pub constraint_strength: f64,
     pub soft: bool,
     pub no_clock: bool,
+    pub decoder_derives: bool,
 }
 
 impl Settings {
@@ -306,6 +307,7 @@ impl Settings {
             constraint_strength: strength,
             soft: params.soft,
             no_clock: params.no_clock,
+            decoder_derives: card.decoder.fusion.is_some(),
         })
     }
 
@@ -363,6 +365,7 @@ impl Settings {
             constraint_strength: self.constraint_strength,
             soft: self.soft,
             no_clock: self.no_clock,
+            decoder_derives: self.decoder_derives,
         }
     }
 

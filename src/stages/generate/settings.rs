@@ -9,7 +9,7 @@ use crate::motion::style::STYLE_DIM;
 use crate::store::digest;
 
 /// Raised when generate writes something else for the same model, music and settings.
-pub(super) const OUTPUT_VERSION: u32 = 2;
+pub(super) const OUTPUT_VERSION: u32 = 3;
 
 /// What determines a motion beside its music and its candidate: the column `settings` of `generations`, and
 /// what the digest of a generation is made of.
@@ -47,6 +47,10 @@ pub struct MotionSettings {
     /// Whether the clock is withheld from a network that hears it.
     #[serde(default, skip_serializing_if = "is_false")]
     pub no_clock: bool,
+    /// Whether the decoder derives velocities from its poses, so that decoded motion agrees with itself by
+    /// construction.
+    #[serde(default, skip_serializing_if = "is_false")]
+    pub decoder_derives: bool,
 }
 
 /// As release 0.1 wrote settings, what it did not know is left out where it says nothing new.
@@ -92,6 +96,7 @@ mod tests {
             constraint_strength: 1.0,
             soft: false,
             no_clock: false,
+            decoder_derives: false,
         }
     }
 

@@ -1,0 +1,64 @@
+//! A fixed filter over frames, for each channel its own.
+
+use std::sync::Arc;
+
+use ndarray::Array2;
+
+use crate::autodiff::element::Element;
+use crate::autodiff::operation::{Backward, Operation, Run, expect_axes};
+use crate::autodiff::tensor::Tensor;
+use crate::model::{GraphError, Result};
+
+/// y\[t, c\] = Σ_j h\[c, j\] x\[t + j − m\], m = ⌊taps / 2⌋, zero beyond either end.
+///
+/// h, \[channels, taps\], is no parameter and learns nothing. \[batch, frames, channels\] → the same
+pub struct FilterFrames(pub Arc<Array2<f64>>);
+
+impl FilterFrames {
+    /// Filters, or for the gradient applies the transpose, which is the filter with its taps in reverse.
+    fn apply<E: Element>(&self, shape: &[usize], x: &[E], y: &mut [E], is_transposed: bool) {
+        let (frames, channels, taps) = (shape[1], shape[2], self.0.ncols());
+        let kernel: Vec<E> = self.0.iter().map(|&h| E::from_f64(h)).collect();
+        let half = taps / 2;
+        y.fill(E::ZERO);
+        let sample = (frames * channels).max(1);
+        for (y, x) in y.chunks_exact_mut(sample).zip(x.chunks_exact(sample)) {
+            for t in 0..frames {
+                for j in 0..taps {
+                    let Some(from) = (t + j).checked_sub(half).filter(|&s| s < frames) else {
+                        continue;
+                    };
+                    let tap = if is_transposed { taps - 1 - j } else { j };
+                    for c in 0..channels {
+                        let h = kernel[c * taps + tap];
+                        y[t * channels + c] = y[t * channels + c] + h * x[from * channels + c];
+                    }
+                }
+            }
+        }
+    }
+}
+
+impl<E: Element> Operation<E> for FilterFrames {
+    fn name(&self) -> &'static str {
+        "filter_frames"
+    }
+
+    fn forward(&mut self, x: &[&Tensor<E>], run: &Run<E>) -> Result<Tensor<E>> {
+        let x = x[0];
+        expect_axes("filter_frames", "input", x, 3, "[batch, frames, channels]")?;
+        let (channels, taps) = self.0.dim();
+        if x.channels() != channels || taps % 2 == 0 {
+            let problem = format!(
+                "input has {} channels, the filter has {channels} with {taps} taps, of which an odd number is asked",
+                x.channels()
+            );
+            return Err(GraphError::shape("filter_frames", problem));
+        }
+        Ok(run.tensor(x.shape(), |y| self.apply(x.shape(), x.data(), y, false)))
+    }
+
+    fn backward(&mut self, dy: Tensor<E>, at: &mut Backward<E>) -> Vec<Option<Tensor<E>>> {
+        at.only(|| at.tensor(dy.shape(), |dx| self.apply(dy.shape(), dy.data(), dx, true)))
+    }
+}
