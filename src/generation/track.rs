@@ -11,6 +11,7 @@ use ndarray::{Array2, Array3, ArrayView2, Axis, s};
 
 use crate::autodiff::Stream;
 use crate::diffusion::Refine;
+use crate::motion::quaternion::{Quaternion, dot};
 use crate::motion::style::STYLE_DIM;
 use crate::motion::{Channel, MOTION_DIM, Normalizer, Placement};
 
@@ -90,11 +91,14 @@ impl Generator<'_> {
     ) -> Result<(), E> {
         let windows = self.windows(track.condition.nrows());
         let start = track.constraints.map(|c| c.constraints.placement()).unwrap_or_default();
-        let give = |mut frames: Array2<f32>, emit: &mut dyn FnMut(Array2<f32>) -> Result<(), E>| {
+        let mut last: Option<Quaternion> = None;
+        let mut give = |mut frames: Array2<f32>,
+                        emit: &mut dyn FnMut(Array2<f32>) -> Result<(), E>| {
             if frames.nrows() == 0 {
                 return Ok(());
             }
             start.restore(&mut frames);
+            last = continue_signs(&mut frames, last);
             emit(frames)
         };
         let mut joiner = Joiner::new();
@@ -111,9 +115,7 @@ impl Generator<'_> {
             let decoded = self.engine.decode(latent.view())?;
             for (i, window) in run.clone().zip(decoded.outer_iter()) {
                 let shift = windows.shift(i);
-                let mut window = window.to_owned();
-                continue_signs(&mut window);
-                give(joiner.push(window, shift), &mut emit)?;
+                give(joiner.push(window.to_owned(), shift), &mut emit)?;
             }
             let motions = self.motions(&latent);
             let place = job.places(&motions).pop().unwrap_or(first);
@@ -254,15 +256,20 @@ impl Run<'_> {
     }
 }
 
-/// Gives each orientation of a window the sign that is nearer to the one before: q and −q are one orientation.
-fn continue_signs(window: &mut Array2<f32>) {
+/// Gives each orientation the sign that is nearer to the one before, q and −q being one orientation; returns the
+/// last.
+fn continue_signs(frames: &mut Array2<f32>, before: Option<Quaternion>) -> Option<Quaternion> {
     let columns = Channel::Quaternion.range();
-    for t in 1..window.nrows() {
-        let dot: f32 = columns.clone().map(|i| window[[t - 1, i]] * window[[t, i]]).sum();
-        if dot < 0.0 {
-            window.slice_mut(s![t, columns.clone()]).mapv_inplace(|x| -x);
+    let mut before = before;
+    for mut row in frames.rows_mut() {
+        let mut q: Quaternion = std::array::from_fn(|i| f64::from(row[columns.start + i]));
+        if before.is_some_and(|before| dot(before, q) < 0.0) {
+            row.slice_mut(s![columns.clone()]).mapv_inplace(|x| -x);
+            q = q.map(|x| -x);
         }
+        before = Some(q);
     }
+    before
 }
 
 /// Returns where a motion stands at a frame.

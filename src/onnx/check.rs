@@ -13,11 +13,11 @@ use super::proto::{AttributeType, DataType, Graph, Model, Node, Tensor};
 /// The operators that are written: name, fewest and most inputs, attributes.
 ///
 /// Versions: the newest of each up to opset 21 (<https://onnx.ai/onnx/operators>).
-const OPERATORS: [(&str, usize, usize, &[&str]); 38] = [
+const OPERATORS: [(&str, usize, usize, &[&str]); 39] = [
     ("Add", 2, 2, &[]),
     ("Cast", 1, 1, &["to"]),
     ("Concat", 1, usize::MAX, &["axis"]),
-    ("Conv", 2, 3, &["kernel_shape", "strides", "dilations", "pads"]),
+    ("Conv", 2, 3, &["kernel_shape", "strides", "dilations", "pads", "group"]),
     ("Cos", 1, 1, &[]),
     ("DequantizeLinear", 2, 3, &["axis"]),
     ("Div", 2, 2, &[]),
@@ -31,6 +31,7 @@ const OPERATORS: [(&str, usize, usize, &[&str]); 38] = [
     ("Less", 2, 2, &[]),
     ("MatMul", 2, 2, &[]),
     ("Max", 1, usize::MAX, &[]),
+    ("Min", 1, usize::MAX, &[]),
     ("Mish", 1, 1, &[]),
     ("Mod", 2, 2, &[]),
     ("Mul", 2, 2, &[]),

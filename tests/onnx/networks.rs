@@ -4,14 +4,16 @@ use std::collections::BTreeMap;
 
 use motiongen::audio::{FEATURE_DIM, FeatureScale};
 use motiongen::autodiff::{Arena, Eager, Parameters};
+use motiongen::evaluation::checks;
 use motiongen::model::{
     DecoderConfig, MotionDecoder, Parameter, ParameterList, Preset, UNet1D, UNetConfig, UNetInputs,
 };
-use motiongen::motion::MOTION_DIM;
+use motiongen::motion::postprocess::{Coherence, FusionVariances, PostProcessConfig, process};
+use motiongen::motion::{Channel, ChannelLimits, MOTION_DIM};
 use motiongen::onnx::{
     DecoderNames, Form, ModelFile, Session, Storage, Tensor, UNetNames, decoder, unet, values_of,
 };
-use ndarray::ArrayViewMut2;
+use ndarray::{Array2, ArrayViewMut2, s};
 
 use super::{OPTIONS, floats, integers, max_difference, normal, runtime, session, write};
 
@@ -188,6 +190,100 @@ fn rounded_weights_are_read_back_as_onnxruntime_sees_them() {
         compare(&config, &read, &mut session, &case);
     }
     assert!(sizes[1] < sizes[0] * 6 / 10 && sizes[2] < sizes[0] * 4 / 10, "{sizes:?}");
+}
+
+#[test]
+fn a_decoder_that_fuses_is_the_same_network_in_onnx() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let config =
+        DecoderConfig { fusion: Some(FusionVariances::default()), ..DecoderConfig::default() };
+    let (network, list) = MotionDecoder::new(&config);
+    let parameters = random(list, 9);
+    let weights = |id| parameters.unpacked(id);
+    let graph = decoder(&config, &weights, Storage::Fp32).expect("a graph");
+    let mut session = session(file(graph), folder.path(), "decoder.onnx");
+    for (batch, frames) in [(2, 121), (3, 7), (1, 1)] {
+        let latent = slow_waves(batch, frames);
+        let shape = [batch, frames, MOTION_DIM];
+        let inputs: [Tensor; 1] = [floats(DecoderNames::LATENT, &shape, &latent)];
+        let (found_shape, found) = session.run(&inputs, DecoderNames::MOTION).expect("motion");
+        let arena = Arena::default();
+        let mut g = Eager::new(&parameters, &arena);
+        let x = g.input(&shape, &latent);
+        let wanted = network.forward(&mut g, &x).expect("motion");
+        assert_eq!(found_shape, shape);
+        for (i, (a, b)) in found.iter().zip(wanted.data()).enumerate() {
+            // Second differences of positions of some metres, 900 of which make an acceleration.
+            let tolerance =
+                if Channel::Acceleration.range().contains(&(i % MOTION_DIM)) { 5e-3 } else { 2e-4 };
+            assert!((a - b).abs() <= tolerance, "{batch} × {frames}, {i}: {a} against {b}");
+        }
+    }
+}
+
+#[test]
+fn a_decoder_that_fuses_does_in_the_middle_what_post_processing_does() {
+    let variances = FusionVariances::default();
+    let plain = DecoderConfig::default();
+    let fusing = DecoderConfig { fusion: Some(variances), ..plain.clone() };
+    let (n, frames) = (1, 331);
+    let latent = slow_waves(n, frames);
+    let decoded = |config: &DecoderConfig| {
+        let (network, list) = MotionDecoder::new(config);
+        let parameters = random(list, 9);
+        let arena = Arena::default();
+        let mut g = Eager::new(&parameters, &arena);
+        let x = g.input(&[n, frames, MOTION_DIM], &latent);
+        let motion = network.forward(&mut g, &x).expect("motion").data().to_vec();
+        Array2::from_shape_vec((frames, MOTION_DIM), motion).expect("one motion")
+    };
+    let (mut wanted, found) = (decoded(&plain), decoded(&fusing));
+    let before = wanted.clone();
+    let only_fuse = PostProcessConfig {
+        coherence: Coherence::Fuse,
+        fusion_variances: Some(variances),
+        ..PostProcessConfig::nothing()
+    };
+    process(&only_fuse, &mut wanted, None);
+    let difference = |a: &Array2<f32>, b: &Array2<f32>, channel: Channel| {
+        let middle = s![70..frames - 70, channel.range()];
+        max_difference(
+            &a.slice(middle).to_owned().into_raw_vec_and_offset().0,
+            &b.slice(middle).to_owned().into_raw_vec_and_offset().0,
+        )
+    };
+    for (channel, tolerance) in [
+        // The filters are cut off after two seconds.
+        (Channel::Position, 1e-4),
+        (Channel::Velocity, 1e-3),
+        // Turns are exact to first order: of a turn of a tenth of a radian a hundredth is left.
+        (Channel::Quaternion, 1e-2),
+        (Channel::Phase, 0.0),
+        (Channel::Style, 0.0),
+    ] {
+        let (off, moved) =
+            (difference(&found, &wanted, channel), difference(&before, &wanted, channel));
+        assert!(off <= tolerance, "{channel:?}: off by {off}, moved by {moved}");
+        assert!(moved > 3.0 * tolerance || tolerance == 0.0, "{channel:?}: moved by {moved} alone");
+    }
+    for name in ["velocity", "acceleration", "angular_velocity"] {
+        let check = |motion: &Array2<f32>| {
+            let checks = checks(motion.view(), ChannelLimits::Wide);
+            checks.into_iter().find(|check| check.name == name).expect("a strict check")
+        };
+        let (fused, apart) = (check(&found), check(&before));
+        assert!(fused.passed && !apart.passed, "{}; {}", fused.message, apart.message);
+    }
+}
+
+/// Latents of slow waves, of which no two channels are alike.
+fn slow_waves(batch: usize, frames: usize) -> Vec<f32> {
+    let wave = |i: usize| {
+        let (t, c) = (i / MOTION_DIM % frames, i % MOTION_DIM);
+        let b = i / (MOTION_DIM * frames);
+        (t as f32 * (0.01 + 0.002 * c as f32) + (c * c + b) as f32).sin()
+    };
+    (0..batch * frames * MOTION_DIM).map(wave).collect()
 }
 
 #[test]

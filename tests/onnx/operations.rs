@@ -39,6 +39,9 @@ enum Call {
     Normalize,
     Rotary,
     HoldAndCrop,
+    LaterFrames { shift: usize, spare: usize },
+    LaterFramesOfConvolution,
+    FilterFrames { taps: usize },
     HeldMask,
     StridedMask,
 }
@@ -167,6 +170,17 @@ fn run<G: Graph>(call: Call, g: &mut G, x: &Given<G::Tensor>, ids: &Ids) -> Resu
         }
         Call::Normalize => g.normalize(&x.x, 1e-12),
         Call::Rotary => g.rotary(&x.x, HEADS),
+        Call::LaterFrames { shift, spare } => g.later_frames(&x.x, shift, spare),
+        Call::LaterFramesOfConvolution => {
+            let h = convolved(g)?;
+            g.later_frames(&h, 1, 2)
+        }
+        Call::FilterFrames { taps } => {
+            let kernel = Array2::from_shape_fn((WIDTH, taps), |(c, j)| {
+                0.1 * c as f64 - 0.07 * j as f64 + 0.02
+            });
+            g.filter_frames(&x.x, &Arc::new(kernel))
+        }
         Call::HoldAndCrop => {
             let h = g.hold_frames(&x.x, 4)?;
             let h = g.conv1d(&h, ids.taps, None, SAME)?;
@@ -299,6 +313,13 @@ fn every_operation_gives_what_the_interpreter_gives() {
         Call::Normalize,
         Call::Rotary,
         Call::HoldAndCrop,
+        Call::LaterFrames { shift: 1, spare: 0 },
+        Call::LaterFrames { shift: 0, spare: 2 },
+        // More than there are frames.
+        Call::LaterFrames { shift: 3, spare: FRAMES + 1 },
+        Call::LaterFramesOfConvolution,
+        Call::FilterFrames { taps: 5 },
+        Call::FilterFrames { taps: 2 * FRAMES + 3 },
         Call::HeldMask,
         Call::StridedMask,
     ];

@@ -16,6 +16,8 @@ struct ByHeart {
     /// How far every window's estimate lies beside the motion, by the number of its first frame, m.
     offset_m: fn(usize) -> f32,
     normalizer: Normalizer,
+    /// From this frame of a window on, orientations are decoded with the other sign.
+    other_sign_from: usize,
 }
 
 impl Engine for ByHeart {
@@ -44,6 +46,11 @@ impl Engine for ByHeart {
     fn decode(&self, latent: ArrayView3<f32>) -> Result<Array3<f32>, EngineError> {
         let mut motion = latent.to_owned();
         motion.outer_iter_mut().for_each(|window| self.normalizer.denormalize(window));
+        for ((_, t, i), x) in motion.indexed_iter_mut() {
+            if t >= self.other_sign_from && Channel::Quaternion.range().contains(&i) {
+                *x = -*x;
+            }
+        }
         Ok(motion)
     }
 }
@@ -76,6 +83,17 @@ fn run(
     constraints: Option<Constrained>,
     overlap: usize,
 ) -> (Array2<f32>, Vec<usize>) {
+    run_at(engine, seed, constraints, overlap, None)
+}
+
+/// Returns the motion of a track whose music has a phase, and how many frames came at once.
+fn run_at(
+    engine: &ByHeart,
+    seed: u64,
+    constraints: Option<Constrained>,
+    overlap: usize,
+    phase: Option<&[f64]>,
+) -> (Array2<f32>, Vec<usize>) {
     let (schedule, config) = (schedule(), sampler());
     let generator = Generator {
         engine,
@@ -86,7 +104,7 @@ fn run(
     };
     let features = numbered(engine.track.nrows());
     let condition = features.view();
-    let track = Track { condition, phase: None, seed, style: None, constraints, primed: None };
+    let track = Track { condition, phase, seed, style: None, constraints, primed: None };
     let mut parts: Vec<Array2<f32>> = Vec::new();
     generator
         .run(&track, |frames| {
@@ -102,7 +120,7 @@ fn run(
 fn by_heart(n: usize, offset_m: fn(usize) -> f32) -> ByHeart {
     let track = walk(n);
     let normalizer = Normalizer::fit(track.view()).0;
-    ByHeart { track, offset_m, normalizer }
+    ByHeart { track, offset_m, normalizer, other_sign_from: usize::MAX }
 }
 
 fn largest_difference(a: &Array2<f32>, b: &Array2<f32>) -> f32 {
@@ -125,6 +143,46 @@ fn what_a_model_knows_comes_out_at_any_length() {
         // Placed anew at up to 13 seams, of accelerations up to 5 m/s² and positions up to 10 m.
         let off = largest_difference(&motion, &engine.track);
         assert!(off < 2e-4, "{n} frames: {off:e}");
+    }
+}
+
+#[test]
+fn motion_is_sampled_with_the_phase_of_its_music() {
+    // One window, and several that meet.
+    for n in [33, 173] {
+        let engine = by_heart(n, |_| 0.0);
+        let phase: Vec<f64> = (0..n).map(|t| (0.37 + t as f64 / 47.0).fract()).collect();
+        let (motion, _) = run_at(&engine, 3, None, 10, Some(&phase));
+        let column = Channel::Phase.range().start;
+        for (t, phase) in phase.iter().enumerate() {
+            let off = (f64::from(motion[[t, column]]) - phase).abs();
+            // Normalised and back; where windows are faded the shorter way round the bar is taken.
+            assert!(off.min(1.0 - off) < 1e-5, "{t} of {n}: {} for {phase}", motion[[t, column]]);
+        }
+        let (without, _) = run(&engine, 3, None, 10);
+        assert!((f64::from(without[[20, column]]) - phase[20]).abs() > 0.05);
+        let others = |i: usize| {
+            largest_difference(
+                &motion.slice(s![.., i..i + 1]).to_owned(),
+                &without.slice(s![.., i..i + 1]).to_owned(),
+            )
+        };
+        assert!(others(0) < 1e-5 && others(9) < 1e-5, "nothing but the phase is given");
+    }
+}
+
+#[test]
+fn orientations_keep_their_sign_from_frame_to_frame() {
+    for n in [33, 173] {
+        let plain = by_heart(n, |_| 0.0);
+        let engine = ByHeart { other_sign_from: 25, ..by_heart(n, |_| 0.0) };
+        let (motion, _) = run(&engine, 3, None, 10);
+        assert!(largest_difference(&motion, &plain.track) < 2e-4);
+        for t in 1..n {
+            let columns = Channel::Quaternion.range();
+            let dot: f32 = columns.map(|i| motion[[t - 1, i]] * motion[[t, i]]).sum();
+            assert!(dot > 0.9, "frame {t} of {n}: {dot}");
+        }
     }
 }
 

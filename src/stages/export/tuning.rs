@@ -31,8 +31,6 @@ const N_WINDOWS: usize = 32;
 const MAX_FITTED_PHRASES: usize = 400;
 /// Guidances that are tried, until motion is locked to the bar as far as real motion is.
 const GUIDANCES: [f64; 5] = [1.0, 1.5, 2.0, 3.0, 4.0];
-/// Steps of DPM-Solver++, as generate takes them by default.
-const N_STEPS: usize = 10;
 /// Powers of two by which variances are multiplied.
 const MULTIPLES: [f64; 17] =
     [-8., -7., -6., -5., -4., -3., -2., -1., 0., 1., 2., 3., 4., 5., 6., 7., 8.];
@@ -216,7 +214,7 @@ fn decoded(
     let schedule = Schedule::new(&network.diffusion)?;
     let config = SamplerConfig {
         sampler: Sampler::DpmSolver,
-        n_steps: N_STEPS.min(schedule.len()),
+        n_steps: Sampler::DpmSolver.usual_steps(schedule.len()),
         spacing: Spacing::Trailing,
         clip: true,
     };

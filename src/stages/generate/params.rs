@@ -91,7 +91,7 @@ pub struct Params {
     /// How noise becomes motion.
     #[arg(long, value_enum, default_value_t = SamplerName::DpmSolver, help_heading = "Sampling")]
     pub sampler: SamplerName,
-    /// Steps of the sampler [default: 10 of dpm-solver, 20 of ddim, all of ddpm]
+    /// Steps of the sampler [default: 20; all of ddpm]
     #[arg(long, value_name = "N", help_heading = "Sampling")]
     pub steps: Option<usize>,
     /// Which steps of the diffusion are visited.
@@ -265,12 +265,12 @@ impl Settings {
     /// One sentence for what this model or any sampler cannot do.
     pub fn new(params: &Params, card: &ModelCard) -> anyhow::Result<Self> {
         let schedule = Schedule::new(&card.diffusion)?;
-        let (sampler, n_steps) = match params.sampler {
-            SamplerName::Ddpm => (Sampler::Ddpm, schedule.len()),
-            SamplerName::Ddim => (Sampler::Ddim { eta: params.eta }, 20),
-            SamplerName::DpmSolver => (Sampler::DpmSolver, 10),
+        let sampler = match params.sampler {
+            SamplerName::Ddpm => Sampler::Ddpm,
+            SamplerName::Ddim => Sampler::Ddim { eta: params.eta },
+            SamplerName::DpmSolver => Sampler::DpmSolver,
         };
-        let n_steps = params.steps.unwrap_or_else(|| n_steps.min(schedule.len()));
+        let n_steps = params.steps.unwrap_or_else(|| sampler.usual_steps(schedule.len()));
         let sampler = SamplerConfig { sampler, n_steps, spacing: params.spacing, clip: true };
         sampler.check(schedule.len())?;
         let guidance = params.guidance.unwrap_or_else(|| card.guidance());
