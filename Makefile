@@ -116,6 +116,11 @@ bench-generation: build/bench-venv/ready setup ## measure generation, whole song
 bench-evaluation: build/bench-venv/ready build ## measure evaluation of 10,000 motions, with the demo's model [BENCH_ARGS]
 	build/bench-venv/bin/python benches/evaluation.py --bin $(BIN)/motiongen $(BENCH_ARGS)
 
+.PHONY: bench-store
+bench-store: build/bench-venv/ready ## measure a store of a million phrases, and a year of updates [BENCH_PROFILE, BENCH_ARGS]
+	$(CARGO) build --locked --profile $(BENCH_PROFILE) --bin motiongen
+	build/bench-venv/bin/python benches/store.py --bin $(BENCH_BIN)/motiongen $(BENCH_ARGS)
+
 .PHONY: bench-room
 bench-room: ## build the room autodiff alone, from nothing
 	$(PYTHON) benches/room.py

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use motiongen::motion::{Beats, bar_phase};
 use motiongen::stages::beats::{BeatSource, PhraseBeats, of_phrases};
-use motiongen::store::Location;
 use motiongen::store::tables::{BeatRow, ExtractionRow};
+use motiongen::store::{Location, StoreSnapshot};
 use parquet::arrow::ArrowWriter;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use serde_json::Value;
@@ -67,6 +67,7 @@ fn rows_of(dir: &Dir, id: &str) -> Vec<BeatRow> {
 /// Returns the beats of a phrase as every stage reads them.
 fn read(store: &Path, id: &str) -> PhraseBeats {
     let store = Location::local(store).expect("a folder");
+    let store = StoreSnapshot::take(&store).expect("commits");
     of_phrases(&store, |name| name == id).expect("beats").remove(id).unwrap_or_default()
 }
 

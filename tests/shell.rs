@@ -5,9 +5,9 @@ use std::process::{Command, Stdio};
 
 use crate::support::run;
 
-const STAGES: [&str; 12] = [
+const STAGES: [&str; 14] = [
     "ingest", "extract", "library", "train", "finetune", "export", "generate", "evaluate", "model",
-    "plot", "view", "query",
+    "plot", "view", "query", "compact", "vacuum",
 ];
 
 #[test]

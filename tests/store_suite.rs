@@ -1,8 +1,11 @@
 //! What the store promises, on every kind of storage that it opens: memory, a local folder, and
 //! `s3://` and `gs://` on loopback.
 
+mod catalogue;
 mod commits;
+mod compaction;
 mod faults;
+mod leases;
 mod objects;
 mod parts;
 mod sources;

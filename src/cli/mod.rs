@@ -16,6 +16,7 @@ use std::process::ExitCode;
 
 use clap::{Arg, ArgAction, ArgMatches, Command, FromArgMatches as _};
 
+use crate::stages::compact::Compact;
 use crate::stages::evaluate::Evaluate;
 use crate::stages::export::Export;
 use crate::stages::extract::Extract;
@@ -28,6 +29,7 @@ use crate::stages::plot::Plot;
 #[cfg(feature = "query")]
 use crate::stages::query::Query;
 use crate::stages::train::Train;
+use crate::stages::vacuum::Vacuum;
 use crate::stages::view::View;
 use crate::stages::{Stage, Summary};
 use progress::Bars;
@@ -62,6 +64,8 @@ fn entries() -> Vec<Entry> {
         Entry::of::<View>(),
         #[cfg(feature = "query")]
         Entry::of::<Query>(),
+        Entry::of::<Compact>(),
+        Entry::of::<Vacuum>(),
     ]
 }
 

@@ -8,7 +8,7 @@ use std::collections::HashMap;
 
 use crate::motion::Beats;
 use crate::store::tables::{BeatRow, PhraseRow};
-use crate::store::{ItemTables, Location, Row as _, Snapshot, StoreError};
+use crate::store::{ItemTables, Row as _, StoreError, StoreSnapshot};
 use crate::units::s_to_frames;
 
 /// `beats_per_bar_source` of a bar that nobody counted.
@@ -178,11 +178,11 @@ impl From<&BeatRow> for KnownBeat {
 /// # Errors
 /// [`StoreError`] when the table cannot be read.
 pub fn of_phrases(
-    store: &Location,
+    store: &StoreSnapshot,
     is_wanted: impl Fn(&str) -> bool,
 ) -> Result<HashMap<String, PhraseBeats>, StoreError> {
     let mut found: HashMap<String, Vec<KnownBeat>> = HashMap::new();
-    let table = Snapshot::take(store, BeatRow::schema())?;
+    let table = store.table(BeatRow::schema())?;
     // Kept without their names, which weigh more than all else.
     table.rows_where(|row: &BeatRow| {
         if is_wanted(&row.phrase_id) {

@@ -8,7 +8,7 @@ use anyhow::ensure;
 
 use super::learned::{learned_path, remember};
 use super::train::session::{
-    Looker, MachineParams, check_run_name, claim, claim_path, read_phrases,
+    Looker, MachineParams, check_run_name, claim, claim_path, lease_of, read_phrases,
 };
 use super::train::{Account, StageAccount, quoted, restore};
 use super::trained::{Stand, Trained};
@@ -290,6 +290,7 @@ impl Stage for Finetune {
         );
         let Trained { state: trained, unet, decoder, .. } =
             Trained::read(&store, run, Stand::Train)?;
+        let lease = lease_of(&store, run, &watch)?;
         if params.force {
             checkpoints.clear()?;
             Journal::open(&store, Self::NAME, run, Self::NAME)?.clear()?;
@@ -335,7 +336,7 @@ impl Stage for Finetune {
             plan,
             state,
             checkpoints,
-            journal: Journal::open(&store, Self::NAME, run, Self::NAME)?,
+            journal: Journal::open(&store, Self::NAME, run, Self::NAME)?.under(&lease),
             watch: &watch,
             anchor: claim_path(run, Self::NAME),
         };

@@ -3,7 +3,7 @@
 use bytes::Bytes;
 
 use super::generate::weights_digest;
-use super::model_files::{folder_of, is_model_name};
+use super::model_files::{current_folder, folder_of, is_model_name};
 use super::train::session::{Looker, MachineParams, read_phrases};
 use super::trained::{Trained, Tuned};
 use super::{Progress, Stage as _, finetune::Finetune, pretrained, train::Train};
@@ -195,7 +195,7 @@ fn card_of(store: &Location, model: &str) -> Result<Option<Bytes>, StoreError> {
     if !is_model_name(model) {
         return Ok(None);
     }
-    let path = format!("{}/{}", folder_of(model), file_names::CARD);
+    let path = format!("{}/{}", current_folder(store, &folder_of(model))?, file_names::CARD);
     let of_program = || (model == pretrained::NAME).then(|| pretrained::file(file_names::CARD));
     Ok(store.read_if_there(&path)?.or_else(|| of_program().flatten()))
 }

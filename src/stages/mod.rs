@@ -1,6 +1,7 @@
 //! Stages: what the user runs. Each has a contract, parameters, a run and a summary.
 
 pub mod beats;
+pub mod compact;
 pub mod evaluate;
 pub mod export;
 pub mod extract;
@@ -21,6 +22,7 @@ pub mod query;
 mod retrieval;
 pub mod train;
 mod trained;
+pub mod vacuum;
 pub mod view;
 
 use std::io::{self, Write};

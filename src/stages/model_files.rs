@@ -85,6 +85,43 @@ pub fn folder_of(name: &str) -> String {
     format!("models/{name}")
 }
 
+/// File beside the card of a model that was replaced, which names the folder of the model that counts.
+pub const POINTER: &str = "current.json";
+/// Digits of the name of such a folder.
+const VERSION_DIGITS: usize = 32;
+
+/// What [`POINTER`] says.
+#[derive(serde::Serialize, serde::Deserialize)]
+struct Pointer {
+    folder: String,
+}
+
+/// Returns the name of the folder of a model with that card, and the text that points there.
+pub fn pointer_to(card_text: &[u8]) -> (String, Bytes) {
+    let folder = sha256(card_text)[..VERSION_DIGITS].to_owned();
+    let text = serde_json::json!({ "folder": folder }).to_string() + "\n";
+    (folder, text.into())
+}
+
+/// Returns where the files of a model lie: below its own folder where that was replaced, else in it.
+///
+/// # Errors
+/// [`StoreError`] when the store cannot be read.
+pub fn current_folder(store: &Location, folder: &str) -> Result<String, StoreError> {
+    let below = |name: &str| match folder {
+        "" => name.to_owned(),
+        folder => format!("{folder}/{name}"),
+    };
+    let Some(bytes) = store.read_if_there(&below(POINTER))? else { return Ok(folder.to_owned()) };
+    let is_version =
+        |name: &String| name.len() == VERSION_DIGITS && name.bytes().all(|b| b.is_ascii_hexdigit());
+    match serde_json::from_slice(&bytes) {
+        Ok(Pointer { folder: version }) if is_version(&version) => Ok(below(&version)),
+        // Nothing of ours: the model is where it was before there were pointers.
+        _ => Ok(folder.to_owned()),
+    }
+}
+
 /// Returns whether a name can be that of a model: 1 to 100 letters, digits, `-`, `_` and `.`, and no `.` at the
 /// beginning.
 pub fn is_model_name(name: &str) -> bool {
@@ -98,7 +135,17 @@ impl OpenModel {
     /// # Errors
     /// One sentence about what is missing or of another kind.
     pub fn of_store(store: &Location, name: &str, cache: &Path) -> anyhow::Result<Self> {
-        let folder = folder_of(name);
+        match Self::of_store_once(store, name, cache) {
+            // It was replaced while it was read.
+            Err(e) if matches!(e.downcast_ref(), Some(StoreError::NotFound { .. })) => {
+                Self::of_store_once(store, name, cache)
+            }
+            opened => opened,
+        }
+    }
+
+    fn of_store_once(store: &Location, name: &str, cache: &Path) -> anyhow::Result<Self> {
+        let folder = current_folder(store, &folder_of(name))?;
         let path = format!("{folder}/{}", file_names::CARD);
         let bytes = match store.read(&path) {
             Err(StoreError::NotFound { .. }) if name == pretrained::NAME => {
@@ -136,6 +183,8 @@ impl OpenModel {
     /// # Errors
     /// One sentence about what is missing or of another kind.
     pub fn of_folder(folder: &Path) -> anyhow::Result<Self> {
+        let current = current_folder(&Location::local(folder)?, "")?;
+        let folder = &folder.join(current);
         let store = Location::local(folder)?;
         let bytes = store.read(file_names::CARD)?;
         let card = ModelCard::read(&bytes, &store.url_of(file_names::CARD))?;
@@ -406,11 +455,12 @@ fn processor() -> String {
 /// Says which models a store has.
 fn others(store: &Location) -> anyhow::Result<String> {
     let listed = store.list("models")?;
-    let suffix = format!("/{}", file_names::CARD);
-    let mut names: Vec<&str> = listed
-        .iter()
-        .filter_map(|listed| listed.path.strip_prefix("models/")?.strip_suffix(&suffix))
-        .collect();
-    names.sort_unstable();
+    let name_of = |path: &'_ str| -> Option<String> {
+        let (name, file) = path.strip_prefix("models/")?.split_once('/')?;
+        [file_names::CARD, POINTER].contains(&file).then(|| name.to_owned())
+    };
+    let names: std::collections::BTreeSet<String> =
+        listed.iter().filter_map(|listed| name_of(&listed.path)).collect();
+    let names: Vec<String> = names.into_iter().collect();
     Ok(if names.is_empty() { String::new() } else { format!(" (it has {})", names.join(", ")) })
 }

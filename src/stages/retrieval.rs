@@ -7,7 +7,7 @@ use ndarray::{Array2, ArrayView2, s};
 
 use crate::generation::{Retrieval, Windows};
 use crate::motion::{MOTION_DIM, Placement};
-use crate::store::{Location, Patience, StoreError};
+use crate::store::{Location, Patience, StoreError, StoreSnapshot};
 use crate::training::{Dataset, Phrase, Reading, Split};
 
 /// Most training phrases that are read, the same ones every time: a bound on memory.
@@ -21,13 +21,24 @@ pub fn read_dataset(
     store: &Location,
     threads: NonZeroUsize,
 ) -> Result<Dataset, crate::training::DatasetError> {
+    dataset_of(&StoreSnapshot::take(store)?, threads)
+}
+
+/// Reads the phrases of a snapshot that there is to learn from.
+///
+/// # Errors
+/// As [`Dataset::read`].
+pub fn dataset_of(
+    snapshot: &StoreSnapshot,
+    threads: NonZeroUsize,
+) -> Result<Dataset, crate::training::DatasetError> {
     let reading = Reading {
         in_memory: false,
         n_threads: threads,
         patience: Patience::default(),
         max_train_phrases: Some(MAX_TRAIN_PHRASES),
     };
-    Dataset::read(store, &reading, &|_, _| {}, &|_, _| {}).map(|(dataset, _)| dataset)
+    Dataset::of(snapshot, &reading, &|_, _| {}, &|_, _| {}).map(|(dataset, _)| dataset)
 }
 
 /// Returns an index of the training phrases that have `window_frames`, and their places in the dataset; none

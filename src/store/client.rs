@@ -9,9 +9,10 @@ use object_store::aws::{AmazonS3Builder, AmazonS3ConfigKey};
 use object_store::azure::{AzureConfigKey, MicrosoftAzureBuilder};
 use object_store::gcp::{GoogleCloudStorageBuilder, GoogleConfigKey};
 use object_store::limit::LimitStore;
-use object_store::memory::InMemory;
 use object_store::{BackoffConfig, ClientConfigKey, ObjectStore, RetryConfig};
 use url::Url;
+
+use super::counted::{CountedMemory, Traffic};
 
 /// How patiently and how widely a remote store is used.
 #[derive(Clone, Debug, PartialEq)]
@@ -98,13 +99,18 @@ pub(crate) fn build(url: &Url, options: &ClientOptions) -> Result<Arc<dyn Object
 }
 
 /// Returns the in-process store of that name; every opening of one name sees the same objects.
-fn memory(name: &str) -> Arc<dyn ObjectStore> {
-    static STORES: OnceLock<Mutex<HashMap<String, Arc<InMemory>>>> = OnceLock::new();
+fn memory(name: &str) -> Arc<CountedMemory> {
+    static STORES: OnceLock<Mutex<HashMap<String, Arc<CountedMemory>>>> = OnceLock::new();
     let mut stores = STORES
         .get_or_init(Mutex::default)
         .lock()
         .unwrap_or_else(std::sync::PoisonError::into_inner);
-    Arc::clone(stores.entry(name.to_owned()).or_default()) as Arc<dyn ObjectStore>
+    Arc::clone(stores.entry(name.to_owned()).or_default())
+}
+
+/// Returns what was asked so far of the store `memory://NAME` of this process.
+pub fn memory_traffic(name: &str) -> Traffic {
+    memory(name).counters.traffic()
 }
 
 /// Returns the runtime on which all remote requests of the process run.

@@ -33,7 +33,7 @@ pub enum StoreError {
     },
 
     #[error(
-        "{place}: commit manifest has format {found}, this program reads format {supported}; install \
+        "{place}: commit manifest has format {found}, this program reads formats up to {supported}; install \
          a newer motiongen"
     )]
     ManifestFormat { place: String, found: u32, supported: u32 },
@@ -63,6 +63,12 @@ pub enum StoreError {
 
     #[error("table {table}: {place} lacks columns {missing:?}; it has {found:?}")]
     Columns { table: String, place: String, missing: Vec<String>, found: Vec<String> },
+
+    #[error("table {table}: Delta Lake log {place} {reason}")]
+    DeltaLog { table: String, place: String, reason: String },
+
+    #[error("{what} is being written by {holder}; wait for its end, or give another name")]
+    Held { what: String, holder: String },
 
     #[error("shard \"{text}\" {reason}; write it as i/n with 0 <= i < n, or \"auto\"")]
     BadShard { text: String, reason: String },

@@ -14,7 +14,13 @@ use super::reader::Snapshot;
 impl Snapshot {
     /// Returns a snapshot of one part alone.
     pub fn part(&self, i: usize) -> Self {
-        Self { parts: vec![self.parts[i].clone()], ..self.clone() }
+        Self {
+            store: self.store.clone(),
+            schema: self.schema.clone(),
+            parts: vec![self.parts[i].clone()],
+            item: self.item.clone(),
+            within: self.within.clone(),
+        }
     }
 
     /// Calls `visit` with the frames of each item of a frame table that is among `wanted`, in the order
@@ -42,7 +48,7 @@ impl Snapshot {
                 .expect("invariant: whole rows were gathered");
             visit(item, frames)
         };
-        for batch in self.batches_of(wanted) {
+        for batch in self.batches_of(wanted)? {
             let batch = batch?;
             let columns = Columns::of(&batch, self)?;
             let mut row = 0;

@@ -7,10 +7,10 @@ use ndarray::Array2;
 use parquet::errors::ParquetError;
 
 use super::StoreError;
-use super::commit::{LivePart, parts_of};
 use super::location::Location;
 use super::reader::Snapshot;
 use super::schema::{Row, TableSchema};
+use super::store_snapshot::{LivePart, StoreSnapshot};
 
 /// The live rows of one item, as they were when it was looked up.
 ///
@@ -29,12 +29,15 @@ impl ItemTables {
     /// # Errors
     /// [`StoreError`] when the commits cannot be read.
     pub fn take(store: &Location, item: &str) -> Result<Self, StoreError> {
-        let live = |part| LivePart { part, superseded: Vec::new() };
-        let parts = parts_of(store, item)?
-            .into_iter()
-            .map(|(table, parts)| (table, parts.into_iter().map(live).collect()))
-            .collect();
-        Ok(Self { store: store.clone(), item: item.to_owned(), parts })
+        StoreSnapshot::take(store)?.item(item)
+    }
+
+    pub(super) fn new(
+        store: &Location,
+        item: &str,
+        parts: BTreeMap<String, Vec<LivePart>>,
+    ) -> Self {
+        Self { store: store.clone(), item: item.to_owned(), parts }
     }
 
     /// Returns the item's rows of a table.

@@ -7,6 +7,7 @@ use std::fmt;
 use std::io::Write as _;
 use std::path::{Path as FsPath, PathBuf};
 use std::sync::Arc;
+use std::time::SystemTime;
 
 use bytes::Bytes;
 use futures::{StreamExt as _, TryStreamExt as _};
@@ -172,6 +173,44 @@ impl Location {
         Ok(found)
     }
 
+    /// Lists every object below `folder` as [`Location::list`] does, with the times at which they were written.
+    ///
+    /// # Errors
+    /// [`StoreError`] when the storage cannot be listed.
+    pub(crate) fn list_with_times(
+        &self,
+        folder: &str,
+    ) -> Result<Vec<(Listed, SystemTime)>, StoreError> {
+        let mut found: Vec<(Listed, SystemTime)> = match &self.kind {
+            Kind::Local(root) => {
+                let time_of = |listed: &Listed| {
+                    let modified = std::fs::metadata(root.join(&listed.path))?.modified()?;
+                    Ok::<_, std::io::Error>(modified)
+                };
+                let listed = local::list(root, folder)?.into_iter();
+                // One that somebody else removed meanwhile is not there.
+                listed
+                    .filter_map(|listed| time_of(&listed).ok().map(|time| (listed, time)))
+                    .collect()
+            }
+            Kind::Remote { store, prefix } => {
+                let below = remote::join(prefix, folder);
+                let metas: Vec<_> = block_on(store.list(Some(&below)).try_collect())
+                    .map_err(|e| StoreError::remote("list", &self.url_of(folder), e))?;
+                metas
+                    .into_iter()
+                    .filter_map(|meta| {
+                        let path = remote::relative(prefix, &meta.location)?;
+                        let listed = Listed { path, size_bytes: meta.size };
+                        Some((listed, meta.last_modified.into()))
+                    })
+                    .collect()
+            }
+        };
+        found.sort_by(|a, b| a.0.path.cmp(&b.0.path));
+        Ok(found)
+    }
+
     /// Returns the size of an object.
     ///
     /// # Errors
@@ -255,6 +294,27 @@ impl Location {
         }
     }
 
+    /// Writes `bytes` at `path` in place of what is there: the old or the new is there at any moment, whole.
+    ///
+    /// # Errors
+    /// What the storage says.
+    pub fn replace(&self, path: &str, bytes: Bytes) -> Result<(), StoreError> {
+        let place = || self.url_of(path);
+        match &self.kind {
+            Kind::Local(root) => {
+                let io = |e| StoreError::io("write", &place(), e);
+                let mut file = local::temporary_beside(&root.join(path)).map_err(io)?;
+                file.write_all(&bytes).map_err(io)?;
+                local::replace_file(&root.join(path), file).map_err(io)
+            }
+            Kind::Remote { store, prefix } => {
+                block_on(store.put(&remote::join(prefix, path), bytes.into()))
+                    .map(|_| ())
+                    .map_err(|e| StoreError::remote("write", &place(), e))
+            }
+        }
+    }
+
     /// Creates a temporary file for an object that [`Location::put_file_new`] will publish: on the
     /// same file system for a local location, so that publishing is one link.
     ///
@@ -266,6 +326,15 @@ impl Location {
             Kind::Remote { .. } => tempfile::NamedTempFile::new(),
         }
         .map_err(|e| StoreError::io("make a temporary file beside it", &self.url_of(path), e))
+    }
+
+    /// Says of a local file that it was written now, so that nobody takes it for abandoned; best effort.
+    pub(crate) fn touch(&self, path: &str) {
+        if let Kind::Local(root) = &self.kind
+            && let Ok(file) = std::fs::File::options().write(true).open(root.join(path))
+        {
+            file.set_modified(SystemTime::now()).ok();
+        }
     }
 
     /// Removes an object; one that is gone already is no error.

@@ -4,15 +4,23 @@
 //! `commits/<stage>/<key>.json` say which of them count. See `docs/architecture.md`.
 
 mod cache;
+mod catalogue;
 mod client;
 mod commit;
+mod compact;
+mod counted;
+mod delta;
 mod digest;
 mod error;
 mod frames;
 mod item;
+mod lease;
+mod ledger;
 mod local;
 mod location;
+mod manifest;
 mod number_columns;
+mod parquet_object;
 mod part;
 mod patience;
 mod prepared;
@@ -23,17 +31,26 @@ mod remote;
 pub(crate) mod schema;
 mod shard;
 mod source;
+mod stage_log;
+mod store_snapshot;
 pub mod tables;
+mod vacuum;
 
 pub use cache::Cache;
-pub use client::ClientOptions;
-pub use commit::{Commit, Committed, Item, Ledger, LivePart, Manifest, Part, Settled, live_parts};
+pub use client::{ClientOptions, memory_traffic};
+pub use commit::{Commit, Committed};
+pub use compact::{Compaction, compact};
+pub use counted::Traffic;
+pub use delta::write_delta_logs;
 pub use digest::{digest, digest_of};
 pub use error::StoreError;
 pub use frames::FrameSpool;
 pub use item::ItemTables;
+pub use lease::Lease;
+pub use ledger::{Ledger, Settled};
 pub use local::{replace_file, temporary_beside, write_file};
 pub use location::{Listed, Location, Put};
+pub use manifest::{Item, Manifest, Part};
 #[cfg(test)]
 pub use number_columns::tests::parquet_of;
 pub use number_columns::{NumberColumnsError, number_columns};
@@ -46,3 +63,5 @@ pub use reader::Snapshot;
 pub use schema::{Cell, Column, ColumnType, Row, TableSchema, TimestampUs};
 pub use shard::{Shard, batch_of, split_of};
 pub use source::{Content, InOrder, Listing, Source, SourceFile, SourceProblem, SourceProblemKind};
+pub use store_snapshot::{LivePart, StoreSnapshot, checkpoint, live_parts};
+pub use vacuum::{Vacuumed, vacuum};

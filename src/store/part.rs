@@ -17,7 +17,7 @@ use super::StoreError;
 use super::schema::{Row, TableSchema};
 
 /// Rows of a row group: large enough to compress, small enough to hold in memory.
-const ROW_GROUP_ROWS: usize = 64 << 10;
+pub(super) const ROW_GROUP_ROWS: usize = 64 << 10;
 /// Rows of a data page, the smallest unit that a filter can skip.
 const PAGE_ROWS: usize = 8 << 10;
 
@@ -96,6 +96,23 @@ impl PartWriter {
         debug_assert_eq!(R::schema(), self.table, "rows of another table");
         self.n_rows += rows.len() as u64;
         self.writer.write(&R::to_batch(rows)).map_err(|e| failed(&self.table, e))
+    }
+
+    /// Appends rows of the table's Arrow schema as a row group.
+    ///
+    /// # Errors
+    /// [`StoreError::Parquet`].
+    pub(super) fn write_row_group(&mut self, batch: &RecordBatch) -> Result<(), StoreError> {
+        self.n_rows += batch.num_rows() as u64;
+        self.writer
+            .write(batch)
+            .and_then(|()| self.writer.flush())
+            .map_err(|e| failed(&self.table, e))
+    }
+
+    /// Returns the error of a part that cannot be written.
+    pub(super) fn failed(&self, source: ParquetError) -> StoreError {
+        failed(&self.table, source)
     }
 
     /// Appends the frames of one item to a frame table.

@@ -9,10 +9,10 @@ use polars::io::cloud::{CloudOptions, options::CloudRetryConfig};
 use polars::prelude::*;
 use polars::sql::{SQLContext, extract_table_identifiers};
 
-use super::commit::{LivePart, live_parts};
 use super::location::{Kind, Location};
 use super::reader::check_version;
 use super::schema::{Column as TableColumn, ColumnType, TableSchema};
+use super::store_snapshot::{LivePart, StoreSnapshot};
 use super::tables;
 use super::{ClientOptions, StoreError};
 
@@ -20,6 +20,9 @@ use super::{ClientOptions, StoreError};
 const N_SUGGESTIONS: usize = 3;
 /// Statements that polars would act out on the answer's own copy of a table.
 const CHANGING: [&str; 7] = ["alter", "create", "delete", "drop", "insert", "truncate", "update"];
+
+/// What polars calls a count that has no name.
+const COUNT_COLUMN: &str = "len";
 
 /// How an answer is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -77,14 +80,20 @@ pub fn query(store: &Location, sql: &str, options: &ClientOptions) -> Result<Ans
         return Err(StoreError::Query(format!("\"{verb}\" {reason}")));
     }
     let schemas = tables::all();
-    let mut parts = live_parts(store)?;
+    let snapshot = StoreSnapshot::take(store)?;
+    if let Some((table, column)) = counted_table(sql)
+        && let Some(schema) = schemas.iter().find(|s| s.name.eq_ignore_ascii_case(table))
+    {
+        let n_rows = count_rows(store, schema, &snapshot.parts(schema.name)?, options)?;
+        return Ok(Answer { frame: count_frame(column, n_rows)? });
+    }
     let mut context = SQLContext::new();
     let named = extract_table_identifiers(sql, false, true).unwrap_or_default();
     for schema in &schemas {
         // Only tables that the statement names are opened: a scan reads footers.
         let mut spellings = named.iter().filter(|n| n.eq_ignore_ascii_case(schema.name)).peekable();
         if spellings.peek().is_some() {
-            let live = parts.remove(schema.name).unwrap_or_default();
+            let live = snapshot.parts(schema.name)?;
             let frame = scan(store, schema, &live, options)?;
             spellings.for_each(|name| context.register(name, frame.clone()));
         }
@@ -102,20 +111,10 @@ pub fn table_infos(
     store: &Location,
     options: &ClientOptions,
 ) -> Result<Vec<TableInfo>, StoreError> {
-    let mut parts = live_parts(store)?;
+    let mut parts = StoreSnapshot::take(store)?.live_parts()?;
     let info = |schema: TableSchema| {
         let live = parts.remove(schema.name).unwrap_or_default();
-        let whole = live.iter().all(|l| l.superseded.is_empty());
-        let n_rows = if whole {
-            live.iter().map(|l| l.part.n_rows).sum()
-        } else {
-            // Which rows of a part were superseded is written in the part alone.
-            let counted = scan(store, &schema, &live, options)?
-                .select([len().cast(DataType::UInt64)])
-                .collect()
-                .and_then(|frame| frame.columns()[0].u64()?.get(0).ok_or_else(no_count));
-            counted.map_err(|e| StoreError::Query(first_line(&e)))?
-        };
+        let n_rows = count_rows(store, &schema, &live, options)?;
         Ok(TableInfo {
             name: schema.name,
             n_rows,
@@ -125,6 +124,68 @@ pub fn table_infos(
         })
     };
     tables::all().into_iter().map(info).collect()
+}
+
+/// Returns how many rows of a table count. Commits tell it of their parts; of a part with dead rows, which is
+/// written in the part alone, the names are read.
+fn count_rows(
+    store: &Location,
+    schema: &TableSchema,
+    live: &[LivePart],
+    options: &ClientOptions,
+) -> Result<u64, StoreError> {
+    let (whole, partial): (Vec<_>, Vec<_>) =
+        live.iter().cloned().partition(|l| l.superseded.is_empty());
+    for part in &whole {
+        check_version(store, schema, part)?;
+    }
+    let n_whole: u64 = whole.iter().map(|l| l.part.n_rows).sum();
+    if partial.is_empty() {
+        return Ok(n_whole);
+    }
+    let counted = scan(store, schema, &partial, options)?
+        .select([len().cast(DataType::UInt64)])
+        .collect()
+        .and_then(|frame| frame.columns()[0].u64()?.get(0).ok_or_else(no_count));
+    counted.map(|n| n_whole + n).map_err(|e| StoreError::Query(first_line(&e)))
+}
+
+/// Returns the table whose rows a statement counts, if it does nothing else, and what the count is called.
+fn counted_table(sql: &str) -> Option<(&str, &str)> {
+    let is_name = |word: &&str| {
+        word.starts_with(|c: char| c.is_ascii_alphabetic() || c == '_')
+            && word.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
+    };
+    let rest = sql.trim().trim_end_matches(';').trim_end();
+    let (select, rest) = rest.split_once(char::is_whitespace)?;
+    let (count, rest) = rest.split_once('(')?;
+    let (star, rest) = rest.split_once(')')?;
+    let is_count = select.eq_ignore_ascii_case("select")
+        && count.trim().eq_ignore_ascii_case("count")
+        && star.trim() == "*"
+        && rest.starts_with(char::is_whitespace);
+    let words: Vec<&str> = rest.split_whitespace().collect();
+    let (table, column) = match (is_count, words.as_slice()) {
+        (true, [from, table]) if from.eq_ignore_ascii_case("from") => (*table, COUNT_COLUMN),
+        (true, [column, from, table]) if from.eq_ignore_ascii_case("from") => (*table, *column),
+        (true, [r#as, column, from, table])
+            if r#as.eq_ignore_ascii_case("as") && from.eq_ignore_ascii_case("from") =>
+        {
+            (*table, *column)
+        }
+        _ => return None,
+    };
+    Some((table, column)).filter(|(table, column)| is_name(table) && is_name(column))
+}
+
+fn count_frame(column: &str, n_rows: u64) -> Result<DataFrame, StoreError> {
+    let name = PlSmallStr::from(column);
+    // As polars counts, while it can.
+    let count = match IdxSize::try_from(n_rows) {
+        Ok(n) => Column::new(name, [n]),
+        Err(_) => Column::new(name, [n_rows]),
+    };
+    DataFrame::new(1, vec![count]).map_err(|e| StoreError::Query(first_line(&e)))
 }
 
 fn no_count() -> PolarsError {

@@ -1,35 +1,15 @@
 //! Reading tables: the live rows of a store, one row group in memory at a time.
 
-use std::collections::BTreeSet;
-use std::ops::Range;
-use std::sync::Arc;
+use std::collections::{BTreeSet, HashSet};
 
-use arrow_array::{Array as _, BooleanArray, RecordBatch, StringArray};
-use arrow_schema::ArrowError;
-use bytes::Bytes;
-use futures::future::BoxFuture;
-use futures::{FutureExt as _, StreamExt as _, TryFutureExt as _};
-use object_store::path::Path as ObjectPath;
-use object_store::{ObjectStore, ObjectStoreExt as _};
-use parquet::arrow::arrow_reader::{
-    ArrowPredicateFn, ArrowReaderBuilder, ArrowReaderOptions, ParquetRecordBatchReaderBuilder,
-    RowFilter,
-};
-use parquet::arrow::async_reader::AsyncFileReader;
-use parquet::arrow::{ParquetRecordBatchStreamBuilder, ProjectionMask};
-use parquet::errors::{ParquetError, Result as ParquetResult};
-use parquet::file::metadata::{ParquetMetaData, ParquetMetaDataReader, RowGroupMetaData};
-use parquet::file::statistics::Statistics;
+use arrow_array::{BooleanArray, RecordBatch};
+use parquet::errors::ParquetError;
 
 use super::StoreError;
-use super::client::block_on;
-use super::commit::{LivePart, live_parts};
-use super::location::{Kind, Location};
-use super::remote::join;
+use super::location::Location;
+use super::parquet_object::{Batches, ParquetObject, TAIL_BYTES, Wanted, names};
 use super::schema::{Row, TableSchema};
-
-/// The batches of a part, in order.
-type Batches = Box<dyn Iterator<Item = Result<RecordBatch, ParquetError>>>;
+use super::store_snapshot::{LivePart, StoreSnapshot};
 
 /// The live rows of one table, as they were when the snapshot was taken.
 #[derive(Clone, Debug)]
@@ -39,6 +19,8 @@ pub struct Snapshot {
     pub(super) parts: Vec<LivePart>,
     /// The one item whose rows are wanted; `None` for all.
     pub(super) item: Option<String>,
+    /// Where it is looked up which parts items are in.
+    pub(super) within: Option<StoreSnapshot>,
 }
 
 impl Snapshot {
@@ -48,29 +30,7 @@ impl Snapshot {
     /// [`StoreError::SchemaVersion`] when a part is of a version that is not read; [`StoreError`] when
     /// the commits cannot be read.
     pub fn take(store: &Location, schema: TableSchema) -> Result<Self, StoreError> {
-        let parts = live_parts(store)?.remove(schema.name).unwrap_or_default();
-        Self::new(store, schema, parts, None)
-    }
-
-    /// Takes a snapshot of the parts of a table that this program reads, and tells why it leaves out the first
-    /// of the others.
-    ///
-    /// # Errors
-    /// [`StoreError`] when the commits cannot be read.
-    pub fn take_known(
-        store: &Location,
-        schema: TableSchema,
-    ) -> Result<(Self, Option<StoreError>), StoreError> {
-        let mut parts = live_parts(store)?.remove(schema.name).unwrap_or_default();
-        let mut unknown = None;
-        parts.retain(|live| match check_version(store, &schema, live) {
-            Ok(()) => true,
-            Err(e) => {
-                unknown.get_or_insert(e);
-                false
-            }
-        });
-        Ok((Self::new(store, schema, parts, None)?, unknown))
+        StoreSnapshot::take(store)?.table(schema)
     }
 
     /// Returns the snapshot of some parts, or of one item's rows in them.
@@ -83,7 +43,12 @@ impl Snapshot {
         for live in &parts {
             check_version(store, &schema, live)?;
         }
-        Ok(Self { store: store.clone(), schema, parts, item })
+        Ok(Self { store: store.clone(), schema, parts, item, within: None })
+    }
+
+    /// Returns the snapshot as one of a table of `store`.
+    pub(super) fn within(self, store: &StoreSnapshot) -> Self {
+        Self { within: Some(store.clone()), ..self }
     }
 
     pub fn parts(&self) -> &[LivePart] {
@@ -104,26 +69,42 @@ impl Snapshot {
         self.wanted(wanted)
     }
 
-    /// Returns the live rows of the row groups that may hold some of the items.
+    /// Returns the live rows of the row groups that may hold some of the items; parts that do not hold them are
+    /// not opened.
     pub(super) fn batches_of<'a>(
         &'a self,
         items: &'a BTreeSet<String>,
-    ) -> impl Iterator<Item = Result<RecordBatch, StoreError>> + 'a {
-        self.wanted(Wanted::Near(items))
+    ) -> Result<impl Iterator<Item = Result<RecordBatch, StoreError>> + 'a, StoreError> {
+        let parts: Vec<&LivePart> = match &self.within {
+            Some(store) => store.parts_near(self.schema.name, &self.parts, items)?,
+            None => self.parts.iter().collect(),
+        };
+        Ok(self.batches_in(parts.into_iter(), Wanted::Near(items)))
     }
 
     fn wanted<'a>(
         &'a self,
         wanted: Wanted<'a>,
     ) -> impl Iterator<Item = Result<RecordBatch, StoreError>> + 'a {
-        self.parts.iter().flat_map(move |live| {
+        self.batches_in(self.parts.iter(), wanted)
+    }
+
+    fn batches_in<'a>(
+        &'a self,
+        parts: impl Iterator<Item = &'a LivePart> + 'a,
+        wanted: Wanted<'a>,
+    ) -> impl Iterator<Item = Result<RecordBatch, StoreError>> + 'a {
+        parts.flat_map(move |live| {
             let failed = move |source| StoreError::Parquet {
                 table: self.schema.name.to_owned(),
                 place: self.store.url_of(&live.part.path),
                 source: Box::new(source),
             };
             let column = self.schema.item_column();
-            let batches: Batches = match open(&self.store, &live.part.path, column, wanted) {
+            let opened =
+                ParquetObject::open(&self.store, &live.part.path, live.part.n_bytes, TAIL_BYTES)
+                    .and_then(|file| file.batches(column, wanted, None));
+            let batches: Batches = match opened {
                 Ok(batches) => batches,
                 Err(e) => Box::new(std::iter::once(Err(e))),
             };
@@ -167,6 +148,33 @@ impl Snapshot {
             rows.extend(read.into_iter().filter(&mut is_wanted));
         }
         Ok(rows)
+    }
+
+    /// Visits the rows of items, part by part; parts and row groups without any are not read.
+    ///
+    /// # Errors
+    /// [`StoreError`] when a part cannot be read or has other columns.
+    ///
+    /// # Panics
+    /// When `R` is a row of another table.
+    pub fn visit_rows_of<R: Row>(
+        &self,
+        items: &BTreeSet<String>,
+        mut visit: impl FnMut(R),
+    ) -> Result<(), StoreError> {
+        assert_eq!(R::schema().name, self.schema.name, "rows of another table");
+        let column = self.schema.item_column();
+        for batch in self.batches_of(items)? {
+            let batch = batch?;
+            let columns_error = || self.columns_error(&batch, "");
+            let found = names(&batch, column).map_err(|_| columns_error())?;
+            let keep: BooleanArray =
+                found.iter().map(|item| Some(item.is_some_and(|i| items.contains(i)))).collect();
+            let batch = arrow_select::filter::filter_record_batch(&batch, &keep)
+                .map_err(|_| columns_error())?;
+            R::from_batch(&batch).ok_or_else(columns_error)?.into_iter().for_each(&mut visit);
+        }
+        Ok(())
     }
 
     fn check_columns(&self, batch: &RecordBatch, path: &str) -> Result<(), StoreError> {
@@ -223,7 +231,7 @@ pub(super) fn check_version(
 }
 
 /// Returns the rows whose item is not among `superseded`.
-fn without(
+pub(super) fn without(
     batch: &RecordBatch,
     column: &str,
     superseded: &[String],
@@ -231,132 +239,9 @@ fn without(
     if superseded.is_empty() {
         return Ok(batch.clone());
     }
-    let items = items(batch, column)
-        .ok_or_else(|| ParquetError::General(format!("no text column {column}")))?;
-    let dead: std::collections::HashSet<&str> = superseded.iter().map(String::as_str).collect();
+    let items = names(batch, column)?;
+    let dead: HashSet<&str> = superseded.iter().map(String::as_str).collect();
     let keep: BooleanArray =
         items.iter().map(|item| Some(item.is_some_and(|i| !dead.contains(i)))).collect();
     Ok(arrow_select::filter::filter_record_batch(batch, &keep)?)
-}
-
-fn items<'a>(batch: &'a RecordBatch, column: &str) -> Option<&'a StringArray> {
-    batch.column_by_name(column)?.as_any().downcast_ref::<StringArray>()
-}
-
-/// Which rows are wanted.
-#[derive(Clone, Copy)]
-enum Wanted<'a> {
-    All,
-    /// Those of one item.
-    One(&'a str),
-    /// Those of the items, and what lies in one row group with them.
-    Near(&'a BTreeSet<String>),
-}
-
-impl Wanted<'_> {
-    /// Returns whether a row group that holds names from `min` to `max` may hold what is wanted.
-    fn may_lie_within(self, min: Option<&[u8]>, max: Option<&[u8]>) -> bool {
-        let within =
-            |item: &[u8]| min.is_none_or(|min| min <= item) && max.is_none_or(|max| max >= item);
-        match self {
-            Wanted::All => true,
-            Wanted::One(item) => within(item.as_bytes()),
-            Wanted::Near(items) => items.iter().any(|item| within(item.as_bytes())),
-        }
-    }
-}
-
-/// Narrows a reader to what is wanted: row groups that cannot hold it are not read, and where one item
-/// is wanted only its rows are decoded.
-fn narrow<T>(
-    builder: ArrowReaderBuilder<T>,
-    column: &'static str,
-    wanted: Wanted,
-) -> ArrowReaderBuilder<T> {
-    let groups = builder.metadata().row_groups().iter().enumerate();
-    let groups =
-        groups.filter(|(_, group)| may_hold(group, column, wanted)).map(|(i, _)| i).collect();
-    let builder = builder.with_row_groups(groups);
-    let Wanted::One(item) = wanted else { return builder };
-    let mask = ProjectionMask::columns(builder.parquet_schema(), [column]);
-    let item = item.to_owned();
-    let is_wanted = ArrowPredicateFn::new(mask, move |batch| {
-        let found = items(&batch, column)
-            .ok_or_else(|| ArrowError::SchemaError(format!("no text column {column}")))?;
-        Ok(found.iter().map(|found| Some(found == Some(item.as_str()))).collect())
-    });
-    builder.with_row_filter(RowFilter::new(vec![Box::new(is_wanted)]))
-}
-
-/// Returns whether the statistics of a row group leave room for what is wanted.
-fn may_hold(group: &RowGroupMetaData, column: &str, wanted: Wanted) -> bool {
-    let column = group.columns().iter().find(|c| c.column_path().string() == column);
-    let Some(Statistics::ByteArray(names)) = column.and_then(|c| c.statistics()) else {
-        return true;
-    };
-    // Both ends may be cut short, the least downwards and the greatest upwards.
-    wanted.may_lie_within(
-        names.min_opt().map(|min| min.data()),
-        names.max_opt().map(|max| max.data()),
-    )
-}
-
-fn open(
-    store: &Location,
-    path: &str,
-    column: &'static str,
-    wanted: Wanted,
-) -> ParquetResult<Batches> {
-    match store.kind() {
-        Kind::Local(root) => {
-            let file = std::fs::File::open(root.join(path))?;
-            Ok(Box::new(
-                narrow(ParquetRecordBatchReaderBuilder::try_new(file)?, column, wanted)
-                    .build()?
-                    .map(|batch| batch.map_err(ParquetError::from)),
-            ))
-        }
-        Kind::Remote { store, prefix } => {
-            let path = join(prefix, path);
-            let stream = block_on(async {
-                let size = store.head(&path).await.map_err(external)?.size;
-                let object = RemotePart { store: Arc::clone(store), path, size };
-                narrow(ParquetRecordBatchStreamBuilder::new(object).await?, column, wanted).build()
-            })?;
-            let mut stream = Box::pin(stream);
-            Ok(Box::new(std::iter::from_fn(move || block_on(stream.next()))))
-        }
-    }
-}
-
-/// A Parquet part in an object store, read by ranges.
-struct RemotePart {
-    store: Arc<dyn ObjectStore>,
-    path: ObjectPath,
-    size: u64,
-}
-
-impl AsyncFileReader for RemotePart {
-    fn get_bytes(&mut self, range: Range<u64>) -> BoxFuture<'_, ParquetResult<Bytes>> {
-        async move { self.store.get_range(&self.path, range).await.map_err(external) }.boxed()
-    }
-
-    fn get_byte_ranges(
-        &mut self,
-        ranges: Vec<Range<u64>>,
-    ) -> BoxFuture<'_, ParquetResult<Vec<Bytes>>> {
-        async move { self.store.get_ranges(&self.path, &ranges).await.map_err(external) }.boxed()
-    }
-
-    fn get_metadata<'a>(
-        &'a mut self,
-        _options: Option<&'a ArrowReaderOptions>,
-    ) -> BoxFuture<'a, ParquetResult<Arc<ParquetMetaData>>> {
-        let size = self.size;
-        ParquetMetaDataReader::new().load_and_finish(self, size).map_ok(Arc::new).boxed()
-    }
-}
-
-fn external(error: object_store::Error) -> ParquetError {
-    ParquetError::External(Box::new(error))
 }

@@ -13,7 +13,8 @@ use crate::motion::phase::DEFAULT_BEATS_PER_BAR;
 use crate::motion::{Channel, MOTION_DIM, Trajectory, TrajectoryError, clock};
 use crate::store::tables::{self, PhraseRow};
 use crate::store::{
-    FrameSpool, Location, Patience, Row as _, Snapshot, StoreError, TableSchema, digest,
+    FrameSpool, Location, Patience, Row as _, Snapshot, StoreError, StoreSnapshot, TableSchema,
+    digest,
 };
 
 /// Motion and features of one phrase may differ by this much: ingest lets a frame pass, the last frame of
@@ -151,12 +152,27 @@ impl Dataset {
         progress: &(dyn Fn(usize, usize) + Sync),
     ) -> Result<(Self, Vec<LeftOut>), DatasetError> {
         let wait = |error: &StoreError, pause| notice(error, pause);
+        let snapshot = reading.patience.wait_out(wait, || StoreSnapshot::take(store))?;
+        Self::of(&snapshot, reading, notice, progress)
+    }
+
+    /// Reads all phrases with motion and features of a snapshot, as [`Dataset::read`] does.
+    ///
+    /// # Errors
+    /// As [`Dataset::read`].
+    pub fn of(
+        snapshot: &StoreSnapshot,
+        reading: &Reading,
+        notice: &(dyn Fn(&StoreError, Duration) + Sync),
+        progress: &(dyn Fn(usize, usize) + Sync),
+    ) -> Result<(Self, Vec<LeftOut>), DatasetError> {
+        let wait = |error: &StoreError, pause| notice(error, pause);
         let take = |schema: fn() -> TableSchema| {
-            reading.patience.wait_out(wait, || Snapshot::take(store, schema()))
+            reading.patience.wait_out(wait, || snapshot.table(schema()))
         };
         let rows: Vec<PhraseRow> = {
-            let snapshot = take(PhraseRow::schema)?;
-            reading.patience.wait_out(wait, || snapshot.rows())?
+            let table = take(PhraseRow::schema)?;
+            reading.patience.wait_out(wait, || table.rows())?
         };
         let rows: BTreeMap<String, PhraseRow> = rows
             .into_iter()
@@ -231,7 +247,7 @@ impl Dataset {
             keep_train(&mut phrases, &mut digests, most);
         }
         if phrases.is_empty() {
-            return Err(DatasetError::Empty { store: store.to_string() });
+            return Err(DatasetError::Empty { store: snapshot.store().to_string() });
         }
         let fingerprint = digest(digests.join("\n").as_bytes());
         Ok((Self { phrases, motion, features, fingerprint }, left_out))

@@ -4,7 +4,8 @@ use std::time::Duration;
 
 use crate::store::tables::TrainingLogRow;
 use crate::store::{
-    Commit, Item, Ledger, Location, Patience, Row as _, StoreError, TimestampUs, digest,
+    Commit, Item, Lease, Ledger, Location, Patience, Row as _, StoreError, TimestampUs, checkpoint,
+    digest,
 };
 
 use super::checkpoint::Progress;
@@ -83,6 +84,7 @@ pub struct Journal<'a> {
     ledger: Ledger,
     first_step: u64,
     rows: Vec<TrainingLogRow>,
+    lease: Option<&'a Lease>,
 }
 
 impl<'a> Journal<'a> {
@@ -96,9 +98,24 @@ impl<'a> Journal<'a> {
         run: &str,
         stage: &'static str,
     ) -> Result<Self, StoreError> {
+        checkpoint(store, &[command]);
         let ledger = Ledger::read(store, command)?;
         let run = run.to_owned();
-        Ok(Self { store, run, stage, command, ledger, first_step: 0, rows: Vec::new() })
+        Ok(Self {
+            store,
+            run,
+            stage,
+            command,
+            ledger,
+            first_step: 0,
+            rows: Vec::new(),
+            lease: None,
+        })
+    }
+
+    /// Writes under a lease of the run, and no more once it is lost.
+    pub fn under(self, lease: &'a Lease) -> Self {
+        Self { lease: Some(lease), ..self }
     }
 
     /// Begins a stretch after `step` steps.
@@ -158,6 +175,9 @@ impl<'a> Journal<'a> {
         patience: Patience,
         notice: &dyn Fn(&StoreError, Duration),
     ) -> Result<(), TrainingError> {
+        if let Some(lease) = self.lease {
+            lease.check()?;
+        }
         if self.rows.is_empty() {
             return Ok(());
         }
@@ -172,6 +192,7 @@ impl<'a> Journal<'a> {
             .map(str::to_owned)
             .collect();
         let id = self.name(self.first_step);
+        let ledger = &mut self.ledger;
         patience.wait_out(notice, || {
             let mut commit = Commit::new(self.store, self.command, "", &self.run);
             let schema = TrainingLogRow::schema;
@@ -180,13 +201,12 @@ impl<'a> Journal<'a> {
             let input_hash = digest(format!("{id} to {step}").as_bytes());
             let fingerprint = input_hash.clone();
             let item = Item { id: id.clone(), fingerprint, input_hash, failure: None };
-            commit.settle(item, &self.ledger);
+            commit.settle(item, ledger);
             for id in &withdrawn {
-                commit.settle(Item::forgotten(id), &self.ledger);
+                commit.settle(Item::forgotten(id), ledger);
             }
-            commit.publish()
+            commit.publish_into(ledger)
         })?;
-        self.ledger = patience.wait_out(notice, || Ledger::read(self.store, self.command))?;
         self.begin(step);
         Ok(())
     }
@@ -207,8 +227,7 @@ impl<'a> Journal<'a> {
             for id in &ids {
                 commit.settle(Item::forgotten(id), &self.ledger);
             }
-            commit.publish()?;
-            self.ledger = Ledger::read(self.store, self.command)?;
+            commit.publish_into(&mut self.ledger)?;
         }
         Ok(())
     }

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use motiongen::motion::{Beats, bar_phase};
 use motiongen::stages::beats::of_phrases;
-use motiongen::store::Location;
 use motiongen::store::tables::BeatRow;
+use motiongen::store::{Location, StoreSnapshot};
 use motiongen::units::frames_to_s;
 
 use super::{beat_list, clicks, constructed, contents, from, library, write_captures, write_songs};
@@ -65,7 +65,8 @@ fn tables_hold_dances_to_the_songs_of_the_store() {
     assert_eq!(ids, [all, expected("tracked.wav", 3)].concat());
 
     let (frames, features, beats) = (motion(&store), features(&store), beats(&store));
-    let known = of_phrases(&Location::local(&store).unwrap(), |_| true).unwrap();
+    let snapshot = StoreSnapshot::take(&Location::local(&store).unwrap()).unwrap();
+    let known = of_phrases(&snapshot, |_| true).unwrap();
     let mut n_upbeats = 0;
     for (id, row) in &rows {
         let (song, rest) = id.split_once(".t").unwrap();

@@ -9,10 +9,10 @@ use ndarray::Array2;
 
 use super::{backends, chain, paths, put, put_file, read};
 
-const STAGE: &str = "ingest";
+pub(super) const STAGE: &str = "ingest";
 
 /// Returns the outcome of an item; `message` stands for what was read.
-fn outcome(id: &str, message: &str) -> FailureRow {
+pub(super) fn outcome(id: &str, message: &str) -> FailureRow {
     FailureRow {
         stage: STAGE.to_owned(),
         phrase_id: id.to_owned(),
@@ -23,7 +23,7 @@ fn outcome(id: &str, message: &str) -> FailureRow {
     }
 }
 
-fn item(id: &str, message: &str) -> Item {
+pub(super) fn item(id: &str, message: &str) -> Item {
     Item {
         id: id.to_owned(),
         fingerprint: String::new(),
@@ -33,7 +33,7 @@ fn item(id: &str, message: &str) -> Item {
 }
 
 /// Commits outcomes as a process does that has read `ledger`.
-fn commit(location: &Location, ledger: &Ledger, outcomes: &[(&str, &str)]) -> Committed {
+pub(super) fn commit(location: &Location, ledger: &Ledger, outcomes: &[(&str, &str)]) -> Committed {
     let mut commit = Commit::new(location, STAGE, "rules", "file:///source");
     let rows: Vec<_> = outcomes.iter().map(|(id, message)| outcome(id, message)).collect();
     let part = commit.part("failures", FailureRow::schema).expect("a temporary file");
@@ -44,16 +44,16 @@ fn commit(location: &Location, ledger: &Ledger, outcomes: &[(&str, &str)]) -> Co
     commit.publish().unwrap_or_else(|e| panic!("{}", chain(&e)))
 }
 
-fn ledger(location: &Location) -> Ledger {
+pub(super) fn ledger(location: &Location) -> Ledger {
     Ledger::read(location, STAGE).unwrap_or_else(|e| panic!("{}", chain(&e)))
 }
 
-fn snapshot(location: &Location) -> Snapshot {
+pub(super) fn snapshot(location: &Location) -> Snapshot {
     Snapshot::take(location, FailureRow::schema()).unwrap_or_else(|e| panic!("{}", chain(&e)))
 }
 
 /// Returns what readers see: items and messages, sorted.
-fn visible(snapshot: &Snapshot) -> Vec<(String, String)> {
+pub(super) fn visible(snapshot: &Snapshot) -> Vec<(String, String)> {
     let rows = snapshot.rows::<FailureRow>().unwrap_or_else(|e| panic!("{}", chain(&e)));
     let mut seen: Vec<_> = rows.into_iter().map(|r| (r.phrase_id, r.message)).collect();
     seen.sort();
@@ -212,13 +212,13 @@ fn a_damaged_manifest_is_refused_with_its_place_and_the_damage() {
 
 #[test]
 fn a_manifest_of_another_format_asks_for_a_newer_program() {
-    let newer = r#"{"format": 2, "stage": "ingest", "key": "k", "sequence": 0, "program": "p",
+    let newer = r#"{"format": 3, "stage": "ingest", "key": "k", "sequence": 0, "program": "p",
         "params_hash": "h", "origin": "o", "parts": [], "items": []}"#;
     for backend in backends("newer") {
         put(&backend.location, "commits/ingest/0123.json", newer.as_bytes());
         let error = Ledger::read(&backend.location, STAGE).expect_err("another format");
         let expected = format!(
-            "{}: commit manifest has format 2, this program reads format 1; install a newer motiongen",
+            "{}: commit manifest has format 3, this program reads formats up to 2; install a newer motiongen",
             backend.location.url_of("commits/ingest/0123.json")
         );
         assert_eq!(error.to_string(), expected, "{backend}");

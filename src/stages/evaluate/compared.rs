@@ -10,7 +10,7 @@ use super::measure::Measurer;
 use super::subjects::{Item, Subject};
 use crate::evaluation::Measured;
 use crate::evaluation::window::window_starts;
-use crate::store::{Snapshot, StoreError, digest, tables};
+use crate::store::{StoreError, digest, tables};
 
 /// Windows of music for which the library is asked for its nearest phrase.
 const MAX_RETRIEVED: usize = 500;
@@ -46,7 +46,7 @@ impl Job<'_> {
         let owned: BTreeSet<String> = names.iter().map(|id| (*id).to_owned()).collect();
         let length = measurer.window_frames;
         let mut found: BTreeMap<String, Vec<Item>> = BTreeMap::new();
-        Snapshot::take(self.store, tables::features())?.visit_items(
+        self.snapshot.table(tables::features())?.visit_items(
             &owned,
             |id, features: Array2<f32>| {
                 let song = self.phrases.song(id);

@@ -24,7 +24,7 @@ use crate::stages::generate::MotionSettings;
 use crate::stages::learned;
 use crate::stages::motion_source::generated_frames;
 use crate::store::tables::{self, GenerationRow};
-use crate::store::{Location, Snapshot, StoreError, digest};
+use crate::store::{Location, StoreError, StoreSnapshot, digest};
 use crate::units::frames_to_s;
 
 /// Songs whose activity is read; that of others counts as its mean.
@@ -54,6 +54,8 @@ pub struct Evaluand {
     files: Option<ForeignMotions>,
     /// Whether motions say a phase.
     has_phase: bool,
+    /// The tables as they are for the whole evaluation.
+    pub(super) snapshot: StoreSnapshot,
 }
 
 impl Evaluand {
@@ -62,16 +64,19 @@ impl Evaluand {
     /// # Errors
     /// When the store cannot be read, or one sentence where there are no motions.
     pub fn read(store: &Location, params: &Params) -> anyhow::Result<Self> {
+        let snapshot = StoreSnapshot::take(store)?;
         match (&params.run, &params.motions) {
-            (Some(run), _) => Self::of_run(store, run, params.num_samples.map(Into::into)),
-            (None, Some(folder)) => Self::of_folder(store, folder, params),
+            (Some(run), _) => Self::of_run(snapshot, run, params.num_samples.map(Into::into)),
+            (None, Some(folder)) => Self::of_folder(snapshot, folder, params),
             (None, None) => bail!("give --run NAME, or --motions DIR for those of another program"),
         }
     }
 
-    fn of_run(store: &Location, run: &str, most: Option<usize>) -> anyhow::Result<Self> {
-        let generations = motions::of_run(store, run, most)?;
-        let phrases = Phrases::read(store, generations.iter().map(|row| row.phrase_id.as_str()))?;
+    fn of_run(snapshot: StoreSnapshot, run: &str, most: Option<usize>) -> anyhow::Result<Self> {
+        let store = snapshot.store();
+        let generations = motions::of_run(&snapshot, run, most)?;
+        let phrases =
+            Phrases::read(&snapshot, generations.iter().map(|row| row.phrase_id.as_str()))?;
         let (splits, notes) = splits_of(store, &phrases, &generations)?;
         let motions = generations
             .iter()
@@ -104,11 +109,13 @@ impl Evaluand {
             generations,
             files: None,
             has_phase: true,
+            snapshot,
         })
     }
 
     /// Reads the names of the files of a folder; motions are read when they are measured.
-    fn of_folder(store: &Location, folder: &Path, params: &Params) -> anyhow::Result<Self> {
+    fn of_folder(snapshot: StoreSnapshot, folder: &Path, params: &Params) -> anyhow::Result<Self> {
+        let store = snapshot.store();
         let named = |path: &Path| path.file_name().map(|name| name.to_string_lossy().into_owned());
         let absolute = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
         let Some(run) = params.name.clone().or_else(|| named(&absolute)) else {
@@ -116,18 +123,19 @@ impl Evaluand {
         };
         crate::stages::train::session::check_run_name(&run)
             .with_context(|| format!("--name {run}"))?;
-        let known = motions::has_run(store, &run)?;
+        let known = motions::has_run(&snapshot, &run)?;
         ensure!(
             !known,
             "store {store} has a run \"{run}\" of generate, whose evaluation this one would replace; give \
              another --name"
         );
-        let all = Phrases::read(store, [])?;
+        let all = Phrases::read(&snapshot, [])?;
         let mut files = foreign::read(folder, &all.foreign_phrases())?;
         if let Some(n) = params.num_samples {
             files.keep(n.get());
         }
-        let phrases = Phrases::read(store, files.files.iter().map(|file| file.phrase_id.as_str()))?;
+        let phrases =
+            Phrases::read(&snapshot, files.files.iter().map(|file| file.phrase_id.as_str()))?;
         let mut refused = Refused::all(folder, std::mem::take(&mut files.failures));
         // A look at every file, so that what holds no motion is known before the others are measured.
         let (mut motions, mut n_frames, mut notes) = (Vec::new(), Vec::new(), Vec::new());
@@ -181,6 +189,7 @@ impl Evaluand {
             decoder_derives: false,
             files: Some(files),
             has_phase,
+            snapshot,
         })
     }
 
@@ -246,10 +255,10 @@ impl Evaluand {
     ) -> anyhow::Result<Rows> {
         let truth = match params.quick {
             true => None,
-            false => truth::read(store, data_hash, params.threads, progress)?,
+            false => truth::read(&self.snapshot, data_hash, params.threads, progress)?,
         };
         if let Some(truth) = &truth {
-            self.hear(store, truth)?;
+            self.hear(truth)?;
         }
         let told = telling(self.motions.iter().map(|motion| motion.split));
         let sampled = match (params.quick, told) {
@@ -260,7 +269,7 @@ impl Evaluand {
         let holds = |check: &str| holds_by_construction(check, &self.postprocess, has_music);
         let job = Job {
             params,
-            store,
+            snapshot: &self.snapshot,
             motions: &self.motions,
             phrases: &self.phrases,
             truth: truth.as_ref(),
@@ -304,13 +313,13 @@ impl Evaluand {
     }
 
     /// Reads the activity of the songs that were danced to, and of those with held-out real motion.
-    fn hear(&mut self, store: &Location, truth: &Truth) -> Result<(), StoreError> {
+    fn hear(&mut self, truth: &Truth) -> Result<(), StoreError> {
         let held_out = truth.phrases.iter().filter(|phrase| is_held_out(phrase.split));
         let ids = self.motions.iter().map(|motion| motion.phrase_id.as_str());
         let songs = self.phrases.songs_of(ids.chain(held_out.map(|phrase| phrase.id.as_str())));
         let songs: BTreeSet<String> = songs.into_iter().take(MAX_HEARD_SONGS).collect();
         let mut heard: Vec<(String, Array2<f32>)> = Vec::new();
-        Snapshot::take(store, tables::features())?.visit_items(&songs, |id, features| {
+        self.snapshot.table(tables::features())?.visit_items(&songs, |id, features| {
             heard.push((id.to_owned(), features));
             Ok::<_, StoreError>(())
         })?;
@@ -351,7 +360,7 @@ impl Evaluand {
         let names: BTreeSet<String> =
             self.generations.iter().map(|row| row.generation.clone()).collect();
         let read = |schema, advances: bool| -> Result<Vec<Option<MeasuredMotion>>, StoreError> {
-            let table = Snapshot::take(store, schema)?;
+            let table = self.snapshot.table(schema)?;
             measurer.run(self.motions.len(), |give| {
                 table.visit_items(&names, |name, frames: Array2<f32>| {
                     if let Some(&i) = places.get(name) {

@@ -19,7 +19,7 @@ use crate::evaluation::metrics::{
 use crate::evaluation::verdict::{Evidence, Verdict, verdicts};
 use crate::evaluation::window::window_starts;
 use crate::stages::Progress;
-use crate::store::{Location, StoreError};
+use crate::store::{StoreError, StoreSnapshot};
 
 /// Windows of real motion that are measured beside what was generated, evenly among all.
 const MAX_TRUTH_WINDOWS: usize = 4000;
@@ -81,7 +81,7 @@ pub struct Found {
 /// What is evaluated, and what it is compared with.
 pub struct Job<'a> {
     pub params: &'a Params,
-    pub store: &'a Location,
+    pub snapshot: &'a StoreSnapshot,
     pub motions: &'a [Motion],
     pub phrases: &'a Phrases,
     pub truth: Option<&'a Truth>,

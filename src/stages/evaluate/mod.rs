@@ -81,6 +81,7 @@ impl Stage for Evaluate {
             if !params.quick {
                 known.commit_numbers(&found)?;
             }
+            store::checkpoint(&store, &rows::STAGES);
             found
         };
         let report = page::Page {

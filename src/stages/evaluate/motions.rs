@@ -17,7 +17,7 @@ use crate::stages::beats::{self, PhraseBeats};
 use crate::stages::generate::url_of;
 use crate::stages::plot::nearest::nearest;
 use crate::store::tables::{GenerationRow, PhraseRow};
-use crate::store::{Location, Row as _, Snapshot, StoreError, digest};
+use crate::store::{Row as _, StoreError, StoreSnapshot, digest};
 use crate::training::Split;
 use crate::units::{FPS, frames_to_s};
 
@@ -26,9 +26,14 @@ use crate::units::{FPS, frames_to_s};
 ///
 /// # Errors
 /// [`StoreError`], or one sentence where there are none.
-pub fn of_run(store: &Location, run: &str, n: Option<usize>) -> anyhow::Result<Vec<GenerationRow>> {
+pub fn of_run(
+    snapshot: &StoreSnapshot,
+    run: &str,
+    n: Option<usize>,
+) -> anyhow::Result<Vec<GenerationRow>> {
+    let store = snapshot.store();
     let mut runs = BTreeSet::new();
-    let table = Snapshot::take(store, GenerationRow::schema())?;
+    let table = snapshot.table(GenerationRow::schema())?;
     let mut rows: Vec<GenerationRow> = table.rows_where(|row: &GenerationRow| {
         if !runs.contains(&row.run) {
             runs.insert(row.run.clone());
@@ -57,8 +62,8 @@ pub fn of_run(store: &Location, run: &str, n: Option<usize>) -> anyhow::Result<V
 ///
 /// # Errors
 /// [`StoreError`].
-pub fn has_run(store: &Location, run: &str) -> Result<bool, StoreError> {
-    let table = Snapshot::take(store, GenerationRow::schema())?;
+pub fn has_run(snapshot: &StoreSnapshot, run: &str) -> Result<bool, StoreError> {
+    let table = snapshot.table(GenerationRow::schema())?;
     let mut is_there = false;
     table.rows_where(|row: &GenerationRow| {
         is_there |= row.run == run;
@@ -83,16 +88,16 @@ impl Phrases {
     /// # Errors
     /// [`StoreError`].
     pub fn read<'a>(
-        store: &Location,
+        snapshot: &StoreSnapshot,
         danced_to: impl IntoIterator<Item = &'a str>,
     ) -> Result<Self, StoreError> {
-        let rows: Vec<PhraseRow> = Snapshot::take(store, PhraseRow::schema())?.rows()?;
+        let rows: Vec<PhraseRow> = snapshot.table(PhraseRow::schema())?.rows()?;
         let songs: BTreeSet<String> = rows.iter().map(song_of).map(str::to_owned).collect();
         let with_motion = rows.iter().filter(|row| row.has_motion);
         let mut wanted: BTreeSet<String> = with_motion.map(|row| row.phrase_id.clone()).collect();
         wanted.extend(danced_to.into_iter().map(str::to_owned));
         let rows = rows.into_iter().map(|row| (row.phrase_id.clone(), row)).collect();
-        let beats = beats::of_phrases(store, |id| wanted.contains(id))?;
+        let beats = beats::of_phrases(snapshot, |id| wanted.contains(id))?;
         let songs = songs.into_iter().zip(0..).collect();
         Ok(Self { rows, songs, beats, activities: HashMap::new() })
     }

@@ -13,9 +13,8 @@ use crate::plot::{self, Format, MOTION_WIDTH_PX, MotionPanel, MotionPlot};
 use crate::report::{
     self, Against, CheckLine, Metric, Outcome, Paired, Report, Verdict, VerdictTest, Worst,
 };
-
-use crate::store::Location;
 use crate::store::tables::{GenerationRow, MetricRow, SanityCheckRow, SongMetricRow, VerdictRow};
+use crate::store::{Location, StoreSnapshot};
 use crate::training::TemporalConfig;
 use crate::units::frames_to_s;
 
@@ -42,7 +41,10 @@ impl Other {
             );
         }
         let songs = rows::songs_of(store, run)?;
-        let made = motions::of_run(store, run, Some(1)).ok().and_then(|mut rows| rows.pop());
+        let made = StoreSnapshot::take(store)
+            .ok()
+            .and_then(|snapshot| motions::of_run(&snapshot, run, Some(1)).ok())
+            .and_then(|mut rows| rows.pop());
         Ok(Self { run: run.to_owned(), metrics, songs, made })
     }
 }

@@ -15,7 +15,7 @@ use crate::evaluation::window::window_starts;
 use crate::motion::clock;
 use crate::stages::model_files::{OpenModel, default_model_cache};
 use crate::stages::{Progress, learned};
-use crate::store::{Location, Snapshot, StoreError, digest, tables};
+use crate::store::{Location, StoreError, digest, tables};
 
 /// Seed of the noise of baselines, so that two evaluations sample the same.
 const BASELINE_SEED: u64 = 2026;
@@ -45,7 +45,7 @@ impl Evaluand {
         let model = OpenModel::of_store(store, &row.model, &default_model_cache())?;
         let settings = RunSettings::of_run(row, &model.card)?;
         let length = self.window_frames(truth);
-        let windows = self.music_windows(store, split, length, most)?;
+        let windows = self.music_windows(split, length, most)?;
         let request = baselines::Request {
             store,
             model: &model,
@@ -72,7 +72,6 @@ impl Evaluand {
     /// Returns up to `most` windows of the music of a split, evenly among all of up to as many phrases.
     fn music_windows(
         &self,
-        store: &Location,
         split: MusicSplit,
         length: usize,
         most: usize,
@@ -84,7 +83,7 @@ impl Evaluand {
         order.truncate(most);
         let names: BTreeSet<String> = order.iter().map(|id| (*id).to_owned()).collect();
         let mut all: BTreeMap<String, Vec<MusicWindow>> = BTreeMap::new();
-        Snapshot::take(store, tables::features())?.visit_items(
+        self.snapshot.table(tables::features())?.visit_items(
             &names,
             |id, features: Array2<f32>| {
                 let n_frames = features.nrows();

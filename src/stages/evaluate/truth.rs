@@ -9,8 +9,8 @@ use crate::evaluation::reference_statistics::ReferenceStatistics;
 use crate::evaluation::window::{window, window_frames, window_starts};
 use crate::generation::Retrieval;
 use crate::stages::Progress;
-use crate::stages::retrieval::{index_of, read_dataset};
-use crate::store::{Location, StoreError};
+use crate::stages::retrieval::{dataset_of, index_of};
+use crate::store::{Location, StoreError, StoreSnapshot};
 use crate::training::{DatasetError, Split};
 
 /// Where the statistics of real motion are kept in a store.
@@ -40,12 +40,12 @@ pub struct TruthPhrase {
 /// # Errors
 /// When the store cannot be read.
 pub fn read(
-    store: &Location,
+    snapshot: &StoreSnapshot,
     data_hash: &str,
     threads: NonZeroUsize,
     progress: &dyn Progress,
 ) -> anyhow::Result<Option<Truth>> {
-    let dataset = match read_dataset(store, threads) {
+    let dataset = match dataset_of(snapshot, threads) {
         Ok(dataset) => dataset,
         Err(DatasetError::Empty { .. }) => {
             progress.note(
@@ -70,7 +70,7 @@ pub fn read(
     };
     let retrieval = index_of(&dataset, length)?;
     let mean = mean_motion(train().map(|phrase| phrase.motion.view()), length);
-    let statistics = statistics(store, data_hash, train(), length)?;
+    let statistics = statistics(snapshot.store(), data_hash, train(), length)?;
     let (Some(mean_motion), Some(statistics)) = (mean, statistics) else {
         progress.note(too_little);
         return Ok(None);

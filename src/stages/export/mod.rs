@@ -6,6 +6,7 @@ mod report;
 mod tuning;
 
 use std::path::PathBuf;
+use std::time::Duration;
 
 use anyhow::{bail, ensure};
 
@@ -13,7 +14,7 @@ use self::checks::{Checking, Held, eager};
 use self::files::Files;
 use self::report::{Planned, Report};
 use super::learned;
-use super::model_files::{folder_of, is_model_name, sha256};
+use super::model_files::{POINTER, current_folder, folder_of, is_model_name, pointer_to, sha256};
 use super::train::session::{Looker, MachineParams, check_run_name, read_phrases};
 use super::trained::{Stand, Trained};
 use super::{ClientParams, Contract, Progress, Stage, Summary};
@@ -21,7 +22,10 @@ use crate::generation::file_names;
 use crate::motion::rates::MotionRange;
 use crate::onnx::{Runtime, Storage};
 use crate::store::tables::OnnxCheckRow;
-use crate::store::{Commit, Item, Ledger, Location, Row as _, StoreError, TimestampUs, digest};
+use crate::store::{
+    Commit, Item, Lease, Ledger, Listed, Location, Row as _, StoreError, TimestampUs, checkpoint,
+    digest,
+};
 use crate::training::{Dataset, Split};
 
 /// Most training phrases that are read: enough to know how fast they move, and a bound on memory.
@@ -108,7 +112,15 @@ impl Stage for Export {
         if params.dry_run {
             return Ok(Box::new(Planned::new(&params, &files, &store)));
         }
-        match store.read_if_there(&card_path(&params.model))? {
+        let waiting = |holder: &str, rest: Duration| {
+            progress.note(&format!(
+                "model {} was last written by {holder}; waiting {} s for a sign of life",
+                params.model,
+                rest.as_secs() + 1
+            ));
+        };
+        let lease = Lease::take(&store, &folder_of(&params.model), &waiting)?;
+        match store.read_if_there(&card_path(&store, &params.model)?)? {
             Some(there) if there == files.card_text => {
                 return Ok(Box::new(Report::up_to_date(&params, &store, &files)));
             }
@@ -129,6 +141,7 @@ impl Stage for Export {
         };
         let held = checking.run(&runtime, progress)?;
         record(&store, &params, &files, &held)?;
+        checkpoint(&store, &[Self::NAME]);
         if let Some(failed) = held.rows.iter().find(|row| !row.passed) {
             bail!(
                 "model {} was not written: check {} on {} × {} frames differs by {:.2e}, {:.0e} is allowed; \
@@ -141,6 +154,7 @@ impl Stage for Export {
                 failed.tolerance
             );
         }
+        lease.check()?;
         publish(&store, &params.model, &files)?;
         Ok(Box::new(Report::written(&params, &store, &files, held)))
     }
@@ -163,21 +177,43 @@ fn check_model_name(model: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn card_path(model: &str) -> String {
-    format!("{}/{}", folder_of(model), file_names::CARD)
+/// Returns where the card of the model is that counts.
+fn card_path(store: &Location, model: &str) -> Result<String, StoreError> {
+    Ok(format!("{}/{}", current_folder(store, &folder_of(model))?, file_names::CARD))
 }
 
-/// Puts the files in place; the card comes last, and without it there is no model.
+/// Puts the files in place. A model that is there is replaced by a folder of its own and, once that is whole, by one
+/// pointer: at any moment there is the old model or the new one. Its card comes last, without which there is none.
 fn publish(store: &Location, model: &str, files: &Files) -> Result<(), StoreError> {
     let folder = folder_of(model);
-    store.remove(&card_path(model))?;
-    for listed in store.list(&folder)? {
+    let before = current_folder(store, &folder)?;
+    let is_there = store.read_if_there(&format!("{before}/{}", file_names::CARD))?.is_some();
+    let (version, pointer) = pointer_to(&files.card_text);
+    let into = if is_there { format!("{folder}/{version}") } else { folder.clone() };
+    let is_within =
+        |path: &str, folder: &str| path.strip_prefix(folder).is_some_and(|p| p.starts_with('/'));
+    // What an export that was killed left behind.
+    for listed in store.list(&into)?.into_iter().filter(|_| into != before || !is_there) {
         store.remove(&listed.path)?;
     }
     for (name, bytes) in &files.bytes {
-        store.put_new(&format!("{folder}/{name}"), bytes.clone())?;
+        store.put_new(&format!("{into}/{name}"), bytes.clone())?;
     }
-    store.put_new(&card_path(model), files.card_text.clone())?;
+    store.put_new(&format!("{into}/{}", file_names::CARD), files.card_text.clone())?;
+    if !is_there {
+        return Ok(());
+    }
+    let pointer_path = format!("{folder}/{POINTER}");
+    store.replace(&pointer_path, pointer)?;
+    // The model before this one stays where it has a folder, for those who are reading it.
+    for Listed { path, .. } in store.list(&folder)? {
+        let is_kept = path == pointer_path
+            || is_within(&path, &into)
+            || (before != folder && is_within(&path, &before));
+        if !is_kept {
+            store.remove(&path)?;
+        }
+    }
     Ok(())
 }
 
@@ -194,4 +230,108 @@ fn record(store: &Location, params: &Params, files: &Files, held: &Held) -> Resu
     let id = params.model.clone();
     commit.settle(Item { id, fingerprint: input_hash.clone(), input_hash, failure: None }, &ledger);
     commit.publish().map(|_| ())
+}
+
+#[cfg(all(test, feature = "pretrained"))]
+mod tests {
+    use super::*;
+    use crate::generation::ModelCard;
+    use crate::stages::pretrained;
+    use crate::store::ClientOptions;
+
+    const NAMES: [&str; 2] = [file_names::UNET, file_names::DECODER];
+
+    /// Files of a model that all say `version`.
+    fn files(version: usize) -> Files {
+        let card = pretrained::file(file_names::CARD).expect("the model that ships");
+        let card = ModelCard::read(&card, "card").expect("a card");
+        let text = |name: &str| format!("{name} of {version}").into();
+        let bytes = NAMES.iter().map(|name| ((*name).to_owned(), text(name))).collect();
+        Files { card, card_text: text(file_names::CARD), bytes }
+    }
+
+    /// Returns which version a reader finds; none where a file is gone.
+    fn version(store: &Location) -> Option<String> {
+        let folder = current_folder(store, &folder_of("m")).expect("a folder");
+        let read = |name: &str| {
+            let bytes = store.read_if_there(&format!("{folder}/{name}")).expect("readable")?;
+            let text = String::from_utf8(bytes.to_vec()).expect("a text");
+            Some(text.strip_prefix(name).expect("a file of that name").to_owned())
+        };
+        let found = read(file_names::CARD)?;
+        for name in NAMES {
+            assert_eq!(read(name)?, found, "{name} is of another version than its card");
+        }
+        Some(found)
+    }
+
+    fn stores() -> (tempfile::TempDir, [Location; 2]) {
+        let folder = tempfile::tempdir().expect("a folder");
+        let local = Location::local(folder.path()).expect("a location");
+        let memory = Location::open("memory://exported", &ClientOptions::default());
+        (folder, [local, memory.expect("a location")])
+    }
+
+    #[test]
+    fn the_first_model_lies_in_its_folder_and_the_next_in_one_of_its_own() {
+        let (_folder, stores) = stores();
+        for store in &stores {
+            let paths = || -> Vec<String> {
+                store.list("models").expect("listed").into_iter().map(|l| l.path).collect()
+            };
+            // What an export that was killed left behind is no part of a model.
+            store.put_new("models/m/unet.onnx", "half".into()).expect("written");
+            publish(store, "m", &files(1)).expect("published");
+            let plain = ["models/m/decoder.onnx", "models/m/model.json", "models/m/unet.onnx"];
+            assert_eq!(paths(), plain);
+            assert_eq!(version(store).as_deref(), Some(" of 1"));
+            publish(store, "m", &files(2)).expect("published");
+            assert_eq!(version(store).as_deref(), Some(" of 2"));
+            assert_eq!(paths().len(), 4, "three files and the pointer: {:?}", paths());
+            publish(store, "m", &files(3)).expect("published");
+            assert_eq!(version(store).as_deref(), Some(" of 3"));
+            assert_eq!(paths().len(), 7, "the one before stays for its readers");
+            publish(store, "m", &files(2)).expect("published");
+            assert_eq!((version(store).as_deref(), paths().len()), (Some(" of 2"), 7));
+        }
+    }
+
+    #[test]
+    fn there_is_a_whole_model_at_any_moment() {
+        let (_folder, stores) = stores();
+        for store in &stores {
+            publish(store, "m", &files(0)).expect("published");
+            publish(store, "m", &files(1)).expect("published");
+            let is_done = std::sync::atomic::AtomicBool::new(false);
+            let order = std::sync::atomic::Ordering::SeqCst;
+            std::thread::scope(|scope| {
+                let reader = scope.spawn(|| {
+                    let mut n_read = 0;
+                    while !is_done.load(order) {
+                        // As a model is opened: once more where it was replaced twice meanwhile.
+                        assert!(version(store).or_else(|| version(store)).is_some());
+                        n_read += 1;
+                    }
+                    n_read
+                });
+                for i in 2..120 {
+                    publish(store, "m", &files(i)).expect("published");
+                    std::thread::sleep(std::time::Duration::from_millis(1));
+                }
+                is_done.store(true, order);
+                assert!(reader.join().expect("a reader") > 20);
+            });
+        }
+    }
+
+    #[test]
+    fn a_pointer_of_others_is_passed_over() {
+        let (_folder, [store, _]) = stores();
+        publish(&store, "m", &files(1)).expect("published");
+        let digits = "0123456789abcdef0123456789abcdef";
+        for text in ["", "{}", r#"{"folder": "../../../etc"}"#, r#"{"folder": "/etc"}"#, digits] {
+            store.replace("models/m/current.json", text.to_owned().into()).expect("written");
+            assert_eq!(version(&store).as_deref(), Some(" of 1"), "{text}");
+        }
+    }
 }

@@ -17,8 +17,8 @@ use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::ingest::content_hash_of_audio;
 use crate::store::tables::{self, BeatRow, ExtractionRow, FailureRow, PhraseRow};
 use crate::store::{
-    ClientOptions, Commit, Content, InOrder, Item, Ledger, Location, Row as _, Shard, Snapshot,
-    Source, SourceFile, StoreError, TimestampUs, batch_of,
+    ClientOptions, Commit, Content, InOrder, Item, Ledger, Location, Row as _, Shard, Source,
+    SourceFile, StoreError, StoreSnapshot, TimestampUs, batch_of, checkpoint,
 };
 
 /// Where the items of this stage come from, as its commits name it.
@@ -74,7 +74,8 @@ struct Batch {
 /// # Errors
 /// When the store cannot be read or written; what was committed stays.
 pub fn run(job: &Job<'_>, target: &Target<'_>) -> anyhow::Result<Done> {
-    let rows: Vec<PhraseRow> = Snapshot::take(target.store, PhraseRow::schema())?.rows()?;
+    let snapshot = StoreSnapshot::take(target.store)?;
+    let rows: Vec<PhraseRow> = snapshot.table(PhraseRow::schema())?.rows()?;
     if rows.is_empty() {
         anyhow::bail!(
             "store {} has no phrases; run first: motiongen ingest --source … --store {}",
@@ -82,11 +83,11 @@ pub fn run(job: &Job<'_>, target: &Target<'_>) -> anyhow::Result<Done> {
             target.store
         );
     }
-    let ledger = Ledger::read(target.store, Extract::NAME)?;
+    let ledger = snapshot.ledger(Extract::NAME)?;
     let names: BTreeSet<String> = rows.iter().map(|row| row.phrase_id.clone()).collect();
     // Constructed phrases have features of their song, without a file of their own.
     let n_phrases = rows.iter().filter(|row| !row.is_constructed()).count() as u64;
-    let listed = with_listed_beats(target.store, &rows)?;
+    let listed = with_listed_beats(&snapshot, &rows)?;
     let mut tasks = plan(rows, &listed);
     let mut done = Done { n_without: n_phrases - tasks.len() as u64, ..Done::default() };
     tasks.retain(|task| target.shard.takes(&task.row.phrase_id));
@@ -99,17 +100,22 @@ pub fn run(job: &Job<'_>, target: &Target<'_>) -> anyhow::Result<Done> {
         return Ok(done);
     }
     target.store.sweep()?;
+    snapshot.checkpoint();
     job.progress.start_audio("extract", done.todo_s.ceil() as u64);
     let writer = Writer { target, ledger: &ledger };
     let done = Mutex::new(done);
     work_off(job, target, tasks, &writer, &done)?;
     writer.forget_failures(&names)?;
     job.progress.finish();
+    checkpoint(target.store, &[Extract::NAME]);
     Ok(done.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner))
 }
 
 /// Returns the phrases of whose beat lists ingest wrote the beats; release 0.1 did not.
-fn with_listed_beats(store: &Location, rows: &[PhraseRow]) -> Result<BTreeSet<String>, StoreError> {
+fn with_listed_beats(
+    store: &StoreSnapshot,
+    rows: &[PhraseRow],
+) -> Result<BTreeSet<String>, StoreError> {
     let with_list: BTreeSet<&str> = rows
         .iter()
         .filter(|row| row.beats_url.is_some())

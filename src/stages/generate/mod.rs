@@ -17,7 +17,7 @@ use std::time::Instant;
 use anyhow::bail;
 
 use super::failure::{Failure, N_SHOWN, write_failures};
-use super::model_files::{OpenModel, sha256};
+use super::model_files::{OpenModel, POINTER, sha256};
 use super::retrieval::Primer;
 use super::{Contract, Progress, Stage, Summary};
 use crate::diffusion::Schedule;
@@ -149,7 +149,7 @@ impl Stage for Generate {
 fn open_model(params: &Params, store: Option<&Location>) -> anyhow::Result<OpenModel> {
     let Some(model) = &params.model else { return OpenModel::pretrained() };
     let folder = Path::new(model);
-    if folder.join(file_names::CARD).is_file() {
+    if [file_names::CARD, POINTER].iter().any(|name| folder.join(name).is_file()) {
         return OpenModel::of_folder(folder);
     }
     match store {

@@ -20,8 +20,8 @@ use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::{Progress, Stage as _};
 use crate::store::tables::{self, ExtractionRow, FailureRow, GenerationRow, PhraseRow};
 use crate::store::{
-    Commit, Item, Label, Ledger, Location, Row as _, Shard, Snapshot, StoreError, TimestampUs,
-    batch_of, digest,
+    Commit, Item, Label, Ledger, Location, Row as _, Shard, Snapshot, StoreError, StoreSnapshot,
+    TimestampUs, batch_of, checkpoint, digest,
 };
 use crate::units::frames_to_s;
 
@@ -31,6 +31,8 @@ const ITEMS_FROM: &str = "phrases";
 const MAX_BATCH_S: f64 = 600.0;
 /// Most phrases in a batch, about.
 const MAX_BATCH_PHRASES: usize = 64;
+/// Most frames of features that are read ahead: 85 MB.
+const MAX_FRAMES_AHEAD: usize = 128 << 10;
 
 /// The store and what is asked of it.
 pub struct Target<'a> {
@@ -79,9 +81,10 @@ type Outcome = Result<Made, Failure>;
 /// # Errors
 /// When the store cannot be read or written; what was committed stays.
 pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::Result<Done> {
-    let ledger = Ledger::read(target.store, Generate::NAME)?;
+    let snapshot = StoreSnapshot::take(target.store)?;
+    let ledger = snapshot.ledger(Generate::NAME)?;
     let mut done = Done::default();
-    let tasks = plan(maker, target, &ledger, &mut done)?;
+    let tasks = plan(maker, target, &snapshot, &ledger, &mut done)?;
     done.n_todo = tasks.iter().map(|task| task.samples.len() as u64).sum();
     done.todo_s =
         tasks.iter().map(|task| frames_to_s(task.n_frames) * task.samples.len() as f64).sum();
@@ -89,33 +92,88 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
         return Ok(done);
     }
     target.store.sweep()?;
+    snapshot.checkpoint();
     progress.start_audio("generate", done.todo_s.ceil() as u64);
     let mut batches: BTreeMap<u64, Vec<Task>> = BTreeMap::new();
     for task in tasks {
         batches.entry(task.batch).or_default().push(task);
     }
-    for tasks in batches.into_values() {
-        let outcomes = make_batch(maker, target, &tasks, progress)?;
+    let batches: Vec<Vec<Task>> = batches.into_values().collect();
+    let mut ahead = MusicAhead::new(&snapshot)?;
+    for (i, tasks) in batches.iter().enumerate() {
+        ahead.read(&batches[i..])?;
+        let outcomes = make_batch(maker, target, tasks, &ahead, progress)?;
         done.add(&outcomes);
-        commit(maker, target, &ledger, &tasks, outcomes)?;
+        commit(maker, target, &ledger, tasks, outcomes)?;
+        ahead.forget(tasks);
         if progress.is_interrupted() {
             done.is_interrupted = true;
             break;
         }
     }
     progress.finish();
+    checkpoint(target.store, &[Generate::NAME]);
     Ok(done)
+}
+
+/// The features of the batches that come next. Parts of `features` hold the phrases of several batches, so
+/// batches that lie side by side are read together.
+struct MusicAhead {
+    table: Snapshot,
+    /// Why parts of the table are not read.
+    unknown: Option<String>,
+    at_hand: HashMap<String, Array2<f32>>,
+    /// Batches that were read, and not made yet.
+    n_ahead: usize,
+}
+
+impl MusicAhead {
+    fn new(snapshot: &StoreSnapshot) -> Result<Self, StoreError> {
+        let (table, unknown) = snapshot.known_table(tables::features())?;
+        let unknown = unknown.map(|e| e.to_string());
+        Ok(Self { table, unknown, at_hand: HashMap::new(), n_ahead: 0 })
+    }
+
+    /// Reads the features of the first of `batches` and of those behind it that fit, unless they are at hand.
+    fn read(&mut self, batches: &[Vec<Task>]) -> Result<(), StoreError> {
+        if self.n_ahead > 0 {
+            return Ok(());
+        }
+        let (mut wanted, mut n_frames) = (BTreeSet::new(), 0);
+        for tasks in batches {
+            n_frames += tasks.iter().map(|task| task.n_frames).sum::<usize>();
+            if self.n_ahead > 0 && n_frames > MAX_FRAMES_AHEAD {
+                break;
+            }
+            wanted.extend(tasks.iter().map(|task| task.row.phrase_id.clone()));
+            self.n_ahead += 1;
+        }
+        let at_hand = &mut self.at_hand;
+        self.table.visit_items(&wanted, |id, frames| {
+            at_hand.insert(id.to_owned(), frames);
+            Ok(())
+        })
+    }
+
+    /// Drops the features of a batch that was made.
+    fn forget(&mut self, tasks: &[Task]) {
+        self.n_ahead = self.n_ahead.saturating_sub(1);
+        for task in tasks {
+            self.at_hand.remove(&task.row.phrase_id);
+        }
+    }
 }
 
 /// Returns the phrases that lack motions, in the order in which they are made.
 fn plan(
     maker: &Maker,
     target: &Target,
+    snapshot: &StoreSnapshot,
     ledger: &Ledger,
     done: &mut Done,
 ) -> anyhow::Result<Vec<Task>> {
     let store = target.store;
-    let rows: Vec<PhraseRow> = Snapshot::take(store, PhraseRow::schema())?.rows()?;
+    let rows: Vec<PhraseRow> = snapshot.table(PhraseRow::schema())?.rows()?;
     if rows.is_empty() {
         bail!(
             "store {store} has no phrases; run first: motiongen ingest --source … --store {store}"
@@ -124,7 +182,7 @@ fn plan(
     for id in target.phrases {
         ensure!(rows.iter().any(|row| row.phrase_id == *id), "store {store} has no phrase {id}");
     }
-    let extractions: Vec<ExtractionRow> = Snapshot::take(store, ExtractionRow::schema())?.rows()?;
+    let extractions: Vec<ExtractionRow> = snapshot.table(ExtractionRow::schema())?.rows()?;
     let extracted: HashMap<&str, i64> =
         extractions.iter().map(|row| (row.phrase_id.as_str(), row.n_frames)).collect();
     let is_wanted = |row: &PhraseRow| {
@@ -158,7 +216,7 @@ fn plan(
     let n_batches = by_length.max(by_count).max(1).next_power_of_two();
     tasks.retain(|task| target.shard.takes(&task.row.phrase_id));
     let ids: BTreeSet<&str> = tasks.iter().map(|task| task.row.phrase_id.as_str()).collect();
-    let mut beats = beats::of_phrases(store, |id| ids.contains(id))?;
+    let mut beats = beats::of_phrases(snapshot, |id| ids.contains(id))?;
     for task in &mut tasks {
         task.beats = beats.remove(&task.row.phrase_id).unwrap_or_default();
         let (id, fingerprint) = (&task.row.phrase_id, task.fingerprint());
@@ -185,16 +243,9 @@ fn make_batch(
     maker: &Maker,
     target: &Target,
     tasks: &[Task],
+    ahead: &MusicAhead,
     progress: &dyn Progress,
 ) -> anyhow::Result<BTreeMap<String, Outcome>> {
-    let wanted: BTreeSet<String> = tasks.iter().map(|task| task.row.phrase_id.clone()).collect();
-    let mut music: HashMap<String, Array2<f32>> = HashMap::new();
-    let (known, unknown) = Snapshot::take_known(target.store, tables::features())?;
-    known.visit_items(&wanted, |id, frames| {
-        music.insert(id.to_owned(), frames);
-        Ok::<_, StoreError>(())
-    })?;
-    let unknown = unknown.map(|e| e.to_string());
     // The longest first, so that no worker is left with it at the end.
     let mut order: Vec<(&Task, usize)> = tasks
         .iter()
@@ -210,7 +261,7 @@ fn make_batch(
         || queue.next(),
         |(task, sample): (&Task, usize)| -> anyhow::Result<()> {
             let id = &task.row.phrase_id;
-            let outcome = match music.get(id) {
+            let outcome = match ahead.at_hand.get(id) {
                 Some(features) => {
                     let music = Music {
                         phrase_id: id,
@@ -222,7 +273,7 @@ fn make_batch(
                     };
                     maker.make(&music, sample, &mut |_| Ok(()))
                 }
-                None => Err(without_features(&task.row, target.store, unknown.as_deref())),
+                None => Err(without_features(&task.row, target.store, ahead.unknown.as_deref())),
             };
             progress.advance(frames_to_s(task.n_frames).round() as u64);
             lock(&outcomes).insert(generation_id(maker.run, id, sample), outcome);

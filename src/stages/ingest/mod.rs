@@ -13,7 +13,7 @@ use std::time::Instant;
 use super::{ClientParams, Contract, Progress, Stage, Summary, all_threads};
 use crate::store::tables::PhraseRow;
 use crate::store::{
-    Cache, Ledger, Location, Row as _, Shard, Snapshot, Source, StoreError, digest,
+    Cache, Ledger, Location, Row as _, Shard, Source, StoreError, StoreSnapshot, checkpoint, digest,
 };
 
 use super::failure::{Failure, write_failures};
@@ -97,11 +97,12 @@ impl Stage for Ingest {
         if !params.dry_run {
             store.sweep()?;
         }
-        let ledger = Ledger::read(&store, Self::NAME)?;
+        let snapshot = StoreSnapshot::take(&store)?;
+        let ledger = snapshot.ledger(Self::NAME)?;
         let params_hash = params_hash(&params.rules);
 
         // With --force everything is done again anyway, also where old parts cannot be read.
-        let unidentified = if params.force { BTreeSet::new() } else { unidentified(&store)? };
+        let unidentified = if params.force { BTreeSet::new() } else { unidentified(&snapshot)? };
 
         let mine: Vec<_> = plan.phrases.iter().filter(|p| shard.takes(&p.id)).collect();
         let origin = source.location().url();
@@ -138,6 +139,7 @@ impl Stage for Ingest {
             });
             report.tally.failed = problems.collect();
         } else {
+            snapshot.checkpoint();
             progress.start("ingest", "phrases", todo.len() as u64);
             let batches = batch::batches(&plan.phrases, todo, params.batch_phrases.get());
             let job = batch::Job {
@@ -152,6 +154,7 @@ impl Stage for Ingest {
             };
             report.tally.add(job.run(&batches, params.workers.get())?);
             job.forget_failures(&plan.phrases, shard)?;
+            checkpoint(&store, &[Self::NAME]);
             progress.finish();
         }
         report.tally.failed.sort_by(|a, b| a.id.cmp(&b.id));
@@ -191,9 +194,9 @@ fn is_settled(planned: &Planned, ledger: &Ledger, params_hash: &str, origin: &st
 ///
 /// # Errors
 /// [`StoreError`] when the commits cannot be read.
-fn unidentified(store: &Location) -> Result<BTreeSet<String>, StoreError> {
+fn unidentified(store: &StoreSnapshot) -> Result<BTreeSet<String>, StoreError> {
     // Rows that cannot be read cannot be mended, and keep nobody from ingesting others.
-    let (table, _) = Snapshot::take_known(store, PhraseRow::schema())?;
+    let (table, _) = store.known_table(PhraseRow::schema())?;
     let lacks = |row: &PhraseRow| {
         let has_music = row.audio_url.is_some() || row.features_url.is_some();
         row.song_hash.is_none() && has_music

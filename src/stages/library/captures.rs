@@ -12,8 +12,8 @@ use crate::motion::{ChannelLimits, Trajectory};
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::ingest::{read_bvh, read_trajectory};
 use crate::store::{
-    ClientOptions, Content, Listing, Location, Snapshot, Source, SourceFile, SourceProblemKind,
-    StoreError, digest, tables,
+    ClientOptions, Content, Listing, Source, SourceFile, SourceProblemKind, StoreError,
+    StoreSnapshot, digest, tables,
 };
 
 /// Endings of the files that are read.
@@ -33,7 +33,7 @@ pub struct Captures {
 enum Place {
     /// Phrases of the store, with the digests of their files.
     Store {
-        place: Location,
+        place: StoreSnapshot,
         ids: BTreeMap<String, String>,
     },
     Folder {
@@ -56,7 +56,7 @@ pub struct Loaded {
 impl Captures {
     /// Finds the captures of a store: phrases with motion and without audio that library has not
     /// constructed.
-    pub fn of_store(store: &Location, known: &Known) -> Self {
+    pub fn of_store(store: &StoreSnapshot, known: &Known) -> Self {
         let ids = known.captures.clone();
         let lines: String = ids.iter().map(|(id, hash)| format!("{hash} {id}\n")).collect();
         Self {
@@ -119,13 +119,14 @@ impl Captures {
             Place::Store { place, ids } => {
                 if ids.is_empty() {
                     bail!(
-                        "store {place} has no captures: no phrase has motion without audio; ingest \
-                         some, or name a folder of .bvh or .npy files with --captures"
+                        "store {} has no captures: no phrase has motion without audio; ingest \
+                         some, or name a folder of .bvh or .npy files with --captures",
+                        place.store()
                     );
                 }
                 let mut frames: BTreeMap<String, Array2<f32>> = BTreeMap::new();
                 let wanted = ids.keys().cloned().collect();
-                Snapshot::take(&place, tables::motion())?.visit_items(&wanted, |id, found| {
+                place.table(tables::motion())?.visit_items(&wanted, |id, found| {
                     frames.insert(id.to_owned(), found);
                     Ok::<_, StoreError>(())
                 })?;
@@ -135,7 +136,7 @@ impl Captures {
                         let motion = Trajectory::new(frames);
                         reading.add(&id, motion.map_err(|e| Failure::of(&id, e.kind(), &e))?)
                     });
-                    reading.settle(&id, &place.url_of(&id), added);
+                    reading.settle(&id, &place.store().url_of(&id), added);
                 }
                 Ok(reading.finish(self.fingerprint))
             }

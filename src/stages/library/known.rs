@@ -9,7 +9,7 @@ use crate::stages::beats::{self, BeatSource};
 use crate::stages::extract::Extract;
 use crate::stages::failure::{Failure, FailureKind};
 use crate::store::tables::{ExtractionRow, PhraseRow};
-use crate::store::{Ledger, Location, Row, Snapshot, StoreError};
+use crate::store::{Row, StoreError, StoreSnapshot};
 
 /// What a store knows.
 #[derive(Debug, Default)]
@@ -35,7 +35,7 @@ impl Known {
     ///
     /// # Errors
     /// [`StoreError`].
-    pub fn read(store: &Location) -> Result<Self, StoreError> {
+    pub fn read(store: &StoreSnapshot) -> Result<Self, StoreError> {
         let mut known = Self::default();
         let mut with_audio: BTreeMap<String, PhraseRow> = BTreeMap::new();
         each(store, |row: PhraseRow| {
@@ -62,7 +62,7 @@ impl Known {
         })?;
         let mut beats = beats::of_phrases(store, |id| with_audio.contains_key(id))?;
         // Other features of the same file have another digest of parameters.
-        let extract = Ledger::read(store, Extract::NAME)?;
+        let extract = store.ledger(Extract::NAME)?;
         for (id, row) in with_audio {
             let (Some(&n_frames), Some(url)) = (extracted.get(&id), row.audio_url.clone()) else {
                 known.n_without_features += 1;
@@ -107,9 +107,9 @@ fn unread(id: &str, list: &str) -> Failure {
 }
 
 /// Visits the rows of a table without holding all of them.
-fn each<R: Row>(store: &Location, mut visit: impl FnMut(R)) -> Result<(), StoreError> {
-    let snapshot = Snapshot::take(store, R::schema())?;
-    for batch in snapshot.batches() {
+fn each<R: Row>(store: &StoreSnapshot, mut visit: impl FnMut(R)) -> Result<(), StoreError> {
+    let table = store.table(R::schema())?;
+    for batch in table.batches() {
         let rows = R::from_batch(&batch?).unwrap_or_default();
         rows.into_iter().for_each(&mut visit);
     }

@@ -19,7 +19,7 @@ use std::time::Instant;
 
 use super::failure::{Failure, FailureKind};
 use super::{ClientParams, Contract, Progress, Stage, Summary, all_threads};
-use crate::store::{Ledger, Location, StoreError, digest};
+use crate::store::{Location, StoreError, StoreSnapshot, checkpoint, digest};
 use captures::Captures;
 use job::Job;
 use known::Known;
@@ -122,17 +122,18 @@ impl Stage for Library {
         let started = Instant::now();
         let options = params.client.options();
         let store = Location::open(&params.store, &options)?;
-        let mut known = Known::read(&store)?;
-        let ledger = Ledger::read(&store, Self::NAME)?;
+        let snapshot = StoreSnapshot::take(&store)?;
+        let mut known = Known::read(&snapshot)?;
+        let ledger = snapshot.ledger(Self::NAME)?;
         let captures = match &params.captures {
             Some(url) => Captures::of_folder(url, &options)?,
-            None => Captures::of_store(&store, &known),
+            None => Captures::of_store(&snapshot, &known),
         };
         let mut songs = match &params.songs {
             Some(url) => Songs::of_folder(url, &options, &known)?,
             None => {
                 let is_needed = params.compose == 0 && params.tunes.is_none();
-                Songs::of_store(&store, &mut known, is_needed)?
+                Songs::of_store(&snapshot, &mut known, is_needed)?
             }
         };
         #[cfg(feature = "soundfont")]
@@ -154,6 +155,9 @@ impl Stage for Library {
             took_s: 0.0,
         };
         job.run(captures, &songs, &mut report)?;
+        if !params.dry_run {
+            checkpoint(&store, &[Self::NAME]);
+        }
         report.took_s = started.elapsed().as_secs_f64();
         report.tally.failed.sort_by(|a, b| a.0.cmp(&b.0));
         Ok(Box::new(report))

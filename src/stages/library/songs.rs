@@ -13,7 +13,7 @@ use crate::stages::beats::BeatSource;
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::ingest::{Layout, Role, plan};
 use crate::store::{
-    ClientOptions, Content, Location, Snapshot, Source, SourceFile, StoreError, digest, tables,
+    ClientOptions, Content, Source, SourceFile, StoreError, StoreSnapshot, digest, tables,
 };
 
 /// Longest name of a song within the name of a phrase, in bytes; a folder's name may have 255.
@@ -95,7 +95,7 @@ pub struct Songs {
 
 #[derive(Clone)]
 enum Place {
-    Store(Location),
+    Store(StoreSnapshot),
     Folder(Source),
 }
 
@@ -104,7 +104,12 @@ impl Songs {
     ///
     /// # Errors
     /// When there is none and one is needed.
-    pub fn of_store(store: &Location, known: &mut Known, is_needed: bool) -> anyhow::Result<Self> {
+    pub fn of_store(
+        snapshot: &StoreSnapshot,
+        known: &mut Known,
+        is_needed: bool,
+    ) -> anyhow::Result<Self> {
+        let store = snapshot.store();
         if known.songs.is_empty() && is_needed {
             let hint = match known.n_without_features {
                 0 => {
@@ -123,7 +128,7 @@ impl Songs {
             origin: super::FROM_STORE.to_owned(),
             songs: songs.into_values().collect(),
             n_without_features: known.n_without_features,
-            place: Place::Store(store.clone()),
+            place: Place::Store(snapshot.clone()),
         })
     }
 
@@ -254,14 +259,14 @@ fn send_files(source: &Source, songs: Vec<Song>, sender: &SyncSender<(Song, Inpu
 }
 
 fn send_features(
-    store: &Location,
+    store: &StoreSnapshot,
     songs: Vec<Song>,
     sender: &SyncSender<(Song, Input)>,
 ) -> Result<(), StoreError> {
     let mut missing: BTreeMap<String, Song> =
         songs.into_iter().map(|song| (song.id.clone(), song)).collect();
     let wanted = missing.keys().cloned().collect();
-    Snapshot::take(store, tables::features())?.visit_items(&wanted, |id, frames| {
+    store.table(tables::features())?.visit_items(&wanted, |id, frames| {
         if let Some(song) = missing.remove(id) {
             // Nobody listens any more when the job has failed; it says so itself.
             sender.send((song, Input::Features(Ok(frames)))).ok();

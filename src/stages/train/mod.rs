@@ -16,12 +16,14 @@ use crate::autodiff::{Arena, Parameters};
 use crate::diffusion::Schedule;
 use crate::model::UNet1D;
 use crate::motion::Normalizer;
-use crate::store::Location;
+use crate::store::{Lease, Location};
 use crate::training::{
     Augmentation, Checkpoints, DecoderLearner, Denoiser, DiffusionLearner, Drive, End, Journal,
     Kind, Learner, Loader, Plan, State, TrainConfig, TrainingError, Windows,
 };
-use session::{Looker, MachineParams, check_run_name, claim, claim_path, read_phrases, scales};
+use session::{
+    Looker, MachineParams, check_run_name, claim, claim_path, lease_of, read_phrases, scales,
+};
 pub use summary::{Account, StageAccount};
 
 /// Share of a time budget that the decoder gets.
@@ -110,7 +112,12 @@ impl Stage for Train {
         check_numbers(&params, &config)?;
         let store = Location::open(&params.store, &params.client.options())?;
         let watch = Looker(progress);
-        let mut run = Run { params: &params, config: &config, store: &store, watch: &watch };
+        let lease = match params.dry_run {
+            true => None,
+            false => Some(lease_of(&store, &params.run, &watch)?),
+        };
+        let lease = lease.as_ref();
+        let mut run = Run { params: &params, config: &config, store: &store, watch: &watch, lease };
         let first = run.checkpoints(DiffusionLearner::STAGE);
         ensure!(
             !params.resume || !first.steps(Kind::Step)?.is_empty(),
@@ -186,6 +193,7 @@ struct Run<'a> {
     config: &'a TrainConfig,
     store: &'a Location,
     watch: &'a Looker<'a>,
+    lease: Option<&'a Lease>,
 }
 
 impl<'a> Run<'a> {
@@ -194,7 +202,11 @@ impl<'a> Run<'a> {
     }
 
     fn journal(&self, stage: &'static str) -> anyhow::Result<Journal<'a>> {
-        Ok(Journal::open(self.store, Train::NAME, &self.params.run, stage)?)
+        let journal = Journal::open(self.store, Train::NAME, &self.params.run, stage)?;
+        Ok(match self.lease {
+            Some(lease) => journal.under(lease),
+            None => journal,
+        })
     }
 
     /// Removes what the run has left, so that it can begin anew.

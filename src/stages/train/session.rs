@@ -13,7 +13,7 @@ use crate::autodiff::Threads;
 use crate::stages::{Progress, all_threads};
 use crate::store::tables::FailureRow;
 use crate::store::{
-    Commit, Item, Ledger, Location, Patience, Put, Row as _, StoreError, TimestampUs, digest,
+    Commit, Item, Lease, Ledger, Location, Patience, Put, Row as _, StoreError, TimestampUs, digest,
 };
 use crate::training::{
     Dataset, LeftOut, Reading, Scales, TrainingError, Watch, differences, fit_scales,
@@ -73,6 +73,20 @@ pub fn check_run_name(run: &str) -> anyhow::Result<()> {
          at the beginning"
     );
     Ok(())
+}
+
+/// Takes the right to write a run; whoever asks for it meanwhile waits or is refused.
+///
+/// # Errors
+/// [`StoreError::Held`] when another process writes it.
+pub fn lease_of(store: &Location, run: &str, watch: &Looker) -> Result<Lease, StoreError> {
+    let waiting = |holder: &str, rest: Duration| {
+        watch.note(&format!(
+            "run {run} was last written by {holder}; waiting {} s for a sign of life",
+            rest.as_secs() + 1
+        ));
+    };
+    Lease::take(store, &format!("runs/{run}"), &waiting)
 }
 
 /// Returns where a command's claim on a run lies below the store.

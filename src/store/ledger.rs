@@ -1,0 +1,85 @@
+//! Ledgers: what a store knows of one stage's items.
+
+use std::collections::HashMap;
+use std::ops::Deref;
+use std::sync::Arc;
+
+use super::StoreError;
+use super::location::Location;
+use super::manifest::{Header, Item, Manifest};
+use super::stage_log::StageLog;
+
+/// What a store knows of one stage's items.
+#[derive(Debug, Default)]
+pub struct Ledger {
+    items: HashMap<String, Settled>,
+}
+
+/// The latest word on an item, and what the commit that settled it says of all its items.
+#[derive(Clone, Debug)]
+pub struct Settled {
+    pub item: Item,
+    header: Arc<Header>,
+}
+
+impl Deref for Settled {
+    type Target = Header;
+
+    fn deref(&self) -> &Header {
+        &self.header
+    }
+}
+
+impl Ledger {
+    /// Reads what `stage` has committed in `store`.
+    ///
+    /// # Errors
+    /// [`StoreError`] when commits cannot be read.
+    pub fn read(store: &Location, stage: &str) -> Result<Self, StoreError> {
+        Self::of(&StageLog::read(store, stage)?)
+    }
+
+    pub(super) fn of(log: &StageLog) -> Result<Self, StoreError> {
+        let mut ledger = Self::default();
+        let mut headers: HashMap<Header, Arc<Header>> = HashMap::new();
+        log.visit(|word| {
+            let header = match headers.get(word.header) {
+                Some(header) => Arc::clone(header),
+                None => {
+                    let header = Arc::new(word.header.clone());
+                    headers.insert(word.header.clone(), Arc::clone(&header));
+                    header
+                }
+            };
+            ledger.items.insert(word.item.id.clone(), Settled { item: word.item, header });
+        })?;
+        Ok(ledger)
+    }
+
+    /// Adds what a commit settles, which was made with this ledger.
+    pub(super) fn add(&mut self, manifest: &Manifest) {
+        let headers: Vec<_> = manifest.headers().into_iter().map(Arc::new).collect();
+        for (i, item) in manifest.items.iter().enumerate() {
+            let header = Arc::clone(&headers[manifest.header_of(i)]);
+            self.items.insert(item.id.clone(), Settled { item: item.clone(), header });
+        }
+    }
+
+    /// Returns the items from `origin` that failed last time, in order of id.
+    pub fn failed(&self, origin: &str) -> Vec<&str> {
+        let failed = |s: &&Settled| s.item.failure.is_some() && s.origin == origin;
+        let mut ids: Vec<_> =
+            self.items.values().filter(failed).map(|s| s.item.id.as_str()).collect();
+        ids.sort_unstable();
+        ids
+    }
+
+    /// Returns the items that anything is known of, in no order.
+    pub fn ids(&self) -> impl Iterator<Item = &str> {
+        self.items.keys().map(String::as_str)
+    }
+
+    pub fn get(&self, id: &str) -> Option<&Settled> {
+        self.items.get(id)
+    }
+}

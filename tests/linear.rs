@@ -1,0 +1,107 @@
+//! Work on twice the phrases costs twice as much: bytes read and requests are counted, never timed.
+
+use std::collections::BTreeMap;
+
+use clap::{Args as _, FromArgMatches as _};
+use motiongen::stages::evaluate::Evaluate;
+use motiongen::stages::extract::Extract;
+use motiongen::stages::generate::Generate;
+use motiongen::stages::ingest::Ingest;
+use motiongen::stages::library::Library;
+#[cfg(feature = "query")]
+use motiongen::stages::query::Query;
+use motiongen::stages::train::Train;
+use motiongen::stages::view::View;
+use motiongen::stages::{Silent, Stage};
+use motiongen::store::{ClientOptions, Location, Traffic, memory_traffic};
+
+use crate::support::Dir;
+use crate::support::files::{coherent, features_npz, trajectory};
+
+const N_FRAMES: usize = 33;
+/// What twice the phrases may cost, over what they cost once.
+const MOST: f64 = 2.2;
+
+/// Runs a stage within this process.
+#[track_caller]
+fn run_stage<S: Stage>(arguments: &[&str]) {
+    let command = S::Params::augment_args(clap::Command::new(S::NAME).no_binary_name(true));
+    let matches = command.try_get_matches_from(arguments).unwrap_or_else(|e| panic!("{e}"));
+    let params = S::Params::from_arg_matches(&matches).unwrap_or_else(|e| panic!("{e}"));
+    let mut summary =
+        S::run(params, &Silent).unwrap_or_else(|e| panic!("{} {arguments:?}: {e:#}", S::NAME));
+    assert_eq!(summary.n_failed(), 0, "{}", S::NAME);
+    summary.write(&mut Vec::new()).expect("a summary");
+}
+
+/// Copies the model that ships into a store.
+fn put_model(store: &Location) {
+    for entry in std::fs::read_dir("models/pretrained").expect("the model that ships") {
+        let entry = entry.expect("an entry");
+        let name = entry.file_name().into_string().expect("a name");
+        let bytes = std::fs::read(entry.path()).expect("a file");
+        store.put_new(&format!("models/m/{name}"), bytes.into()).expect("written");
+    }
+}
+
+/// Returns what every stage asks of a store of `n` phrases.
+fn costs(n: usize) -> BTreeMap<&'static str, Traffic> {
+    let dir = Dir::new();
+    for i in 0..n {
+        let id = format!("p{:05}", i * 7919 % 100_003);
+        let frames = coherent(N_FRAMES, i as u32 % 97);
+        dir.write(format!("source/motion/{id}/trajectory.npy"), trajectory(&frames));
+        dir.write(format!("source/audio_features/{id}/features.npz"), features_npz(N_FRAMES));
+    }
+    let name = format!("linear-{n}");
+    let url = format!("memory://{name}");
+    put_model(&Location::open(&url, &ClientOptions::default()).expect("a store"));
+    let store = format!("--store={url}");
+    let source = format!("--source={}", dir.at("source").display());
+    let page = format!("--output={}", dir.at("page.html").display());
+    let mut costs = BTreeMap::new();
+    let mut count = |what: &'static str, work: &dyn Fn()| {
+        let before = memory_traffic(&name);
+        work();
+        let after = memory_traffic(&name);
+        let cost = Traffic {
+            n_requests: after.n_requests - before.n_requests,
+            read_bytes: after.read_bytes - before.read_bytes,
+        };
+        costs.insert(what, cost);
+    };
+    let ingest = [store.as_str(), &source, "--batch-phrases=8"];
+    count("ingest", &|| run_stage::<Ingest>(&ingest));
+    count("ingest again", &|| run_stage::<Ingest>(&ingest));
+    count("extract", &|| run_stage::<Extract>(&[&store]));
+    count("train", &|| {
+        let tiny = ["--run=r", "--preset=tiny", "--steps=1", "--decoder-steps=1"];
+        run_stage::<Train>(&[&[store.as_str(), "--dry-run"][..], &tiny].concat());
+    });
+    count("generate", &|| {
+        let quick = ["--model=m", "--steps=1", "--engine=eager", "--run=g", "--tracks=all"];
+        run_stage::<Generate>(&[&[store.as_str()][..], &quick].concat());
+    });
+    count("evaluate", &|| run_stage::<Evaluate>(&[&store, "--run=g", "--quick"]));
+    count("library", &|| run_stage::<Library>(&[&store, "--compose=1", "--takes=1"]));
+    count("view", &|| run_stage::<View>(&[&store, "--phrase=p00000", &page]));
+    #[cfg(feature = "query")]
+    count("query", &|| run_stage::<Query>(&[&store, "select count(*) from phrases"]));
+    costs
+}
+
+#[test]
+fn twice_the_phrases_cost_twice_as_much() {
+    let (once, twice) = (costs(256), costs(512));
+    let (mut dear, mut all) = (Vec::new(), String::new());
+    for (what, once) in &once {
+        let twice = &twice[what];
+        let bytes = twice.read_bytes as f64 / once.read_bytes.max(1) as f64;
+        let requests = twice.n_requests as f64 / once.n_requests.max(1) as f64;
+        all += &format!("{what}: {once:?}, {twice:?}: {bytes:.2}, {requests:.2}\n");
+        if bytes > MOST || requests > MOST {
+            dear.push(what);
+        }
+    }
+    assert!(dear.is_empty(), "{dear:?} cost more than {MOST} times as much:\n{all}");
+}
