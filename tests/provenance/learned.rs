@@ -30,7 +30,13 @@ fn list(store: &Path, command: &str) -> LearnedFrom {
 }
 
 fn card(store: &Path) -> ModelCard {
-    let text = std::fs::read(store.join("models/m/model.json")).expect("a card");
+    let mut folder = store.join("models/m");
+    // A model that was replaced lies in a folder of its own.
+    if let Ok(text) = std::fs::read(folder.join("current.json")) {
+        let pointer: serde_json::Value = serde_json::from_slice(&text).expect("JSON");
+        folder.push(pointer["folder"].as_str().expect("a folder"));
+    }
+    let text = std::fs::read(folder.join("model.json")).expect("a card");
     ModelCard::read(&text, "m").expect("a card")
 }
 
