@@ -96,8 +96,8 @@ impl Lease {
         let holder = Holder::of_this_process();
         let mut seen: Option<u64> = None;
         loop {
-            let latest = latest(store, name)?;
-            let number = match &latest {
+            let highest = latest(store, name)?;
+            let number = match &highest {
                 Some((number, terms)) if !terms.is_over() => {
                     if seen.is_some_and(|seen| seen != *number) {
                         return Err(StoreError::Held {
