@@ -89,4 +89,8 @@ impl Summary for Printed {
     fn n_failed(&self) -> u64 {
         0
     }
+
+    fn figures(&mut self) -> serde_json::Value {
+        serde_json::Value::Null
+    }
 }

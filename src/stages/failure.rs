@@ -70,6 +70,8 @@ kinds! {
     QuaternionNorm = "quaternion_norm",
     Shape = "shape",
     SoundFont = "soundfont",
+    /// Features of other content than the phrase has now.
+    StaleFeatures = "stale_features",
     Symlink = "symlink",
     /// A tempo that nobody dances to.
     Tempo = "tempo",
@@ -161,6 +163,20 @@ pub(in crate::stages) fn write_failures<'a, N: fmt::Display>(
         Some(store) if n_failed > 0 => writeln!(out, "  all of them: {}", query_of_failures(store)),
         _ => Ok(()),
     }
+}
+
+/// Returns the first failures of a job as JSON, each with its name, kind and sentence.
+pub(in crate::stages) fn failures_json<'a, N: fmt::Display>(
+    failed: impl Iterator<Item = (N, &'a Failure)>,
+) -> serde_json::Value {
+    let told = failed.take(N_SHOWN).map(|(name, failure)| {
+        serde_json::json!({
+            "item": name.to_string(),
+            "kind": failure.kind.name(),
+            "message": failure.message,
+        })
+    });
+    told.collect()
 }
 
 /// Returns the command that shows the failures of a store.

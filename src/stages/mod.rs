@@ -19,6 +19,7 @@ mod pretrained;
 #[cfg(feature = "query")]
 pub mod query;
 mod retrieval;
+mod seen;
 pub mod train;
 mod trained;
 pub mod view;
@@ -37,6 +38,11 @@ pub trait Stage {
     /// Tables read and written, for the help text.
     const CONTRACT: Contract;
     type Params: clap::Args;
+
+    /// Returns the flag by which these parameters ask for standard output while the stage runs.
+    fn claims_stdout(_params: &Self::Params) -> Option<&'static str> {
+        None
+    }
 
     /// Does the work.
     ///
@@ -67,7 +73,7 @@ pub trait Progress: Sync {
     fn say(&self, text: &str);
     /// Says something that stays.
     fn note(&self, line: &str);
-    /// Returns whether the user asked for an end (Ctrl-C, or a signal to terminate). Who asks gets a
+    /// Returns whether the user asked for an end (Ctrl-C, or a signal to terminate). A stage that asks gets a
     /// chance to finish what is under way: until the first call such a signal ends the program at once,
     /// and a second one always does.
     fn is_interrupted(&self) -> bool;
@@ -102,6 +108,14 @@ pub trait Summary {
 
     /// Returns how many items failed; they are in the `failures` table.
     fn n_failed(&self) -> u64;
+
+    /// Returns whether the stage was stopped before it was done.
+    fn is_stopped(&self) -> bool {
+        false
+    }
+
+    /// Returns the figures of the account as a JSON object, for programs; names carry units.
+    fn figures(&mut self) -> serde_json::Value;
 }
 
 /// Returns how many threads this machine runs side by side, the default of every stage that has workers.

@@ -31,6 +31,9 @@ pub struct Params {
     pub output: Option<PathBuf>,
     #[command(flatten)]
     pub client: ClientParams,
+    /// With --output: say how much would be written, and write nothing.
+    #[arg(long)]
+    pub dry_run: bool,
 }
 
 impl Stage for Query {
@@ -51,9 +54,11 @@ impl Stage for Query {
             return Ok(Box::new(Selected { answer, format: params.format }));
         };
         let n_rows = answer.n_rows();
-        store::write_file(output, |out| answer.write(params.format, out))
-            .with_context(|| format!("while writing {}", output.display()))?;
-        Ok(Box::new(Written { n_rows, output: output.clone() }))
+        if !params.dry_run {
+            store::write_file(output, |out| answer.write(params.format, out))
+                .with_context(|| format!("while writing {}", output.display()))?;
+        }
+        Ok(Box::new(Written { n_rows, output: output.clone(), dry_run: params.dry_run }))
     }
 }
 
@@ -70,20 +75,35 @@ impl Summary for Selected {
     fn n_failed(&self) -> u64 {
         0
     }
+
+    fn figures(&mut self) -> serde_json::Value {
+        let mut text = Vec::new();
+        // Rows that cannot be written as JSON are told as none.
+        let written = self.answer.write(Format::Json, &mut text);
+        let rows: serde_json::Value =
+            written.ok().and_then(|()| serde_json::from_slice(&text).ok()).unwrap_or_default();
+        serde_json::json!({ "rows": rows })
+    }
 }
 
 struct Written {
     n_rows: usize,
     output: PathBuf,
+    dry_run: bool,
 }
 
 impl Summary for Written {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        writeln!(out, "{} rows → {}", self.n_rows, self.output.display())
+        let would = if self.dry_run { "would write " } else { "" };
+        writeln!(out, "{would}{} rows → {}", self.n_rows, self.output.display())
     }
 
     fn n_failed(&self) -> u64 {
         0
+    }
+
+    fn figures(&mut self) -> serde_json::Value {
+        serde_json::json!({ "to": self.output, "dry_run": self.dry_run, "n_rows": self.n_rows })
     }
 }
 
@@ -110,5 +130,18 @@ impl Summary for Tables {
 
     fn n_failed(&self) -> u64 {
         0
+    }
+
+    fn figures(&mut self) -> serde_json::Value {
+        let tables = self.tables.iter().map(|t| {
+            serde_json::json!({
+                "table": t.name,
+                "n_rows": t.n_rows,
+                "n_bytes": t.n_bytes,
+                "n_parts": t.n_parts,
+                "version": t.schema_version,
+            })
+        });
+        serde_json::json!({ "tables": tables.collect::<Vec<_>>() })
     }
 }

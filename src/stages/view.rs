@@ -38,6 +38,9 @@ pub struct Params {
     pub output: Option<PathBuf>,
     #[command(flatten)]
     pub client: ClientParams,
+    /// Say what would be done, and do nothing.
+    #[arg(long)]
+    pub dry_run: bool,
 }
 
 impl Stage for View {
@@ -65,14 +68,17 @@ impl Stage for View {
             page.beats_s = tracked(path, progress);
         }
         let text = view::page(&page);
-        store::write_file(&output, |out| out.write_all(text.as_bytes()))
-            .with_context(|| format!("while writing {}", output.display()))?;
+        if !params.dry_run {
+            store::write_file(&output, |out| out.write_all(text.as_bytes()))
+                .with_context(|| format!("while writing {}", output.display()))?;
+        }
         Ok(Box::new(Made {
             n_motions: page.samples.len(),
             n_frames: page.samples.first().map_or(0, |sample| sample.frames.nrows()),
             n_beats: page.beats_s.len(),
             has_audio: page.audio.is_some(),
             n_bytes: text.len(),
+            dry_run: params.dry_run,
             output,
         }))
     }
@@ -179,22 +185,36 @@ struct Made {
     n_beats: usize,
     has_audio: bool,
     n_bytes: usize,
+    dry_run: bool,
     output: PathBuf,
 }
 
 impl Summary for Made {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        let Self { n_motions, n_frames, n_beats, has_audio, n_bytes, output } = self;
+        let Self { n_motions, n_frames, n_beats, has_audio, n_bytes, dry_run, output } = self;
         let counted = |n: usize, one: &str| format!("{n} {one}{}", if n == 1 { "" } else { "s" });
         let (motions, beats) = (counted(*n_motions, "motion"), counted(*n_beats, "beat"));
         let duration_s = frames_to_s(*n_frames);
         let audio = if *has_audio { "with audio" } else { "without audio" };
         let mb = *n_bytes as f64 / 1e6;
         let place = output.display();
-        writeln!(out, "{motions} ({duration_s:.2} s), {beats}, {audio} → {place} ({mb:.2} MB)")
+        let would = if *dry_run { "would write " } else { "" };
+        writeln!(out, "{would}{motions} ({duration_s:.2} s), {beats}, {audio} → {place} ({mb:.2} MB)")
     }
 
     fn n_failed(&self) -> u64 {
         0
+    }
+
+    fn figures(&mut self) -> serde_json::Value {
+        serde_json::json!({
+            "to": self.output,
+            "dry_run": self.dry_run,
+            "n_motions": self.n_motions,
+            "n_frames": self.n_frames,
+            "n_beats": self.n_beats,
+            "has_audio": self.has_audio,
+            "n_bytes": self.n_bytes,
+        })
     }
 }

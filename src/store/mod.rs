@@ -6,6 +6,7 @@
 mod cache;
 mod client;
 mod commit;
+mod currency;
 mod digest;
 mod error;
 mod frames;
@@ -28,7 +29,8 @@ pub mod tables;
 pub use cache::Cache;
 pub use client::ClientOptions;
 pub use commit::{Commit, Committed, Item, Ledger, LivePart, Manifest, Part, Settled, live_parts};
-pub use digest::{digest, digest_of};
+pub use currency::{outdated_features, outdated_generations};
+pub use digest::{digest, digest_of, digest_texts};
 pub use error::StoreError;
 pub use frames::FrameSpool;
 pub use item::ItemTables;

@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use serde::Serialize;
+
 use crate::store::tables::TrainingLogRow;
 use crate::store::{
     Commit, Item, Ledger, Location, Patience, Row as _, StoreError, TimestampUs, digest,
@@ -80,6 +82,10 @@ pub struct Journal<'a> {
     run: String,
     stage: &'static str,
     command: &'static str,
+    /// Digest of the run's configuration.
+    params_hash: String,
+    /// What determines the rows beside configuration and steps.
+    data: String,
     ledger: Ledger,
     first_step: u64,
     rows: Vec<TrainingLogRow>,
@@ -98,7 +104,18 @@ impl<'a> Journal<'a> {
     ) -> Result<Self, StoreError> {
         let ledger = Ledger::read(store, command)?;
         let run = run.to_owned();
-        Ok(Self { store, run, stage, command, ledger, first_step: 0, rows: Vec::new() })
+        let (params_hash, data) = (String::new(), String::new());
+        let (first_step, rows) = (0, Vec::new());
+        Ok(Self { store, run, stage, command, params_hash, data, ledger, first_step, rows })
+    }
+
+    /// Says what determines the rows beside their steps: the configuration, the digest of the data, and the steps in
+    /// all, on which learning rates depend.
+    pub fn determined_by(&mut self, config: &impl Serialize, data: &str, n_steps: u64) {
+        let config =
+            serde_json::to_vec(config).expect("invariant: numbers and texts become JSON");
+        self.params_hash = digest(&config);
+        self.data = format!("{data} in {n_steps} steps");
     }
 
     /// Begins a stretch after `step` steps.
@@ -173,11 +190,12 @@ impl<'a> Journal<'a> {
             .collect();
         let id = self.name(self.first_step);
         patience.wait_out(notice, || {
-            let mut commit = Commit::new(self.store, self.command, "", &self.run);
+            let mut commit = Commit::new(self.store, self.command, &self.params_hash, &self.run);
             let schema = TrainingLogRow::schema;
             commit.part(schema().name, schema)?.write_rows(&self.rows)?;
-            // The same steps of the same run have the same losses, whoever takes them.
-            let input_hash = digest(format!("{id} to {step}").as_bytes());
+            // The same steps of the same run have the same losses, whoever takes them: a run is a name, and what it
+            // learns from and how.
+            let input_hash = digest(format!("{id} to {step} of {}", self.data).as_bytes());
             let fingerprint = input_hash.clone();
             let item = Item { id: id.clone(), fingerprint, input_hash, failure: None };
             commit.settle(item, &self.ledger);

@@ -24,7 +24,9 @@ use crate::stages::generate::MotionSettings;
 use crate::stages::learned;
 use crate::stages::motion_source::generated_frames;
 use crate::store::tables::{self, GenerationRow};
-use crate::store::{Location, Snapshot, StoreError, digest};
+use crate::store::{
+    Location, Snapshot, StoreError, digest, outdated_features, outdated_generations,
+};
 use crate::units::frames_to_s;
 
 /// Songs whose activity is read; that of others counts as its mean.
@@ -72,6 +74,7 @@ impl Evaluand {
     fn of_run(store: &Location, run: &str, most: Option<usize>) -> anyhow::Result<Self> {
         let generations = motions::of_run(store, run, most)?;
         let phrases = Phrases::read(store, generations.iter().map(|row| row.phrase_id.as_str()))?;
+        refuse_outdated(store, run, &phrases, &generations)?;
         let (splits, notes) = splits_of(store, &phrases, &generations)?;
         let motions = generations
             .iter()
@@ -304,11 +307,18 @@ impl Evaluand {
     }
 
     /// Reads the activity of the songs that were danced to, and of those with held-out real motion.
-    fn hear(&mut self, store: &Location, truth: &Truth) -> Result<(), StoreError> {
+    fn hear(&mut self, store: &Location, truth: &Truth) -> anyhow::Result<()> {
         let held_out = truth.phrases.iter().filter(|phrase| is_held_out(phrase.split));
         let ids = self.motions.iter().map(|motion| motion.phrase_id.as_str());
         let songs = self.phrases.songs_of(ids.chain(held_out.map(|phrase| phrase.id.as_str())));
         let songs: BTreeSet<String> = songs.into_iter().take(MAX_HEARD_SONGS).collect();
+        let rows = songs.iter().filter_map(|id| self.phrases.row(id));
+        if let Some(first) = outdated_features(store, rows)?.first() {
+            bail!(
+                "phrase {first}: its features are of a file that was replaced since; run motiongen extract \
+                 --store {store} first"
+            );
+        }
         let mut heard: Vec<(String, Array2<f32>)> = Vec::new();
         Snapshot::take(store, tables::features())?.visit_items(&songs, |id, features| {
             heard.push((id.to_owned(), features));
@@ -380,6 +390,26 @@ impl Evaluand {
             .map(|(is, decoded)| Evaluated { is, decoded })
             .collect())
     }
+}
+
+/// Refuses motions that were made for other music than their phrases have now.
+fn refuse_outdated(
+    store: &Location,
+    run: &str,
+    phrases: &Phrases,
+    generations: &[GenerationRow],
+) -> anyhow::Result<()> {
+    let content_of = |id: &str| phrases.row(id).map(|row| row.content_hash.as_str());
+    let outdated = outdated_generations(store, generations, content_of)?;
+    if let Some(first) = outdated.first() {
+        bail!(
+            "store {store}: {} of {} motions of run \"{run}\" were made for files that were replaced since; run \
+             motiongen extract and generate again. The first: {first}",
+            outdated.len(),
+            generations.len()
+        );
+    }
+    Ok(())
 }
 
 /// Notes on single files that are told; the table of failures has all that were refused.

@@ -85,7 +85,14 @@ pub fn run(job: &Job<'_>, audio: &[PathBuf], output: &Path) -> anyhow::Result<Do
     let mut queue = tasks.into_iter();
     pool::run(
         job.n_workers,
-        || queue.next(),
+        || {
+            let task = queue.next()?;
+            if job.progress.is_interrupted() {
+                lock(&done).is_stopped = true;
+                return None;
+            }
+            Some(task)
+        },
         |task| -> anyhow::Result<()> {
             let outcome = {
                 let _share = budget.take(needed_bytes(task.duration_s, task.size_bytes));
@@ -110,7 +117,8 @@ pub fn run(job: &Job<'_>, audio: &[PathBuf], output: &Path) -> anyhow::Result<Do
         },
     )?;
     job.progress.finish();
-    if let Some(table) = table {
+    // A table is written whole or not at all.
+    if let Some(table) = table.filter(|_| !lock(&done).is_stopped) {
         table.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner).finish()?;
     }
     Ok(done.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner))

@@ -103,7 +103,9 @@ pub fn run(job: &Job<'_>, target: &Target<'_>) -> anyhow::Result<Done> {
     let writer = Writer { target, ledger: &ledger };
     let done = Mutex::new(done);
     work_off(job, target, tasks, &writer, &done)?;
-    writer.forget_failures(&names)?;
+    if !lock(&done).is_stopped {
+        writer.forget_failures(&names)?;
+    }
     job.progress.finish();
     Ok(done.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner))
 }
@@ -199,10 +201,18 @@ fn work_off(
     let batches = Mutex::new(batches);
     let budget = Budget::new(job.memory_bytes);
     let mut inputs = Inputs::open(&tasks, &target.options);
-    let mut queue = tasks.into_iter();
+    let mut queue = tasks.into_iter().peekable();
+    let mut under_way = None;
     pool::run(
         job.n_workers,
         || {
+            // Who asks for an end gets the batch that is under way, whole.
+            let batch = Some(queue.peek()?.batch);
+            if batch != under_way && job.progress.is_interrupted() {
+                lock(done).is_stopped = true;
+                return None;
+            }
+            under_way = batch;
             let task = queue.next()?;
             let input = inputs.next(&task);
             Some((task, input))
@@ -401,6 +411,7 @@ fn extraction_row(id: &str, task: &Task, extracted: &Extracted) -> ExtractionRow
         audio_codec: heard.map(|h| h.encoding.codec.to_owned()),
         sample_rate_hz: heard.map(|h| h.encoding.sample_rate_hz as i32),
         n_channels: heard.map(|h| i32::from(h.encoding.n_channels)),
+        content_hash: Some(task.row.content_hash.clone()),
     }
 }
 

@@ -5,6 +5,7 @@ mod files;
 mod maker;
 mod outputs;
 mod params;
+mod receipt;
 mod settings;
 mod tracks;
 
@@ -16,8 +17,8 @@ use std::time::Instant;
 
 use anyhow::bail;
 
-use super::failure::{Failure, N_SHOWN, write_failures};
-use super::model_files::{OpenModel, sha256};
+use super::failure::{Failure, N_SHOWN, failures_json, write_failures};
+use super::model_files::{EngineChoice, EngineParams, OpenModel, is_model_name, sha256};
 use super::retrieval::Primer;
 use super::{Contract, Progress, Stage, Summary};
 use crate::diffusion::Schedule;
@@ -47,6 +48,10 @@ impl Stage for Generate {
     };
     type Params = Params;
 
+    fn claims_stdout(params: &Params) -> Option<&'static str> {
+        (params.stream.as_deref() == Some("-")).then_some("--stream")
+    }
+
     fn run(params: Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
         let started = Instant::now();
         let store = match &params.store {
@@ -68,12 +73,19 @@ impl Stage for Generate {
                 Some(primer)
             }
         };
-        let run = params.run.clone().unwrap_or_else(|| model.card.name.clone());
+        let name = name_of_model(&params, &model.card);
+        let run = params.run.clone().unwrap_or_else(|| name.clone());
         super::train::session::check_run_name(&run)?;
         // A single track is fastest with all threads in one worker; many keep a worker each busy.
         let is_single = params.audio.len() == 1 || params.phrase.len() == 1;
         let n_workers = if is_single { NonZeroUsize::MIN } else { params.engine.threads };
-        let (engine, note): (Box<dyn Engine>, _) = model.engine(&params.engine, n_workers)?;
+        let engine_params = if params.dry_run {
+            // The one engine that keeps no prepared copy of a model.
+            EngineParams { engine: EngineChoice::Eager, ..params.engine.clone() }
+        } else {
+            params.engine.clone()
+        };
+        let (engine, note): (Box<dyn Engine>, _) = model.engine(&engine_params, n_workers)?;
         if let Some(note) = note {
             progress.note(&note);
         }
@@ -94,6 +106,7 @@ impl Stage for Generate {
                 overlap_frames: settings.overlap_frames,
             },
             card,
+            model: &name,
             weights: &weights,
             run: &run,
             settings: &settings,
@@ -132,16 +145,19 @@ impl Stage for Generate {
             (None, None) => bail!("nothing to do: give --store, or --audio with --output"),
         };
         let took_s = started.elapsed().as_secs_f64();
+        let by_card = match name == card.name {
+            true => String::new(),
+            false => format!(" (its card calls it {})", card.name),
+        };
         let made_with = format!(
-            "model {}, {} ({}), {} in {} steps, guidance {}",
-            card.name,
+            "model {name}{by_card}, {} ({}), {} in {} steps, guidance {}",
             engine.name(),
             engine.n_workers(),
             settings.sampler.sampler.name(),
             settings.sampler.n_steps,
             settings.guidance
         );
-        Ok(Box::new(Report { place, done, made_with, dry_run: params.dry_run, took_s }))
+        Ok(Box::new(Report { place, done, model: name, made_with, dry_run: params.dry_run, took_s }))
     }
 }
 
@@ -160,6 +176,19 @@ fn open_model(params: &Params, store: Option<&Location>) -> anyhow::Result<OpenM
             model
         ),
     }
+}
+
+/// Returns what a model is called: as the user typed it, whatever its card says; a folder by its own name.
+fn name_of_model(params: &Params, card: &ModelCard) -> String {
+    let Some(typed) = &params.model else { return card.name.clone() };
+    let folder = Path::new(typed);
+    if !folder.join(file_names::CARD).is_file() {
+        return typed.clone();
+    }
+    let absolute = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
+    let name = absolute.file_name().map(|name| name.to_string_lossy().into_owned());
+    // A folder may be called what no model can be.
+    name.filter(|name| is_model_name(name)).unwrap_or_else(|| card.name.clone())
 }
 
 /// Returns one digest for both networks of a model.
@@ -224,6 +253,7 @@ enum Place {
 struct Report {
     place: Place,
     done: Done,
+    model: String,
     made_with: String,
     dry_run: bool,
     took_s: f64,
@@ -286,10 +316,10 @@ impl Summary for Report {
             Place::Folder(_) => None,
         };
         write_failures(out, done.failed.iter().map(|(name, why)| (name, why)), url)?;
+        if done.is_interrupted {
+            writeln!(out, "  stopped as asked; the same command goes on with what is missing")?;
+        }
         if let Place::Store { store, run } = place {
-            if done.is_interrupted {
-                writeln!(out, "  stopped as asked; the same command goes on with what is missing")?;
-            }
             writeln!(
                 out,
                 "  motiongen query --store {store} \"select phrase_id, score, real_time_factor from \
@@ -301,5 +331,36 @@ impl Summary for Report {
 
     fn n_failed(&self) -> u64 {
         self.done.failed.len() as u64
+    }
+
+    fn is_stopped(&self) -> bool {
+        self.done.is_interrupted
+    }
+
+    fn figures(&mut self) -> serde_json::Value {
+        let Self { place, done, .. } = self;
+        let (to, run) = match place {
+            Place::Store { store, run } => (store.clone(), Some(run.clone())),
+            Place::Folder(folder) => (folder.display().to_string(), None),
+        };
+        let files: Vec<String> =
+            done.told.iter().flat_map(|(_, files)| files).map(|f| f.display().to_string()).collect();
+        serde_json::json!({
+            "to": to,
+            "run": run,
+            "model": self.model,
+            "dry_run": self.dry_run,
+            "n_todo": done.n_todo,
+            "todo_s": done.todo_s,
+            "n_done": done.n_made,
+            "n_unchanged": done.n_unchanged,
+            "n_frames": done.n_frames,
+            "duration_s": done.made_s,
+            "n_candidates": done.n_candidates,
+            "n_checks_failed": done.n_checks_failed,
+            "files": files,
+            "failures": failures_json(done.failed.iter().map(|(name, why)| (name, why))),
+            "took_s": self.took_s,
+        })
     }
 }

@@ -21,7 +21,7 @@ use crate::stages::{Progress, Stage as _};
 use crate::store::tables::{self, ExtractionRow, FailureRow, GenerationRow, PhraseRow};
 use crate::store::{
     Commit, Item, Label, Ledger, Location, Row as _, Shard, Snapshot, StoreError, TimestampUs,
-    batch_of, digest,
+    batch_of, digest, outdated_features,
 };
 use crate::units::frames_to_s;
 
@@ -53,6 +53,8 @@ struct Task {
     row: PhraseRow,
     n_frames: usize,
     beats: PhraseBeats,
+    /// Whether its features are of other content than it has now.
+    has_old_features: bool,
     /// Samples that are missing.
     samples: Vec<usize>,
 }
@@ -94,11 +96,11 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
     for task in tasks {
         batches.entry(task.batch).or_default().push(task);
     }
-    for tasks in batches.into_values() {
+    while let Some((_, tasks)) = batches.pop_first() {
         let outcomes = make_batch(maker, target, &tasks, progress)?;
         done.add(&outcomes);
         commit(maker, target, &ledger, &tasks, outcomes)?;
-        if progress.is_interrupted() {
+        if progress.is_interrupted() && !batches.is_empty() {
             done.is_interrupted = true;
             break;
         }
@@ -127,6 +129,7 @@ fn plan(
     let extractions: Vec<ExtractionRow> = Snapshot::take(store, ExtractionRow::schema())?.rows()?;
     let extracted: HashMap<&str, i64> =
         extractions.iter().map(|row| (row.phrase_id.as_str(), row.n_frames)).collect();
+    let outdated = outdated_features(store, &rows)?;
     let is_wanted = |row: &PhraseRow| {
         let of_kind = match target.tracks {
             Tracks::All => true,
@@ -147,7 +150,8 @@ fn plan(
         .filter(|row| is_wanted(row))
         .map(|row| {
             let (n_frames, beats) = (n_frames(&row), PhraseBeats::default());
-            Task { batch: 0, n_frames, row, beats, samples: Vec::new() }
+            let has_old_features = outdated.contains(&row.phrase_id);
+            Task { batch: 0, n_frames, row, beats, has_old_features, samples: Vec::new() }
         })
         .collect();
     let total_s: f64 =
@@ -211,9 +215,11 @@ fn make_batch(
         |(task, sample): (&Task, usize)| -> anyhow::Result<()> {
             let id = &task.row.phrase_id;
             let outcome = match music.get(id) {
+                Some(_) if task.has_old_features => Err(with_old_features(&task.row, target.store)),
                 Some(features) => {
                     let music = Music {
                         phrase_id: id,
+                        content_hash: &task.row.content_hash,
                         source: url_of(&task.row),
                         features: features.view(),
                         beats: task.beats.in_bars(&task.row),
@@ -250,6 +256,16 @@ fn without_features(row: &PhraseRow, store: &Location, unknown: Option<&str>) ->
         format!("phrase {id}: has no audio and no features, so that there is nothing to dance to")
     };
     Failure::new(FailureKind::NoMusic, url_of(row), message)
+}
+
+/// Returns why the features of a phrase are not danced to: its files were replaced since.
+fn with_old_features(row: &PhraseRow, store: &Location) -> Failure {
+    let id = &row.phrase_id;
+    let message = format!(
+        "phrase {id}: its features are of files that were replaced since; run motiongen extract --store {store} \
+         first"
+    );
+    Failure::new(FailureKind::StaleFeatures, url_of(row), message)
 }
 
 /// Writes a batch: its motions, what is known of them, and what failed.

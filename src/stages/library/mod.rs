@@ -18,6 +18,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use super::failure::{Failure, FailureKind};
+use super::seen::Seen;
 use super::{ClientParams, Contract, Progress, Stage, Summary, all_threads};
 use crate::store::{Ledger, Location, StoreError, digest};
 use captures::Captures;
@@ -30,6 +31,8 @@ use split::Share;
 
 /// Raised when library writes something else for the same inputs and parameters.
 const OUTPUT_VERSION: u32 = 2;
+/// The name under which songs are committed that were seen again with nothing new.
+const SEEN: &str = "library-seen";
 /// Where items come from that the store itself has, as commits name it.
 const FROM_STORE: &str = "phrases";
 
@@ -124,6 +127,7 @@ impl Stage for Library {
         let store = Location::open(&params.store, &options)?;
         let mut known = Known::read(&store)?;
         let ledger = Ledger::read(&store, Self::NAME)?;
+        let seen = Seen::read(&store, SEEN)?;
         let captures = match &params.captures {
             Some(url) => Captures::of_folder(url, &options)?,
             None => Captures::of_store(&store, &known),
@@ -144,7 +148,7 @@ impl Stage for Library {
             songs.songs.extend(made::tunes(url, &options, params.rules.seed, &band)?);
         }
         prepare(&mut songs, &params)?;
-        let job = Job { store: &store, ledger, known, band, params: &params, progress };
+        let job = Job { store: &store, ledger, seen, known, band, params: &params, progress };
         let mut report = Report {
             place: Place { store: store.to_string(), output: params.output.clone() },
             dry_run: params.dry_run,

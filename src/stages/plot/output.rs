@@ -30,38 +30,52 @@ pub fn format_of(output: &Path) -> anyhow::Result<Format> {
     })
 }
 
-/// Writes the picture, whole or not at all.
+/// Writes a picture of `what`, whole or not at all; in a dry run not at all.
 ///
 /// # Errors
 /// What the file system says.
-pub fn write_picture(output: &Path, picture: &Picture) -> anyhow::Result<()> {
-    store::write_file(output, |out| out.write_all(&picture.bytes))
-        .with_context(|| format!("while writing {}", output.display()))
+pub fn write_picture(
+    what: String,
+    output: &Path,
+    picture: &Picture,
+    dry_run: bool,
+) -> anyhow::Result<Box<dyn Summary>> {
+    if !dry_run {
+        store::write_file(output, |out| out.write_all(&picture.bytes))
+            .with_context(|| format!("while writing {}", output.display()))?;
+    }
+    let (width_px, height_px) = (picture.width_px, picture.height_px);
+    Ok(Box::new(Drawn { what, output: output.to_owned(), width_px, height_px, dry_run }))
 }
 
 /// What was drawn.
-pub struct Drawn {
+struct Drawn {
     what: String,
     output: PathBuf,
     width_px: u32,
     height_px: u32,
-}
-
-impl Drawn {
-    /// Returns the account of a picture of `what`.
-    pub fn new(what: String, output: &Path, picture: &Picture) -> Self {
-        let (width_px, height_px) = (picture.width_px, picture.height_px);
-        Self { what, output: output.to_owned(), width_px, height_px }
-    }
+    dry_run: bool,
 }
 
 impl Summary for Drawn {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        let Drawn { what, output, width_px, height_px } = self;
-        writeln!(out, "{what} → {} ({width_px} × {height_px} px)", output.display())
+        let Drawn { what, output, width_px, height_px, dry_run } = self;
+        let would = if *dry_run { "would draw " } else { "" };
+        writeln!(out, "{would}{what} → {} ({width_px} × {height_px} px)", output.display())
     }
 
     fn n_failed(&self) -> u64 {
         0
+    }
+
+    fn figures(&mut self) -> serde_json::Value {
+        let Drawn { what, output, width_px, height_px, dry_run } = self;
+        serde_json::json!({
+            "to": output,
+            "dry_run": dry_run,
+            "drawn": what,
+            "width_px": width_px,
+            "height_px": height_px,
+        })
     }
 }
