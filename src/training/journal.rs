@@ -112,8 +112,7 @@ impl<'a> Journal<'a> {
     /// Says what determines the rows beside their steps: the configuration, the digest of the data, and the steps in
     /// all, on which learning rates depend.
     pub fn determined_by(&mut self, config: &impl Serialize, data: &str, n_steps: u64) {
-        let config =
-            serde_json::to_vec(config).expect("invariant: numbers and texts become JSON");
+        let config = serde_json::to_vec(config).expect("invariant: numbers and texts become JSON");
         self.params_hash = digest(&config);
         self.data = format!("{data} in {n_steps} steps");
     }

@@ -264,7 +264,10 @@ impl Summary for DryRun {
         let Self { store, run, n_motions, n_refused, length_s, is_up_to_date } = self;
         writeln!(out, "evaluate {run} → {store}")?;
         let what = if *is_up_to_date { "nothing to do for" } else { "would evaluate" };
-        writeln!(out, "  {what} {n_motions} motions ({length_s:.1} s), {n_refused} files hold no motion")
+        writeln!(
+            out,
+            "  {what} {n_motions} motions ({length_s:.1} s), {n_refused} files hold no motion"
+        )
     }
 
     fn n_failed(&self) -> u64 {

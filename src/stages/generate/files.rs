@@ -73,8 +73,7 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
             let name =
                 if target.n_samples == 1 { stem.clone() } else { format!("{stem}.{sample}") };
             // A song that cannot be read fails when it is its turn.
-            let receipt =
-                Receipt::new(maker, &stem, song.as_deref().unwrap_or_default(), sample);
+            let receipt = Receipt::new(maker, &stem, song.as_deref().unwrap_or_default(), sample);
             let is_kept =
                 || song.is_some() && receipt.is_kept(target.folder, &name, target.formats);
             if !target.force && !std::mem::take(&mut is_streamed) && is_kept() {

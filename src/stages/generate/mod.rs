@@ -157,7 +157,14 @@ impl Stage for Generate {
             settings.sampler.n_steps,
             settings.guidance
         );
-        Ok(Box::new(Report { place, done, model: name, made_with, dry_run: params.dry_run, took_s }))
+        Ok(Box::new(Report {
+            place,
+            done,
+            model: name,
+            made_with,
+            dry_run: params.dry_run,
+            took_s,
+        }))
     }
 }
 
@@ -343,8 +350,12 @@ impl Summary for Report {
             Place::Store { store, run } => (store.clone(), Some(run.clone())),
             Place::Folder(folder) => (folder.display().to_string(), None),
         };
-        let files: Vec<String> =
-            done.told.iter().flat_map(|(_, files)| files).map(|f| f.display().to_string()).collect();
+        let files: Vec<String> = done
+            .told
+            .iter()
+            .flat_map(|(_, files)| files)
+            .map(|f| f.display().to_string())
+            .collect();
         serde_json::json!({
             "to": to,
             "run": run,

@@ -57,7 +57,13 @@ impl Job<'_> {
             !force
                 && output.is_none()
                 && (compose_audio.is_none() || !song.is_made())
-                && is_settled(song, (&self.ledger, &self.seen), (&songs.origin, &params_hash), rules, &print)
+                && is_settled(
+                    song,
+                    (&self.ledger, &self.seen),
+                    (&songs.origin, &params_hash),
+                    rules,
+                    &print,
+                )
         };
         let (sound, problems): (Vec<Song>, Vec<Song>) =
             songs.songs.iter().cloned().partition(|song| song.problem.is_none());

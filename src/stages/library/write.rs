@@ -10,8 +10,8 @@ use super::{Library, Rules};
 use crate::motion::choreography::Repertoire;
 use crate::stages::Stage as _;
 use crate::stages::failure::{Failure, FailureKind};
-use crate::store::tables::{self, BeatRow, FailureRow, PhraseRow};
 use crate::stages::seen::Seen;
+use crate::store::tables::{self, BeatRow, FailureRow, PhraseRow};
 use crate::store::{
     Commit, Item, Ledger, Location, Row as _, Settled, StoreError, TimestampUs, digest,
 };

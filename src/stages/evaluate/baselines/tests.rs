@@ -151,6 +151,7 @@ fn row(settings: Option<String>) -> GenerationRow {
         generate_s: 0.0,
         real_time_factor: 0.0,
         settings,
+        content_hash: None,
         time: TimestampUs(0),
     }
 }
