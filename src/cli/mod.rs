@@ -158,8 +158,11 @@ const VERSION: &str = env!("CARGO_PKG_VERSION");
 /// Returns a stage's command: its parameters and the flags that every stage has.
 fn command<S: Stage>() -> Command {
     use clap::Args as _;
-    let contract =
-        format!("Reads: {}\nWrites: {}\n\n{AFTER}\n{EXIT_CODES}", S::CONTRACT.reads, S::CONTRACT.writes);
+    let contract = format!(
+        "Reads: {}\nWrites: {}\n\n{AFTER}\n{EXIT_CODES}",
+        S::CONTRACT.reads,
+        S::CONTRACT.writes
+    );
     // The parameters' own doc comment would become the text about the stage, so that comes after.
     let mut command = S::Params::augment_args(Command::new(S::NAME))
         .about(S::ABOUT)
@@ -178,16 +181,16 @@ fn command<S: Stage>() -> Command {
 
 /// Returns the flags that every stage has, and that may stand before its name.
 fn general(config_help: String) -> [Arg; 4] {
-    let arg = |name: &'static str| {
-        Arg::new(name).long(name).help_heading("General").global(true)
-    };
+    let arg = |name: &'static str| Arg::new(name).long(name).help_heading("General").global(true);
     [
         arg(config::FLAG).value_name("FILE").help(config_help),
         arg(exit::FLAG)
             .value_name("FORM")
             .value_parser(EnumValueParser::<Form>::new())
             .default_value("text")
-            .help("What is told at the end, on standard output: text for people, or one JSON object"),
+            .help(
+                "What is told at the end, on standard output: text for people, or one JSON object",
+            ),
         arg(log::VERBOSE)
             .short('v')
             .action(ArgAction::Count)

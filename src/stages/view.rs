@@ -199,7 +199,10 @@ impl Summary for Made {
         let mb = *n_bytes as f64 / 1e6;
         let place = output.display();
         let would = if *dry_run { "would write " } else { "" };
-        writeln!(out, "{would}{motions} ({duration_s:.2} s), {beats}, {audio} → {place} ({mb:.2} MB)")
+        writeln!(
+            out,
+            "{would}{motions} ({duration_s:.2} s), {beats}, {audio} → {place} ({mb:.2} MB)"
+        )
     }
 
     fn n_failed(&self) -> u64 {

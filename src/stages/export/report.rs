@@ -95,9 +95,10 @@ impl Summary for Report {
 
 /// Returns what is told of a model in either case.
 fn of_card(card: &ModelCard, place: &str) -> serde_json::Value {
-    let files = card.files.iter().map(|file| {
-        json!({ "name": file.name, "n_bytes": file.n_bytes, "sha256": file.sha256 })
-    });
+    let files = card
+        .files
+        .iter()
+        .map(|file| json!({ "name": file.name, "n_bytes": file.n_bytes, "sha256": file.sha256 }));
     json!({
         "model": card.name,
         "to": place,

@@ -135,9 +135,10 @@ impl Summary for Account {
                 "loss_of_untrained_network": baselines.as_ref().map(|known| known.untrained),
             })
         });
-        let left_out = self.left_out.iter().take(N_SHOWN).map(|one| {
-            json!({ "item": one.phrase_id, "kind": one.kind, "message": one.message })
-        });
+        let left_out =
+            self.left_out.iter().take(N_SHOWN).map(
+                |one| json!({ "item": one.phrase_id, "kind": one.kind, "message": one.message }),
+            );
         json!({
             "run": self.run,
             "store": self.store,
@@ -151,11 +152,7 @@ impl Summary for Account {
 /// Says how far a loss is below another, or above it.
 fn beside(loss: f64, other: f64) -> String {
     let percent = 100.0 * (1.0 - loss / other);
-    if percent < 0.0 {
-        format!("{:.0} % above", -percent)
-    } else {
-        format!("{percent:.0} % below")
-    }
+    if percent < 0.0 { format!("{:.0} % above", -percent) } else { format!("{percent:.0} % below") }
 }
 
 /// What would be done.
