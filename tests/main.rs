@@ -14,6 +14,7 @@ mod ingest_bad_input;
 mod ingest_kill;
 mod ingest_local;
 mod ingest_remote;
+mod jobs;
 mod library;
 mod motion_capture;
 mod notebooks;
