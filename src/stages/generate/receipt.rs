@@ -98,9 +98,12 @@ fn file(folder: &Path, name: &str, format: Format) -> PathBuf {
     folder.join(format!("{name}.{}", format.extension()))
 }
 
-/// Returns the digest of a song: of its audio file, and of the beat list beside it; none of a file that cannot be
-/// read.
+/// Returns the digest of a song: of its audio file, and of the beat list beside it; none of what cannot be read, or
+/// only once, as a pipe.
 pub fn digest_of_song(audio: &Path, beat_list: &Path) -> Option<String> {
+    if !std::fs::metadata(audio).ok()?.is_file() {
+        return None;
+    }
     let song = digest_of_file(audio).ok()?;
     match digest_of_file(beat_list) {
         Ok(beats) => Some(digest_texts([song.as_str(), &beats])),
