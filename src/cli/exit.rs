@@ -178,10 +178,8 @@ mod tests {
 
     #[test]
     fn an_outcome_has_its_code_and_its_name() {
-        let told = |code| outcome_of("ingest", code, 3).to_string();
-        let expected = |code: u8, name: &str| {
-            format!(r#"{{"exit_code":{code},"n_failed":3,"outcome":"{name}","stage":"ingest"}}"#)
-        };
+        let told = |code| outcome_of("ingest", code, 3);
+        let expected = |code: u8, name: &str| json!({ "stage": "ingest", "outcome": name, "exit_code": code, "n_failed": 3 });
         assert_eq!(told(0), expected(0, "done"));
         assert_eq!(told(SOME_FAILED), expected(1, "items_failed"));
         assert_eq!(told(COULD_NOT_RUN), expected(2, "could_not_run"));

@@ -44,15 +44,14 @@ impl Summary for Report {
         if done.n_todo == 0 {
             writeln!(out, "  nothing to do: {} motions are up to date", done.n_unchanged)?;
         } else {
+            let share = match done.made_s > 0.0 {
+                true => format!(", {:.2} of the music's length", *took_s / done.made_s),
+                false => String::new(),
+            };
             writeln!(
                 out,
-                "  {} motions made ({:.1} s, {} frames), {} up to date, {n_failed} failed; {took_s:.1} s, {:.2} \
-                 of the music's length",
-                done.n_made,
-                done.made_s,
-                done.n_frames,
-                done.n_unchanged,
-                *took_s / done.made_s.max(f64::MIN_POSITIVE)
+                "  {} motions made ({:.1} s, {} frames), {} up to date, {n_failed} failed; {took_s:.1} s{share}",
+                done.n_made, done.made_s, done.n_frames, done.n_unchanged,
             )?;
         }
         if done.n_candidates > done.n_made {
