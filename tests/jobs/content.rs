@@ -13,9 +13,17 @@ use crate::support::files::{coherent, npz, wav};
 use crate::support::{Dir, failures, finish, ingest, motiongen, phrases, rows, tree};
 use crate::train::{features, train};
 
+/// Returns the usual flags that are not given otherwise, and those that are.
+fn unless_given<'a>(usual: &[&'a str], more: &[&'a str]) -> Vec<&'a str> {
+    let flag = |argument: &'a str| argument.split('=').next().unwrap_or_default();
+    let given: Vec<&str> = more.iter().map(|argument| flag(argument)).collect();
+    let kept = usual.iter().filter(|argument| !given.contains(&flag(argument)));
+    kept.chain(more).copied().collect()
+}
+
 fn generate(store: &Path, more: &[&str]) -> Command {
     let usual = ["--engine=eager", "--steps=3", "--overlap=7", "--quiet"];
-    stage("generate", store, &[&usual[..], more].concat())
+    stage("generate", store, &unless_given(&usual, more))
 }
 
 fn generations(store: &Path) -> Vec<GenerationRow> {
@@ -172,8 +180,8 @@ fn a_motion_in_a_folder_is_known_by_model_settings_and_song() {
     let dance = |song: &Path, more: &[&str]| {
         let mut command = motiongen();
         command.args(["generate", "--model", &model, "--quiet", "--engine=eager", "--overlap=7"]);
-        command.args(["--steps=3", "--format=npy", "--output"]).arg(&out).arg("--audio").arg(song);
-        succeed(command.args(more)).stdout
+        command.args(unless_given(&["--steps=3", "--format=npy"], more));
+        succeed(command.arg("--output").arg(&out).arg("--audio").arg(song)).stdout
     };
     let motion = || std::fs::read(out.join("song.npy")).expect("a motion");
     let is_kept = |said: &str| said.contains("  nothing to do: 1 motions are up to date");

@@ -92,8 +92,6 @@ fn a_stage_that_waits_for_a_file_is_stopped_at_once() {
         command.arg(&pipe);
         let child = start(command);
         wait_until("the listener", || {
-            let listed = std::fs::read_to_string(format!("/proc/{}/task", child.id()));
-            drop(listed);
             let tasks = std::fs::read_dir(format!("/proc/{}/task", child.id()));
             tasks.is_ok_and(|tasks| {
                 tasks.flatten().any(|task| {
@@ -110,10 +108,14 @@ fn a_stage_that_waits_for_a_file_is_stopped_at_once() {
     }
 }
 
+/// Of Linux.
+const O_NONBLOCK: i32 = 0o4000;
+
 /// The second signal does not wait for what is under way.
 #[cfg(unix)]
 #[test]
 fn the_second_signal_ends_a_stage_at_once() {
+    use std::os::unix::fs::OpenOptionsExt as _;
     let dir = Dir::new();
     dir.write("s/a.wav", wav(0.4));
     let store = dir.at("store");
@@ -124,8 +126,18 @@ fn the_second_signal_ends_a_stage_at_once() {
     assert!(std::process::Command::new("mkfifo").arg(&pipe).status().expect("mkfifo").success());
     for (name, expected) in [("TERM", 143), ("INT", 130)] {
         let mut child = start(stage("extract", &store, &["--workers=1"]));
-        // The stage has asked whether it may go on, and waits for the file.
-        std::thread::sleep(std::time::Duration::from_millis(700));
+        // A pipe can be opened for writing once somebody reads it; then the stage waits for what is never written.
+        let mut open = std::fs::OpenOptions::new();
+        open.write(true).custom_flags(O_NONBLOCK);
+        let mut writer = open.open(&pipe);
+        wait_until("a reader", || {
+            assert!(child.try_wait().expect("a status").is_none(), "it ended too soon");
+            if writer.is_err() {
+                writer = open.open(&pipe);
+            }
+            writer.is_ok()
+        });
+        std::thread::sleep(std::time::Duration::from_millis(300));
         signal(name, child.id());
         std::thread::sleep(std::time::Duration::from_millis(200));
         assert!(child.try_wait().expect("a status").is_none(), "the first signal is heeded");

@@ -312,7 +312,11 @@ impl Evaluand {
         let ids = self.motions.iter().map(|motion| motion.phrase_id.as_str());
         let songs = self.phrases.songs_of(ids.chain(held_out.map(|phrase| phrase.id.as_str())));
         let songs: BTreeSet<String> = songs.into_iter().take(MAX_HEARD_SONGS).collect();
-        let rows = songs.iter().filter_map(|id| self.phrases.row(id));
+        let motions = self.motions.iter().map(|motion| motion.phrase_id.as_str());
+        let real = truth.phrases.iter().map(|phrase| phrase.id.as_str());
+        let used: BTreeSet<&str> =
+            motions.chain(real).chain(songs.iter().map(String::as_str)).collect();
+        let rows = used.into_iter().filter_map(|id| self.phrases.row(id));
         if let Some(first) = outdated_features(store, rows)?.first() {
             bail!(
                 "phrase {first}: its features are of a file that was replaced since; run motiongen extract \

@@ -94,7 +94,8 @@ pub fn run(job: &Job<'_>, target: &Target<'_>) -> anyhow::Result<Done> {
     tasks.retain(|task| target.force || !is_settled(task, &ledger, target.params_hash));
     done.n_unchanged = (n_mine - tasks.len()) as u64;
     done.n_todo = tasks.len() as u64;
-    done.todo_s = tasks.iter().map(|task| task.row.duration_s).sum();
+    // An empty sum of f64 is -0.
+    done.todo_s = tasks.iter().fold(0.0, |sum, task| sum + task.row.duration_s);
     if job.dry_run {
         return Ok(done);
     }

@@ -175,9 +175,12 @@ fn prepare(songs: &mut Songs, params: &Params) -> anyhow::Result<()> {
             song.problem = Some(one::too_short(song, *n_frames, length));
         }
     }
-    // A song that cannot be danced to takes no place in a split.
+    // A song that cannot be danced to takes no place in a split, unless it only waits for its features.
+    let takes_place = |song: &&Song| {
+        song.problem.as_ref().is_none_or(|failure| failure.kind == FailureKind::StaleFeatures)
+    };
     // Music of our own is for training: a verdict rests on real songs.
-    let real = songs.songs.iter().filter(|song| song.problem.is_none() && !song.is_made());
+    let real = songs.songs.iter().filter(takes_place).filter(|song| !song.is_made());
     let names: Vec<String> = real.map(|song| song.id.clone()).collect();
     let of =
         split::assign(names.iter().map(String::as_str), params.validation_songs, params.test_songs)
