@@ -25,6 +25,8 @@ fn add_late_phrase(dir: &Dir, store: &Path) {
 fn a_dry_run_of_any_stage_changes_not_one_byte() {
     let dir = Dir::new();
     let store = modelled(&dir);
+    let done = ["--model=m", "--engine=eager", "--steps=3", "--run=done", "--overlap=7"];
+    succeed(&mut stage("generate", &store, &done));
     add_late_phrase(&dir, &store);
     let at = |path: &str| dir.at(path).display().to_string();
     let song = dir.write("song.wav", wav(1.3)).display().to_string();
@@ -38,7 +40,6 @@ fn a_dry_run_of_any_stage_changes_not_one_byte() {
     let (new, out, stream) = (at("new"), at("out/deep"), at("s.csv"));
     let small = ["--widths=8,12", "--num-heads=2", "--window-frames=24", "--preset=tiny"];
     let generate = ["generate", "--store", &s, "--model=m", "--engine=eager", "--steps=3"];
-    succeed(motiongen().args(generate).args(["--run=done", "--overlap=7"]));
     let files = ["generate", "--model", "m", "--store", &s, "--audio", &song, "--overlap=7"];
     let cases: Vec<Vec<&str>> = vec![
         vec!["ingest", "--source", &new, "--store", &s, "--cache", "CACHE"],

@@ -68,9 +68,10 @@ fn generate_that_is_stopped_ends_with_75() {
     let flags =
         ["--model=m", "--engine=eager", "--steps=2", "--samples=400", "--overlap=7", "--quiet"];
     let mut child = start(stage("generate", &store, &flags));
-    wait_until("a batch", || {
+    // Once the second batch is there, the stage has looked whether an end is asked for.
+    wait_until("two batches", || {
         assert!(child.try_wait().expect("a status").is_none(), "it ended too soon");
-        commits(&store, "generate") > 0
+        commits(&store, "generate") > 1
     });
     signal("TERM", child.id());
     let (code, stdout, _) = end(child);
