@@ -3,7 +3,7 @@
 use std::ffi::OsStr;
 use std::process::ExitCode;
 
-use crate::stages::Summary;
+use crate::stages::{Summary, one_line, redacted};
 
 /// Done, but some items failed; they are in the `failures` table.
 const SOME_FAILED: u8 = 1;
@@ -21,7 +21,12 @@ pub fn report(outcome: anyhow::Result<Box<dyn Summary>>) -> ExitCode {
         }
     };
     if let Err(error) = super::print(summary.as_mut()) {
-        eprintln!("error: could not write to standard output: {error}");
+        // Data are read while they are written.
+        let said = match error.get_ref() {
+            Some(cause) => on_one_line(&cause.to_string()),
+            None => format!("could not write to standard output: {error}"),
+        };
+        eprintln!("error: {said}");
         return ExitCode::from(COULD_NOT_RUN);
     }
     if summary.n_failed() > 0 { ExitCode::from(SOME_FAILED) } else { ExitCode::SUCCESS }
@@ -45,7 +50,7 @@ pub fn usage(error: &clap::Error, configuration: Option<&OsStr>) -> ExitCode {
 fn chain(error: &anyhow::Error) -> String {
     let mut text = String::new();
     for cause in error.chain() {
-        let cause = cause.to_string();
+        let cause = on_one_line(&cause.to_string());
         if text.contains(&cause) {
             continue;
         }
@@ -55,6 +60,12 @@ fn chain(error: &anyhow::Error) -> String {
         text.push_str(&cause);
     }
     text
+}
+
+/// Joins the lines of a message, and takes from it what is secret and what steers a terminal.
+fn on_one_line(message: &str) -> String {
+    let joined = message.lines().map(str::trim).filter(|line| !line.is_empty());
+    one_line(&redacted(&joined.collect::<Vec<_>>().join(" ")))
 }
 
 #[cfg(test)]
@@ -67,5 +78,12 @@ mod tests {
         assert_eq!(chain(&error), "stage: could not write x: disk full");
         let quoted = anyhow::anyhow!("disk full").context("could not write x: disk full");
         assert_eq!(chain(&quoted), "could not write x: disk full");
+    }
+
+    #[test]
+    fn an_error_is_one_line_without_secrets() {
+        let error =
+            anyhow::anyhow!("no s3://KEY:SECRET@b/a?sig=SECRET\n  \u{1b}[2Jhere").context("a");
+        assert_eq!(chain(&error), "a: no s3://…@b/a?… \\u{1b}[2Jhere");
     }
 }

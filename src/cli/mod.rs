@@ -4,6 +4,7 @@
 //! and chooses the exit code.
 
 mod config;
+mod escaped;
 mod exit;
 mod interrupt;
 mod log;
@@ -11,7 +12,8 @@ mod progress;
 mod shell;
 
 use std::ffi::OsString;
-use std::io::Write as _;
+use std::io::{IsTerminal as _, Write};
+use std::path::Path;
 use std::process::ExitCode;
 
 use clap::{Arg, ArgAction, ArgMatches, Command, FromArgMatches as _};
@@ -29,7 +31,8 @@ use crate::stages::plot::Plot;
 use crate::stages::query::Query;
 use crate::stages::train::Train;
 use crate::stages::view::View;
-use crate::stages::{Stage, Summary};
+use crate::stages::{Stage, Summary, is_standard_output, lines};
+use escaped::Escaped;
 use progress::Bars;
 
 /// A stage with its types taken away, for the front door.
@@ -182,8 +185,19 @@ fn run_stage<S: Stage>(matches: &ArgMatches) -> anyhow::Result<Box<dyn Summary>>
     let bars = Bars::new(quiet);
     log::start(matches.get_count(log::VERBOSE), quiet, bars.clone());
     let params = S::Params::from_arg_matches(matches)?;
-    S::run(params, &bars)
+    let summary = S::run(params, &bars)?;
+    Ok(if writes_to_standard_output(matches) { Box::new(AccountAside(summary)) } else { summary })
 }
+
+/// Returns whether the file that a stage writes is standard output.
+fn writes_to_standard_output(matches: &ArgMatches) -> bool {
+    let of_kind = matches.subcommand().is_some_and(|(_, kind)| writes_to_standard_output(kind));
+    let named = OUTPUTS.iter().filter_map(|id| matches.try_get_raw(id).ok().flatten());
+    of_kind || named.flatten().any(|value| is_standard_output(Path::new(value)))
+}
+
+/// Parameters that name one file to be written.
+const OUTPUTS: [&str; 2] = ["output", "report"];
 
 fn list_stages(entries: &[Entry]) -> anyhow::Result<Box<dyn Summary>> {
     struct Stages(Vec<(&'static str, &'static str)>);
@@ -202,11 +216,44 @@ fn list_stages(entries: &[Entry]) -> anyhow::Result<Box<dyn Summary>> {
     Ok(Box::new(Stages(entries.iter().map(|e| (e.name, e.about)).collect())))
 }
 
-/// Flushes what a stage has to say; a reader that went away is not an error.
+/// Writes what a stage has to say; a reader that went away is not an error.
 fn print(summary: &mut dyn Summary) -> std::io::Result<()> {
-    let mut out = std::io::BufWriter::new(std::io::stdout().lock());
-    match summary.write(&mut out).and_then(|()| out.flush()) {
+    let written = if summary.is_data() {
+        let out = std::io::stdout().lock();
+        let is_terminal = out.is_terminal();
+        let mut out = std::io::BufWriter::new(out);
+        if is_terminal {
+            let mut out = Escaped::new(out);
+            summary.write(&mut out).and_then(|()| out.flush())
+        } else {
+            summary.write(&mut out).and_then(|()| out.flush())
+        }
+    } else {
+        account(summary, &mut std::io::stdout().lock())
+    };
+    match written {
         Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
         written => written,
+    }
+}
+
+/// Writes an account for people, which names files that may be called anything.
+fn account(summary: &mut dyn Summary, out: &mut dyn Write) -> std::io::Result<()> {
+    let mut text = Vec::new();
+    summary.write(&mut text)?;
+    out.write_all(lines(&String::from_utf8_lossy(&text)).as_bytes())?;
+    out.flush()
+}
+
+/// A stage whose file went to standard output, which has no room for its account.
+struct AccountAside(Box<dyn Summary>);
+
+impl Summary for AccountAside {
+    fn write(&mut self, _out: &mut dyn Write) -> std::io::Result<()> {
+        account(self.0.as_mut(), &mut std::io::stderr().lock())
+    }
+
+    fn n_failed(&self) -> u64 {
+        self.0.n_failed()
     }
 }

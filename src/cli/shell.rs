@@ -89,4 +89,8 @@ impl Summary for Printed {
     fn n_failed(&self) -> u64 {
         0
     }
+
+    fn is_data(&self) -> bool {
+        true
+    }
 }

@@ -6,11 +6,12 @@ use std::time::Duration;
 
 use anyhow::ensure;
 
+use super::failure::quoted;
 use super::learned::{learned_path, remember};
 use super::train::session::{
     Looker, MachineParams, check_run_name, claim, claim_path, read_phrases,
 };
-use super::train::{Account, StageAccount, quoted, restore};
+use super::train::{Account, StageAccount, restore};
 use super::trained::{Stand, Trained};
 use super::{ClientParams, Contract, Progress, Stage, Summary};
 use crate::store::Location;
@@ -296,7 +297,7 @@ impl Stage for Finetune {
             store.remove(&claim_path(run, Self::NAME))?;
             store.remove(&learned_path(run, Self::NAME))?;
         }
-        store.sweep()?;
+        store.sweep();
         let machine = &params.machine;
         let limit = config.num_phrases;
         let phrases = read_phrases(&store, Self::NAME, machine, limit, progress, &watch)?;

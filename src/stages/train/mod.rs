@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use anyhow::{bail, ensure};
 
+use super::failure::quoted;
 use super::learned::{learned_path, remember};
 use super::trained::best;
 use super::{ClientParams, Contract, Progress, Stage, Summary};
@@ -123,7 +124,7 @@ impl Stage for Train {
         if params.force {
             run.clear()?;
         }
-        store.sweep()?;
+        store.sweep();
         run.train(progress)
     }
 }
@@ -429,13 +430,4 @@ fn resume_command(params: &Params) -> String {
         words.push("--resume".to_owned());
     }
     words.join(" ")
-}
-
-/// Quotes a word for the shell where it needs it.
-pub fn quoted(word: &str) -> String {
-    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./:=,@+%".contains(c);
-    if !word.is_empty() && word.chars().all(is_plain) {
-        return word.to_owned();
-    }
-    format!("'{}'", word.replace('\'', r"'\''"))
 }
