@@ -1,12 +1,13 @@
 //! `query`: SQL over every table of a store.
 
 use std::io::{self, Write};
+use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
 use anyhow::Context as _;
 
 use super::{ClientParams, Contract, Progress, Stage, Summary};
-use crate::store::{self, Answer, Format, Location, TableInfo};
+use crate::store::{self, Answer, DataFormat, Format, Location, TableInfo, TextTable};
 
 /// The stage.
 pub struct Query;
@@ -26,7 +27,10 @@ pub struct Params {
     /// table, csv, json (an array of rows) or parquet.
     #[arg(long, value_name = "FORMAT", default_value = "table")]
     pub format: Format,
-    /// Write the answer to this file, whole or not at all, instead of standard output.
+    /// Rows that are written; 0 is all [default: 40 as a table, else all]
+    #[arg(long, value_name = "N")]
+    pub limit: Option<usize>,
+    /// Write the answer to this file, whole or not at all, instead of standard output (-).
     #[arg(long, value_name = "FILE")]
     pub output: Option<PathBuf>,
     #[command(flatten)]
@@ -46,34 +50,74 @@ impl Stage for Query {
             let tables = store::table_infos(&location, &options)?;
             return Ok(Box::new(Tables { tables }));
         };
-        let mut answer = store::query(&location, sql, &options)?;
-        let Some(output) = &params.output else {
-            return Ok(Box::new(Selected { answer, format: params.format }));
+        let answer = store::query(&location, sql, &options)?;
+        let limit = params.limit.map(NonZeroUsize::new);
+        let mut selected = match params.format {
+            Format::Table => {
+                let n_shown = limit.unwrap_or(NonZeroUsize::new(N_SHOWN));
+                Selected::Table(answer.text_table(n_shown)?)
+            }
+            Format::Data(format) => {
+                let answer = match limit.flatten() {
+                    Some(n) => answer.limited(n),
+                    None => answer,
+                };
+                Selected::Data { answer: Some(answer), format, n_rows: 0 }
+            }
         };
-        let n_rows = answer.n_rows();
-        store::write_file(output, |out| answer.write(params.format, out))
+        let Some(output) = &params.output else { return Ok(Box::new(selected)) };
+        store::write_file(output, |out| selected.write(out))
             .with_context(|| format!("while writing {}", output.display()))?;
-        Ok(Box::new(Written { n_rows, output: output.clone() }))
+        Ok(Box::new(Written { n_rows: selected.n_rows(), output: output.clone() }))
     }
 }
 
-struct Selected {
-    answer: Answer,
-    format: Format,
+/// Rows that a table shows unless the user says otherwise.
+const N_SHOWN: usize = 40;
+
+enum Selected {
+    Table(TextTable),
+    /// Rows are read while they are written, and counted.
+    Data {
+        answer: Option<Answer>,
+        format: DataFormat,
+        n_rows: u64,
+    },
+}
+
+impl Selected {
+    fn n_rows(&self) -> u64 {
+        match self {
+            Self::Table(table) => table.n_rows as u64,
+            Self::Data { n_rows, .. } => *n_rows,
+        }
+    }
 }
 
 impl Summary for Selected {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        self.answer.write(self.format, out)
+        match self {
+            Self::Table(table) => table.write(out),
+            Self::Data { answer, format, n_rows } => {
+                if let Some(answer) = answer.take() {
+                    *n_rows = answer.write(*format, out)?;
+                }
+                Ok(())
+            }
+        }
     }
 
     fn n_failed(&self) -> u64 {
         0
     }
+
+    fn is_data(&self) -> bool {
+        true
+    }
 }
 
 struct Written {
-    n_rows: usize,
+    n_rows: u64,
     output: PathBuf,
 }
 
