@@ -101,7 +101,9 @@ fn files_of_others_below_the_store_stay_and_one_that_cannot_be_read_stops_nothin
     let (notes, page) = (store.join(".tmp_important_notes"), store.join("projects/a/.tmpl.html"));
     let (other, ours) =
         (store.join("projects/.partial-a1B2c3"), store.join("phrases/.partial-a1B2c3"));
-    [&notes, &page, &other, &ours].map(|path| old(path));
+    for path in [&notes, &page, &other, &ours] {
+        old(path);
+    }
     let locked = store.join("lost+found");
     std::fs::create_dir(&locked).unwrap();
     let lock = |mode| {

@@ -103,9 +103,9 @@ impl Asked {
             "{name}: has more than {MAX_FILE_BYTES} bytes, and is no file of constraints"
         );
         let is_json = path.extension().is_some_and(|extension| extension == "json");
-        let file =
-            Self::parse(&text, is_json).with_context(|| format!("{name} has no constraints"))?;
-        let before = match &file.continue_from {
+        let asked =
+            Self::of_text(&text, is_json).with_context(|| format!("{name} has no constraints"))?;
+        let before = match &asked.file.continue_from {
             Some(continued) => {
                 let frames = continued.frames.unwrap_or(CONTINUED_FRAMES);
                 ensure!(frames > 0, "{name}: continue_from takes 0 frames; take 1 or more");
@@ -114,7 +114,7 @@ impl Asked {
             }
             None => None,
         };
-        Ok(Self { file, before })
+        Ok(Self { before, ..asked })
     }
 
     /// Reads a text, TOML or JSON, that continues no motion.

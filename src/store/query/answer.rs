@@ -153,7 +153,11 @@ fn for_each_batch(
     let plan = frame.sink_batches(send, true, Some(BATCH_ROWS)).map_err(failed)?;
     std::thread::scope(|scope| {
         let run = scope.spawn(move || plan.collect_with_engine(Engine::Streaming).map(drop));
-        let written = receiver.iter().try_for_each(&mut each);
+        let written = receiver.iter().try_for_each(|mut batch| {
+            // Writers take columns in one piece.
+            batch.rechunk_mut();
+            each(batch)
+        });
         drop(receiver);
         let run = run.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
         written.and_then(|()| run.map_err(failed))
