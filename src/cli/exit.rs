@@ -1,12 +1,13 @@
 //! The one place that prints errors and summaries, and chooses the exit code.
 
 use std::ffi::{OsStr, OsString};
-use std::io::{self, Write};
+use std::io::{self, IsTerminal as _, Write};
 use std::process::ExitCode;
 
 use serde_json::{Value, json};
 
-use crate::stages::Summary;
+use super::escaped::Escaped;
+use crate::stages::{Summary, lines, one_line, redacted};
 
 /// Done, but some items failed; they are in the `failures` table.
 pub const SOME_FAILED: u8 = 1;
@@ -74,7 +75,12 @@ pub fn report(stage: &str, form: Form, outcome: anyhow::Result<Box<dyn Summary>>
         }
     };
     if let Err(error) = printed {
-        eprintln!("error: could not write to standard output: {error}");
+        // Data are read while they are written.
+        let said = match error.get_ref() {
+            Some(cause) => on_one_line(&cause.to_string()),
+            None => format!("could not write to standard output: {error}"),
+        };
+        eprintln!("error: {said}");
         return ExitCode::from(COULD_NOT_RUN);
     }
     ExitCode::from(code)
@@ -131,15 +137,33 @@ fn could_not_run(stage: &str, error: &str) -> Value {
     object
 }
 
-/// Flushes what a stage has to say; a reader that went away is not an error.
+/// Writes what a stage has to say: data as they are, or escaped for a terminal; an account for people escaped.
 fn print(summary: &mut dyn Summary) -> io::Result<()> {
-    to_stdout(|out| summary.write(out))
+    if !summary.is_data() {
+        return to_stdout(|out| account(summary, out));
+    }
+    if !io::stdout().is_terminal() {
+        return to_stdout(|out| summary.write(out));
+    }
+    to_stdout(|out| {
+        let mut out = Escaped::new(out);
+        summary.write(&mut out).and_then(|()| out.flush())
+    })
+}
+
+/// Writes an account for people, which names files that may be called anything.
+pub fn account(summary: &mut dyn Summary, out: &mut dyn Write) -> io::Result<()> {
+    let mut text = Vec::new();
+    summary.write(&mut text)?;
+    out.write_all(lines(&String::from_utf8_lossy(&text)).as_bytes())?;
+    out.flush()
 }
 
 fn print_object(object: &Value) -> io::Result<()> {
     to_stdout(|out| writeln!(out, "{object}"))
 }
 
+/// Flushes what is written; a reader that went away is not an error.
 fn to_stdout(write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
     let mut out = io::BufWriter::new(io::stdout().lock());
     match write(&mut out).and_then(|()| out.flush()) {
@@ -152,7 +176,7 @@ fn to_stdout(write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result
 fn chain(error: &anyhow::Error) -> String {
     let mut text = String::new();
     for cause in error.chain() {
-        let cause = cause.to_string();
+        let cause = on_one_line(&cause.to_string());
         if text.contains(&cause) {
             continue;
         }
@@ -162,6 +186,12 @@ fn chain(error: &anyhow::Error) -> String {
         text.push_str(&cause);
     }
     text
+}
+
+/// Joins the lines of a message, and takes from it what is secret and what steers a terminal.
+fn on_one_line(message: &str) -> String {
+    let joined = message.lines().map(str::trim).filter(|line| !line.is_empty());
+    one_line(&redacted(&joined.collect::<Vec<_>>().join(" ")))
 }
 
 #[cfg(test)]
@@ -184,5 +214,12 @@ mod tests {
         assert_eq!(told(SOME_FAILED), expected(1, "items_failed"));
         assert_eq!(told(COULD_NOT_RUN), expected(2, "could_not_run"));
         assert_eq!(told(STOPPED), expected(75, "stopped"));
+    }
+
+    #[test]
+    fn an_error_is_one_line_without_secrets() {
+        let error =
+            anyhow::anyhow!("no s3://KEY:SECRET@b/a?sig=SECRET\n  \u{1b}[2Jhere").context("a");
+        assert_eq!(chain(&error), "a: no s3://…@b/a?… \\u{1b}[2Jhere");
     }
 }

@@ -5,6 +5,7 @@
 
 mod config;
 mod environment;
+mod escaped;
 mod exit;
 mod interrupt;
 mod log;
@@ -12,6 +13,8 @@ mod progress;
 mod shell;
 
 use std::ffi::OsString;
+use std::io::Write;
+use std::path::Path;
 use std::process::ExitCode;
 
 use clap::builder::EnumValueParser;
@@ -30,7 +33,7 @@ use crate::stages::plot::Plot;
 use crate::stages::query::Query;
 use crate::stages::train::Train;
 use crate::stages::view::View;
-use crate::stages::{Stage, Summary};
+use crate::stages::{Stage, Summary, is_standard_output};
 use exit::Form;
 use progress::Bars;
 
@@ -215,15 +218,28 @@ fn run_stage<S: Stage>(matches: &ArgMatches) -> ExitCode {
     interrupt::listen(move || exit::stopped(S::NAME, form));
     let run = || {
         let params = S::Params::from_arg_matches(matches)?;
-        if let Some(what) = S::claims_stdout(&params).filter(|_| form == Form::Json) {
+        let is_aside = writes_to_standard_output(matches);
+        let claimed = S::claims_stdout(&params).or(is_aside.then_some("--output -"));
+        if let Some(what) = claimed.filter(|_| form == Form::Json) {
             anyhow::bail!(
                 "{what} and --summary json both want standard output; give {what} a file, or leave --summary out"
             );
         }
-        S::run(params, &bars)
+        let summary = S::run(params, &bars)?;
+        Ok(if is_aside { Box::new(AccountAside(summary)) as Box<dyn Summary> } else { summary })
     };
     exit::report(S::NAME, form, run())
 }
+
+/// Returns whether the file that a stage writes is standard output.
+fn writes_to_standard_output(matches: &ArgMatches) -> bool {
+    let of_kind = matches.subcommand().is_some_and(|(_, kind)| writes_to_standard_output(kind));
+    let named = OUTPUTS.iter().filter_map(|id| matches.try_get_raw(id).ok().flatten());
+    of_kind || named.flatten().any(|value| is_standard_output(Path::new(value)))
+}
+
+/// Parameters that name one file to be written.
+const OUTPUTS: [&str; 2] = ["output", "report"];
 
 fn list_stages(entries: &[Entry]) -> anyhow::Result<Box<dyn Summary>> {
     struct Stages(Vec<(&'static str, &'static str)>);
@@ -243,4 +259,25 @@ fn list_stages(entries: &[Entry]) -> anyhow::Result<Box<dyn Summary>> {
         }
     }
     Ok(Box::new(Stages(entries.iter().map(|e| (e.name, e.about)).collect())))
+}
+
+/// A stage whose file went to standard output, which has no room for its account.
+struct AccountAside(Box<dyn Summary>);
+
+impl Summary for AccountAside {
+    fn write(&mut self, _out: &mut dyn Write) -> std::io::Result<()> {
+        exit::account(self.0.as_mut(), &mut std::io::stderr().lock())
+    }
+
+    fn n_failed(&self) -> u64 {
+        self.0.n_failed()
+    }
+
+    fn is_stopped(&self) -> bool {
+        self.0.is_stopped()
+    }
+
+    fn figures(&mut self) -> serde_json::Value {
+        self.0.figures()
+    }
 }

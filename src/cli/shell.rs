@@ -93,4 +93,8 @@ impl Summary for Printed {
     fn figures(&mut self) -> serde_json::Value {
         serde_json::Value::Null
     }
+
+    fn is_data(&self) -> bool {
+        true
+    }
 }

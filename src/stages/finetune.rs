@@ -6,11 +6,12 @@ use std::time::Duration;
 
 use anyhow::ensure;
 
+use super::failure::quoted;
 use super::learned::{learned_path, remember};
 use super::train::session::{
     Looker, MachineParams, check_run_name, claim, claim_path, read_phrases,
 };
-use super::train::{Account, DryRun, StageAccount, quoted, restore};
+use super::train::{Account, DryRun, StageAccount, restore};
 use super::trained::{Stand, Trained};
 use super::{ClientParams, Contract, Progress, Stage, Summary};
 use crate::store::Location;
@@ -294,7 +295,7 @@ impl Stage for Finetune {
         let Trained { state: trained, unet, decoder, .. } =
             Trained::read(&store, run, Stand::Train)?;
         if !params.dry_run {
-            store.sweep()?;
+            store.sweep();
         }
         let machine = &params.machine;
         let (limit, is_dry_run) = (config.num_phrases, params.dry_run);

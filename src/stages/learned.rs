@@ -8,7 +8,7 @@ use super::train::session::{Looker, MachineParams, read_phrases};
 use super::trained::{Trained, Tuned};
 use super::{Progress, Stage as _, finetune::Finetune, pretrained, train::Train};
 
-use crate::generation::{CardError, LearnedFrom, ModelCard, Purpose, file_names};
+use crate::generation::{CardError, LearnedFrom, MAX_CARD_BYTES, ModelCard, Purpose, file_names};
 use crate::store::{Location, Patience, StoreError};
 use crate::training::{Dataset, Split};
 
@@ -200,5 +200,8 @@ fn card_of(store: &Location, model: &str) -> Result<Option<Bytes>, StoreError> {
     }
     let path = format!("{}/{}", folder_of(model), file_names::CARD);
     let of_program = || (model == pretrained::NAME).then(|| pretrained::file(file_names::CARD));
-    Ok(store.read_if_there(&path)?.or_else(|| of_program().flatten()))
+    match store.read_regular(&path, MAX_CARD_BYTES) {
+        Err(StoreError::NotFound { .. }) => Ok(of_program().flatten()),
+        read => read.map(Some),
+    }
 }

@@ -28,6 +28,7 @@ use std::io::{self, Write};
 use std::num::NonZeroUsize;
 
 use crate::store::ClientOptions;
+pub use crate::store::{STANDARD_OUTPUT, is_standard_output, lines, one_line, redacted};
 
 /// One stage of the pipeline.
 pub trait Stage {
@@ -116,11 +117,23 @@ pub trait Summary {
 
     /// Returns the figures of the account as a JSON object, for programs; names carry units.
     fn figures(&mut self) -> serde_json::Value;
+    /// Returns whether what is written is data, whose bytes are for a program, and no account for people.
+    fn is_data(&self) -> bool {
+        false
+    }
 }
 
 /// Returns how many threads this machine runs side by side, the default of every stage that has workers.
 pub(in crate::stages) fn all_threads() -> NonZeroUsize {
     std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN)
+}
+
+/// How links in a source are treated; the same flag in every stage that reads one.
+#[derive(Clone, Copy, Debug, Default, clap::Args)]
+pub struct LinkParams {
+    /// Follow symbolic links that lead out of the source, whose files are failures otherwise.
+    #[arg(long)]
+    pub follow_links: bool,
 }
 
 /// How remote storage is used; the same flags in every stage.

@@ -14,16 +14,20 @@ mod item;
 mod local;
 mod location;
 mod number_columns;
+mod output;
 mod part;
 mod patience;
 mod prepared;
 #[cfg(feature = "query")]
 mod query;
 mod reader;
+mod redaction;
 mod remote;
 pub(crate) mod schema;
 mod shard;
 mod source;
+#[cfg(feature = "query")]
+mod sql;
 pub mod tables;
 
 pub use cache::Cache;
@@ -31,20 +35,21 @@ pub use client::ClientOptions;
 pub use commit::{Commit, Committed, Item, Ledger, LivePart, Manifest, Part, Settled, live_parts};
 pub use currency::{outdated_features, outdated_generations};
 pub use digest::{digest, digest_of, digest_texts};
-pub use error::StoreError;
+pub use error::{RemoteError, StoreError};
 pub use frames::FrameSpool;
 pub use item::ItemTables;
-pub use local::{replace_file, temporary_beside, write_file};
 pub use location::{Listed, Location, Put};
 #[cfg(test)]
 pub use number_columns::tests::parquet_of;
 pub use number_columns::{NumberColumnsError, number_columns};
+pub use output::{STANDARD_OUTPUT, is_standard_output, replace_file, temporary_beside, write_file};
 pub use part::{FinishedPart, Label, PartWriter};
 pub use patience::Patience;
 pub use prepared::prepared;
 #[cfg(feature = "query")]
-pub use query::{Answer, Format, TableInfo, query, table_infos};
+pub use query::{Answer, DataFormat, Format, TableInfo, TextTable, query, table_infos};
 pub use reader::Snapshot;
+pub use redaction::{lines, one_line, redacted};
 pub use schema::{Cell, Column, ColumnType, Row, TableSchema, TimestampUs};
 pub use shard::{Shard, batch_of, split_of};
 pub use source::{Content, InOrder, Listing, Source, SourceFile, SourceProblem, SourceProblemKind};

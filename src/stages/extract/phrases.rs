@@ -99,7 +99,7 @@ pub fn run(job: &Job<'_>, target: &Target<'_>) -> anyhow::Result<Done> {
     if job.dry_run {
         return Ok(done);
     }
-    target.store.sweep()?;
+    target.store.sweep();
     job.progress.start_audio("extract", done.todo_s.ceil() as u64);
     let writer = Writer { target, ledger: &ledger };
     let done = Mutex::new(done);
@@ -263,7 +263,8 @@ impl Inputs {
             files.entry(&task.row.source).or_default().push(task);
         }
         let open = |url: &str, tasks: Vec<&Task>| {
-            let source = Source::open(url, options, None).ok()?;
+            // What is read is held against the digest that ingest recorded, wherever it lies.
+            let source = Source::open(url, options, None).ok()?.following_links(true);
             let wanted = tasks.iter().filter_map(|task| Self::file(&source, task)).collect();
             let reader = source.read_in_order(wanted);
             Some((source, reader))

@@ -90,7 +90,7 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
     if target.dry_run || tasks.is_empty() {
         return Ok(done);
     }
-    target.store.sweep()?;
+    target.store.sweep();
     progress.start_audio("generate", done.todo_s.ceil() as u64);
     let mut batches: BTreeMap<u64, Vec<Task>> = BTreeMap::new();
     for task in tasks {

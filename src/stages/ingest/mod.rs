@@ -10,7 +10,7 @@ use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::time::Instant;
 
-use super::{ClientParams, Contract, Progress, Stage, Summary, all_threads};
+use super::{ClientParams, Contract, LinkParams, Progress, Stage, Summary, all_threads};
 use crate::store::tables::PhraseRow;
 use crate::store::{
     Cache, Ledger, Location, Row as _, Shard, Snapshot, Source, StoreError, digest,
@@ -63,6 +63,8 @@ pub struct Params {
     #[arg(long, value_name = "GB", default_value_t = 20.0, help_heading = "Remote storage")]
     pub cache_size_gb: f64,
     #[command(flatten)]
+    pub links: LinkParams,
+    #[command(flatten)]
     pub client: ClientParams,
     /// Say what would be done, and do nothing.
     #[arg(long)]
@@ -86,7 +88,8 @@ impl Stage for Ingest {
         let started = Instant::now();
         let options = params.client.options();
         let shard = Shard::parse(&params.shard, |name| std::env::var(name).ok())?;
-        let source = Source::open(&params.source, &options, open_cache(&params)?)?;
+        let source = Source::open(&params.source, &options, open_cache(&params)?)?
+            .following_links(params.links.follow_links);
         let store = Location::open(&params.store, &options)?;
         let plan = plan(source.list()?, params.layout);
         if plan.phrases.is_empty() {
@@ -98,7 +101,7 @@ impl Stage for Ingest {
             );
         }
         if !params.dry_run {
-            store.sweep()?;
+            store.sweep();
         }
         let ledger = Ledger::read(&store, Self::NAME)?;
         let seen = Seen::read(&store, SEEN)?;

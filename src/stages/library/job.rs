@@ -76,7 +76,7 @@ impl Job<'_> {
         if *dry_run {
             return Ok(());
         }
-        self.store.sweep()?;
+        self.store.sweep();
         let failed_before =
             |name: &String| self.ledger.get(name).is_some_and(|k| k.item.failure.is_some());
         // Captures are read where they are danced, or where one may have been mended.

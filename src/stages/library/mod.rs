@@ -19,8 +19,8 @@ use std::time::Instant;
 
 use super::failure::{Failure, FailureKind};
 use super::seen::Seen;
-use super::{ClientParams, Contract, Progress, Stage, Summary, all_threads};
-use crate::store::{Ledger, Location, StoreError, digest};
+use super::{ClientParams, Contract, LinkParams, Progress, Stage, Summary, all_threads};
+use crate::store::{Ledger, Location, Source, StoreError, digest};
 use captures::Captures;
 use job::Job;
 use known::Known;
@@ -84,6 +84,8 @@ pub struct Params {
     #[arg(long, value_name = "N", default_value_t = all_threads())]
     pub workers: NonZeroUsize,
     #[command(flatten)]
+    pub links: LinkParams,
+    #[command(flatten)]
     pub client: ClientParams,
     /// Say what would be done, and do nothing.
     #[arg(long)]
@@ -128,12 +130,16 @@ impl Stage for Library {
         let mut known = Known::read(&store)?;
         let ledger = Ledger::read(&store, Self::NAME)?;
         let seen = Seen::read(&store, SEEN)?;
+        let open = |url: &str| {
+            Source::open(url, &options, None)
+                .map(|source| source.following_links(params.links.follow_links))
+        };
         let captures = match &params.captures {
-            Some(url) => Captures::of_folder(url, &options)?,
+            Some(url) => Captures::of_folder(open(url)?)?,
             None => Captures::of_store(&store, &known),
         };
         let mut songs = match &params.songs {
-            Some(url) => Songs::of_folder(url, &options, &known)?,
+            Some(url) => Songs::of_folder(open(url)?, &known)?,
             None => {
                 let is_needed = params.compose == 0 && params.tunes.is_none();
                 Songs::of_store(&store, &mut known, is_needed)?
@@ -145,7 +151,7 @@ impl Stage for Library {
         let band = Band::default();
         songs.songs.extend(made::composed(params.compose, params.rules.seed, &band));
         if let Some(url) = &params.tunes {
-            songs.songs.extend(made::tunes(url, &options, params.rules.seed, &band)?);
+            songs.songs.extend(made::tunes(&open(url)?, params.rules.seed, &band)?);
         }
         prepare(&mut songs, &params)?;
         let job = Job { store: &store, ledger, seen, known, band, params: &params, progress };

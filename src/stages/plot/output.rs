@@ -12,11 +12,14 @@ use crate::store;
 /// Widths that a plot can have, as a flag takes them.
 pub const WIDTHS_PX: std::ops::RangeInclusive<i64> = MIN_WIDTH_PX as i64..=MAX_WIDTH_PX as i64;
 
-/// Returns the format that the name of the output asks for.
+/// Returns the format that the name of the output asks for; standard output is given PNG.
 ///
 /// # Errors
 /// When it is no format of plots.
 pub fn format_of(output: &Path) -> anyhow::Result<Format> {
+    if store::is_standard_output(output) {
+        return Ok(Format::Png);
+    }
     let extension = output.extension().map(|e| e.to_string_lossy()).unwrap_or_default();
     Format::of_path_extension(&extension).ok_or_else(|| {
         let found = match extension.as_ref() {

@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use anyhow::{bail, ensure};
 
+use super::failure::quoted;
 use super::learned::{learned_path, remember};
 use super::trained::best;
 use super::{ClientParams, Contract, Progress, Stage, Summary};
@@ -120,7 +121,7 @@ impl Stage for Train {
         if params.dry_run {
             return run.dry_run(progress);
         }
-        store.sweep()?;
+        store.sweep();
         run.train(progress)
     }
 }
@@ -431,13 +432,4 @@ fn resume_command(params: &Params) -> String {
         words.push("--resume".to_owned());
     }
     words.join(" ")
-}
-
-/// Quotes a word for the shell where it needs it.
-pub fn quoted(word: &str) -> String {
-    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./:=,@+%".contains(c);
-    if !word.is_empty() && word.chars().all(is_plain) {
-        return word.to_owned();
-    }
-    format!("'{}'", word.replace('\'', r"'\''"))
 }
