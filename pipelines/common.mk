@@ -2,8 +2,9 @@
 #
 # Before including this file, a pipeline sets OUT and STORE.
 #
-# A stamp says that a stage did its work for these inputs. Stamps lie on this machine even where the
-# store does not. Losing them costs little, because a stage itself skips what the store has already.
+# A stamp says that a stage did its work for these inputs, by their digests (stamp.sh); clocks say nothing. What a
+# rule needs stands behind |, so that make asks only whether the stamp is there. Stamps lie on this machine even
+# where the store does not. Losing them costs little, because a stage itself skips what the store has already.
 
 MAKEFLAGS += --no-builtin-rules --no-print-directory
 SHELL := bash
@@ -16,28 +17,24 @@ BIN       ?= target/debug
 MOTIONGEN ?= $(BIN)/motiongen
 STAMPS    := $(OUT)/stamps
 
-# Stamps mean nothing without their store, nor do those of stages in which items failed: such a
-# stage tries the failed items again next time. (A remote store is taken to be there.)
+# Stamps mean nothing without their store. (A remote store is taken to be there.)
 $(shell case '$(STORE)' in (*://*) ;; (*) [ -d '$(STORE)/commits' ] || rm -f $(STAMPS)/*.done ;; esac)
-$(shell grep --files-with-matches --no-messages 'failed' $(STAMPS)/*.done | xargs --no-run-if-empty rm)
 
 # $(call watch,NAME,SOURCE,SETTINGS) keeps $(STAMPS)/NAME.list up to date with what SOURCE holds.
 watch = $(shell $(PIPELINES)watch.sh $(STAMPS)/$(1).list '$(2)' $(3))
 
-# $(call stage,COMMAND) runs a stage and stamps it. Exit code 1 means that some items failed, which
-# are in the table of failures while the rest is done: the pipeline says so and goes on. Any other
-# code stops it.
-define stage
-@mkdir -p $(@D)
-@echo "$(1)"
-@code=0; $(1) || code=$$?; \
-case $$code in \
-  0) echo done > $@ ;; \
-  1) echo 'some items failed' > $@; \
-     echo "$(basename $(@F)): some items failed (see above); going on, they are tried again next time" >&2 ;; \
-  *) exit $$code ;; \
-esac
-endef
+# The program by its content, which is digested again where its size or time is another.
+PROGRAM := $(STAMPS)/program.list
+$(shell $(PIPELINES)watch.sh --program $(PROGRAM) '$(MOTIONGEN)')
+
+# $(call prune) removes the stamps that are not of the present files; to be called when all lists are made.
+prune = $(shell $(PIPELINES)stamp.sh prune $(STAMPS))
+
+# $(call stage,COMMAND,FILES) runs a stage and, when it is done, stamps it with the digests of all that stands behind
+# | in its rule, and of the FILES that it made. Exit code 1 means that some items failed, which are in the table of
+# failures while the rest is done: the pipeline says so, goes on, and tries them again next time. Any other code stops
+# it, 75 (stopped before it was done) too; without a stamp, the next make goes on there.
+stage = @$(PIPELINES)stamp.sh run $@ $(filter-out $(MOTIONGEN),$|) $(if $(2),--made $(2)) -- $(1)
 
 # $(call unless_done,NAME,TARGET) makes TARGET, or says that there is nothing to make.
 define unless_done

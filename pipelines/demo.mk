@@ -22,7 +22,7 @@ ANSWERS := $(OUT)/queries.txt
 
 .PHONY: demo
 demo:
-	$(call unless_done,demo,$(ANSWERS))
+	$(call unless_done,demo,$(ANSWERED))
 	@echo
 	@echo "tables   $(STORE)"
 	@echo "answers  $(ANSWERS)"
@@ -35,46 +35,52 @@ demo:
 
 # ingest: both sources into one store.
 $(foreach s,$(SOURCES),$(call watch,$(s),$(DATA)/$(s),$(STORE)))
+$(call prune)
+WITH := $(CONFIG) $(PROGRAM) $(MOTIONGEN)
 INGESTED := $(SOURCES:%=$(STAMPS)/ingest-%.done)
-$(INGESTED): $(STAMPS)/ingest-%.done: $(STAMPS)/%.list $(CONFIG) $(MOTIONGEN)
+$(INGESTED): $(STAMPS)/ingest-%.done: | $(STAMPS)/%.list $(WITH)
 	$(call stage,$(MOTIONGEN) ingest --config $(CONFIG) --source $(DATA)/$* --store $(STORE))
 
 # extract: the audio features of every song.
 EXTRACTED := $(STAMPS)/extract.done
-$(EXTRACTED): $(INGESTED) $(CONFIG) $(MOTIONGEN)
+$(EXTRACTED): | $(INGESTED) $(WITH)
 	$(call stage,$(MOTIONGEN) extract --config $(CONFIG) --store $(STORE))
 
 # library: phrases to train on, constructed from the songs and the captures.
 LIBRARY := $(STAMPS)/library.done
-$(LIBRARY): $(EXTRACTED) $(CONFIG) $(MOTIONGEN)
+$(LIBRARY): | $(EXTRACTED) $(WITH)
 	$(call stage,$(MOTIONGEN) library --config $(CONFIG) --store $(STORE))
 
 # train: a network that is small enough to learn in minutes.
 TRAINED := $(STAMPS)/train-$(RUN).done
-$(TRAINED): $(LIBRARY) $(CONFIG) $(MOTIONGEN)
+$(TRAINED): | $(LIBRARY) $(WITH)
 	$(call stage,$(MOTIONGEN) train --config $(CONFIG) --store $(STORE) --run $(RUN))
 PLOT := $(OUT)/training-$(RUN).png
-$(PLOT): $(TRAINED)
-	$(MOTIONGEN) plot training --store $(STORE) --run $(RUN) --output $@
+PLOTTED := $(STAMPS)/plot-$(RUN).done
+$(PLOTTED): | $(TRAINED) $(WITH)
+	$(call stage,$(MOTIONGEN) plot training --store $(STORE) --run $(RUN) --output $(PLOT),$(PLOT))
 
 # export: the networks as ONNX files, held against the interpreter that trained them.
 EXPORTED := $(STAMPS)/export-$(MODEL).done
-$(EXPORTED): $(TRAINED) $(CONFIG) $(MOTIONGEN)
+$(EXPORTED): | $(TRAINED) $(WITH)
 	$(call stage,$(MOTIONGEN) export --config $(CONFIG) --store $(STORE) --run $(RUN) --model $(MODEL) --force)
 
 # generate: motion for every song in tables, and for one of them in files that can be looked at.
 GENERATED := $(STAMPS)/generate-$(MODEL).done
-$(GENERATED): $(EXPORTED) $(CONFIG) $(MOTIONGEN)
+$(GENERATED): | $(EXPORTED) $(WITH)
 	$(call stage,$(MOTIONGEN) generate --config $(CONFIG) --store $(STORE) --model $(MODEL))
 PAGE := $(OUT)/motion/$(basename $(notdir $(SONG))).html
-$(PAGE): $(EXPORTED) $(CONFIG) $(MOTIONGEN)
-	$(MOTIONGEN) generate --config $(CONFIG) --model $(STORE)/models/$(MODEL) --audio $(SONG) \
-	  --output $(OUT)/motion --samples 1 --format npy,glb,png,html --force
+SHOWN := $(STAMPS)/page-$(MODEL).done
+$(SHOWN): | $(EXPORTED) $(WITH)
+	$(call stage,$(MOTIONGEN) generate --config $(CONFIG) --model $(STORE)/models/$(MODEL) --audio $(SONG) \
+	  --output $(OUT)/motion --samples 1 --format npy$(comma)glb$(comma)png$(comma)html,$(PAGE))
 
 # evaluate: checks, metrics and baselines of what was danced.
 REPORT := $(OUT)/report.html
-$(REPORT): $(GENERATED) $(CONFIG) $(MOTIONGEN)
-	$(MOTIONGEN) evaluate --config $(CONFIG) --store $(STORE) --run $(MODEL) --report $@
+EVALUATED := $(STAMPS)/evaluate-$(MODEL).done
+$(EVALUATED): | $(GENERATED) $(WITH)
+	$(call stage,$(MOTIONGEN) evaluate --config $(CONFIG) --store $(STORE) --run $(MODEL) \
+	  --report $(REPORT),$(REPORT))
 
 # query: what the tables tell.
 define SPLITS
@@ -131,11 +137,12 @@ define newline
 endef
 comma := ,
 ask = @{ echo; echo '$(1)'; $(MOTIONGEN) query --config $(CONFIG) --store $(STORE) \
-	'$(subst $(newline), ,$($(2)))'; } | tee --append $@.new
+	'$(subst $(newline), ,$($(2)))'; } | tee --append $(ANSWERS).new
 
-$(ANSWERS): $(INGESTED) $(EXTRACTED) $(LIBRARY) $(TRAINED) $(EXPORTED) $(PLOT) $(GENERATED) $(PAGE) $(REPORT)
-	@rm -f $@.new
-	@{ echo; echo 'What is there?'; $(MOTIONGEN) query --store $(STORE) --tables; } | tee $@.new
+ANSWERED := $(STAMPS)/answers.done
+$(ANSWERED): | $(INGESTED) $(EXTRACTED) $(LIBRARY) $(TRAINED) $(EXPORTED) $(PLOTTED) $(GENERATED) $(SHOWN) \
+  $(EVALUATED) $(WITH)
+	@{ echo; echo 'What is there?'; $(MOTIONGEN) query --store $(STORE) --tables; } | tee $(ANSWERS).new
 	$(call ask,How much is in each split?,SPLITS)
 	$(call ask,Which songs are the longest$(comma) and what is their tempo?,LONGEST_SONGS)
 	$(call ask,How fast does each capture move?,SPEEDS)
@@ -145,4 +152,4 @@ $(ANSWERS): $(INGESTED) $(EXTRACTED) $(LIBRARY) $(TRAINED) $(EXPORTED) $(PLOT) $
 	$(call ask,Does onnxruntime answer what was trained?,CHECKS)
 	$(call ask,What was danced$(comma) and how well?,GENERATIONS)
 	$(call ask,What may be said of motion for songs that nothing was learned from?,VERDICTS)
-	@mv $@.new $@
+	$(call stage,mv $(ANSWERS).new $(ANSWERS),$(ANSWERS))

@@ -20,6 +20,7 @@ include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
 $(if $(and $(SOURCE),$(STORE)),,$(error name both ends: make ingest SOURCE=music STORE=tables [SHARDS=8 -j4]))
 
 $(call watch,source,$(SOURCE),'$(STORE)' '$(FLAGS)')
+$(call prune)
 SHARD := $(STAMPS)/shard-
 DONE  := $(foreach i,$(shell seq 0 $$(($(SHARDS) - 1))),$(SHARD)$(i)-of-$(SHARDS).done)
 
@@ -31,6 +32,6 @@ ingest:
 .PHONY: all-shards
 all-shards: $(DONE)
 
-$(DONE): $(SHARD)%-of-$(SHARDS).done: $(STAMPS)/source.list $(CONFIG) $(MOTIONGEN)
+$(DONE): $(SHARD)%-of-$(SHARDS).done: | $(STAMPS)/source.list $(CONFIG) $(PROGRAM) $(MOTIONGEN)
 	$(call stage,$(strip $(MOTIONGEN) ingest --source '$(SOURCE)' --store '$(STORE)' \
 	  --shard $*/$(SHARDS) $(CONFIG:%=--config %) $(FLAGS)))

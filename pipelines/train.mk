@@ -18,19 +18,25 @@ include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
 
 $(if $(and $(STORE),$(RUN)),,$(error name both: make train STORE=tables RUN=name))
 
+# What was asked for, beside the configuration.
+$(call watch,settings,,'$(STORE)' '$(RUN)' '$(TRAIN)' '$(FINETUNE)')
+$(call prune)
+ASKED := $(STAMPS)/settings.list $(CONFIG) $(PROGRAM) $(MOTIONGEN)
+
 SETTINGS := $(if $(CONFIG),--config $(CONFIG)) --store '$(STORE)' --run '$(RUN)'
 PLOT     := $(OUT)/training.png
 
 .PHONY: train
 train:
-	$(call unless_done,train,$(PLOT))
+	$(call unless_done,train,$(PLOTTED))
 	@echo "plot  $(PLOT)"
 
 TRAINED := $(STAMPS)/train.done
-$(TRAINED): $(CONFIG) $(MOTIONGEN)
+$(TRAINED): | $(ASKED)
 	$(call stage,$(MOTIONGEN) train $(SETTINGS) $(TRAIN))
 FINETUNED := $(if $(FINETUNE),$(STAMPS)/finetune.done,$(TRAINED))
-$(STAMPS)/finetune.done: $(TRAINED)
+$(STAMPS)/finetune.done: | $(TRAINED) $(ASKED)
 	$(call stage,$(MOTIONGEN) finetune $(SETTINGS) $(FINETUNE))
-$(PLOT): $(FINETUNED)
-	$(MOTIONGEN) plot training --store '$(STORE)' --run '$(RUN)' --output $@
+PLOTTED := $(STAMPS)/plot.done
+$(PLOTTED): | $(FINETUNED) $(ASKED)
+	$(call stage,$(MOTIONGEN) plot training --store '$(STORE)' --run '$(RUN)' --output $(PLOT),$(PLOT))

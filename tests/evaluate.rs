@@ -134,6 +134,7 @@ struct Motion {
 /// Writes motions under the name of a run.
 fn put(store: &Path, name: &str, motions: &[Motion]) {
     let weights = weights(store);
+    let known = crate::support::phrases(store);
     let store = Location::local(store).expect("a store");
     let ledger = Ledger::read(&store, "generate").expect("a ledger");
     let mut commit = Commit::new(&store, "generate", name, "phrases");
@@ -181,9 +182,11 @@ fn put(store: &Path, name: &str, motions: &[Motion]) {
             generate_s: 0.1,
             real_time_factor: 0.01,
             settings: None,
+            content_hash: None,
             time: TimestampUs(1_700_000_000_000_000),
         });
-        let hash = "h".to_owned();
+        // As rows of older versions: the commit alone says what the motion was made for.
+        let hash = known.get(phrase).map_or("h".to_owned(), |row| row.content_hash.clone());
         commit.settle(
             Item { id, fingerprint: hash.clone(), input_hash: hash, failure: None },
             &ledger,

@@ -373,7 +373,16 @@ fn a_song_becomes_files_and_a_stream() {
     let csv = std::fs::read_to_string(out.join("song.csv")).expect("text");
     assert_eq!(csv.lines().count(), 95);
     assert_eq!(std::fs::read_to_string(&stream).expect("text").lines().count(), 95);
+    // A stream is made whenever it is asked for; without it there is nothing to do.
+    std::fs::remove_file(&stream).expect("removed");
     let again = finish(&mut command);
+    assert!(again.stdout.contains("  1 motions made ("), "{again:?}");
+    assert_eq!(std::fs::read_to_string(&stream).expect("text").lines().count(), 95);
+    let mut unstreamed = motiongen();
+    let words: Vec<_> = command.get_args().map(ToOwned::to_owned).collect();
+    let at = words.iter().position(|word| word == "--stream").expect("the flag");
+    unstreamed.args(&words[..at]).args(&words[at + 2..]);
+    let again = finish(&mut unstreamed);
     assert!(again.stdout.contains("nothing to do: 1 motions are up to date"), "{again:?}");
 }
 

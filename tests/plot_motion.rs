@@ -36,6 +36,8 @@ fn publish(mut commit: Commit<'_>, ledger: &Ledger, ids: &[String]) {
 
 /// Commits generated motions of a phrase, each the second of two candidates.
 pub fn commit_generated(store: &Path, run: &str, phrase: &str, motions: &[(i32, Vec<Frame>)]) {
+    let known = crate::support::phrases(store);
+    let content_hash = known.get(phrase).map(|row| row.content_hash.clone()).unwrap_or_default();
     let store = Location::local(store).expect("a folder");
     let ledger = Ledger::read(&store, "generate").expect("commits");
     let mut commit = Commit::new(&store, "generate", "", "phrases");
@@ -49,7 +51,11 @@ pub fn commit_generated(store: &Path, run: &str, phrase: &str, motions: &[(i32, 
         let part = commit.part(tables::GENERATED, tables::generated).expect("a part");
         part.write_labelled_frames(&id, &labels, frames.view()).expect("frames");
         for candidate in 0..2 {
-            rows.push(generation(run, phrase, *sample, candidate));
+            let content_hash = Some(content_hash.clone());
+            rows.push(GenerationRow {
+                content_hash,
+                ..generation(run, phrase, *sample, candidate)
+            });
         }
         ids.push(id);
     }
@@ -87,6 +93,7 @@ fn generation(run: &str, phrase: &str, sample: i32, candidate: i32) -> Generatio
         generate_s: 1.0,
         real_time_factor: 0.5,
         settings: None,
+        content_hash: Some(String::new()),
         time: TimestampUs(0),
     }
 }

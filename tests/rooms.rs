@@ -50,8 +50,9 @@ const MAY_USE: [(&str, &[&str]); 19] = [
 ];
 
 /// Crates that only one place may name: crate, where.
-const KEPT_TO: [(&str, &str); 15] = [
-    ("polars", "store/query.rs"),
+const KEPT_TO: [(&str, &str); 16] = [
+    ("polars", "store/query"),
+    ("sqlparser", "store/sql.rs"),
     ("object_store", "store/"),
     ("parquet", "store/"),
     ("arrow_array", "store/"),

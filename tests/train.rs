@@ -37,7 +37,7 @@ const SMALL: [&str; 15] = [
 ];
 
 /// Features that follow the motion, so that there is something to learn.
-fn features(frames: &[[f32; MOTION_DIM]]) -> Vec<Member> {
+pub fn features(frames: &[[f32; MOTION_DIM]]) -> Vec<Member> {
     let n = frames.len();
     let array = |rows: usize, value: &dyn Fn(usize, &[f32; MOTION_DIM]) -> f32| {
         let values: Vec<f32> =

@@ -9,9 +9,12 @@ use std::ffi::OsString;
 use anyhow::{Context as _, bail};
 use clap::{Arg, ArgAction, Command, Id};
 
+use super::environment::{nearest, variable};
+
 /// The flag that names the file.
 pub const FLAG: &str = "config";
-const VARIABLE_PREFIX: &str = "MOTIONGEN_";
+/// Sections of stages that a build may be without.
+const OF_OTHER_BUILDS: [&str; 1] = ["query"];
 
 /// Returns the text about the flag that names the file.
 pub fn help(command: &Command) -> String {
@@ -23,33 +26,17 @@ pub fn help(command: &Command) -> String {
     format!("Take defaults from this TOML file: flags without their dashes, top level, {tables}")
 }
 
-/// Gives every flag of a command and its kinds its environment variable, `MOTIONGEN_<FLAG>`.
-pub fn with_environment(mut command: Command) -> Command {
-    let flags: Vec<_> = command
-        .get_arguments()
-        .filter(|a| a.get_long().is_some() && !matches!(a.get_action(), ArgAction::Count))
-        .map(|a| (a.get_id().clone(), variable(a.get_long().unwrap_or_default())))
-        .collect();
-    for (id, variable) in flags {
-        command = command.mut_arg(id, |arg| arg.env(variable));
-    }
-    command.mut_subcommands(with_environment)
-}
-
-fn variable(flag: &str) -> String {
-    format!("{VARIABLE_PREFIX}{}", flag.to_uppercase().replace('-', "_"))
-}
-
 /// Makes the values of the configuration file, if one is named, the defaults of `command`.
 ///
 /// Of the front door, the stage that `arguments` name is configured; any other `command` is the stage
-/// itself.
+/// itself. `stages` are the commands of all stages, whose sections the file may have.
 ///
 /// # Errors
-/// When the file cannot be read, is not TOML, or has a key that the stage does not know.
+/// When the file cannot be read, is not TOML, or has a section or a key that no stage knows.
 pub fn apply(
     command: Command,
     is_front_door: bool,
+    stages: &[Command],
     arguments: &[OsString],
 ) -> anyhow::Result<Command> {
     let Some(path) = file_named(arguments) else { return Ok(command) };
@@ -61,6 +48,7 @@ pub fn apply(
     // Top-level values are for every stage.
     let shared: Vec<_> = table.iter().filter(|(_, value)| !value.is_table()).collect();
     let file = File { path: path.to_string_lossy().into_owned(), arguments };
+    file.check(&table, stages)?;
     if !is_front_door {
         let name = command.get_name().trim_start_matches("motiongen-").to_owned();
         return file.configure(command, &name, &shared, table.get(&name));
@@ -76,9 +64,7 @@ fn try_mut_subcommand(
     arguments: &[OsString],
     change: impl FnOnce(&str, Command) -> anyhow::Result<Command>,
 ) -> anyhow::Result<Command> {
-    let mut words = arguments.iter().skip(1).filter_map(|a| a.to_str());
-    let chosen = words.find_map(|word| command.find_subcommand(word));
-    let Some(name) = chosen.map(|sub| sub.get_name().to_owned()) else { return Ok(command) };
+    let Some(name) = subcommand_named(&command, arguments) else { return Ok(command) };
     let mut outcome = Ok(());
     let command = command.mut_subcommand(&name, |sub| {
         change(&name, sub.clone()).unwrap_or_else(|e| {
@@ -89,22 +75,42 @@ fn try_mut_subcommand(
     outcome.map(|()| command)
 }
 
+/// Returns the name of the subcommand that `arguments` name, if they name one.
+pub fn subcommand_named(command: &Command, arguments: &[OsString]) -> Option<String> {
+    // The value of a general flag may be called like a stage.
+    let general = [FLAG, super::exit::FLAG].map(|flag| format!("--{flag}"));
+    let mut words = arguments.iter().skip(1).filter_map(|a| a.to_str());
+    while let Some(word) = words.next() {
+        if general.iter().any(|flag| flag == word) {
+            words.next();
+        } else if let Some(sub) = command.find_subcommand(word) {
+            return Some(sub.get_name().to_owned());
+        }
+    }
+    None
+}
+
 /// Returns the file that the flag or the environment names.
 pub fn file_named(arguments: &[OsString]) -> Option<OsString> {
-    let flag = format!("--{FLAG}");
+    value_of(FLAG, arguments)
+}
+
+/// Returns the value of a flag that is needed before all are parsed: that of the arguments, or of the environment.
+pub fn value_of(flag: &str, arguments: &[OsString]) -> Option<OsString> {
+    let long = format!("--{flag}");
     let mut rest = arguments.iter().skip(1);
     while let Some(argument) = rest.next() {
         if argument.to_str() == Some("--") {
             break;
         }
-        if argument.to_str() == Some(&flag) {
+        if argument.to_str() == Some(&long) {
             return rest.next().cloned();
         }
-        if let Some(value) = argument.to_str().and_then(|a| a.strip_prefix(&format!("{flag}="))) {
+        if let Some(value) = argument.to_str().and_then(|a| a.strip_prefix(&format!("{long}="))) {
             return Some(value.into());
         }
     }
-    std::env::var_os(variable(FLAG)).filter(|value| !value.is_empty())
+    std::env::var_os(variable(flag)).filter(|value| !value.is_empty())
 }
 
 /// A configuration file that was read.
@@ -117,10 +123,61 @@ struct File<'a> {
 type Entry<'a> = (&'a String, &'a toml::Value);
 
 impl File<'_> {
+    /// Refuses a section that is no stage's, and a key that no stage knows.
+    fn check(&self, table: &toml::Table, stages: &[Command]) -> anyhow::Result<()> {
+        let path = &self.path;
+        for (name, value) in table {
+            let stage = stages.iter().find(|stage| stage.get_name() == name);
+            match (value.as_table(), stage) {
+                (Some(own), Some(stage)) => self.check_section(name, own, stage)?,
+                (Some(_), None) if OF_OTHER_BUILDS.contains(&name.as_str()) => {}
+                (Some(_), None) => {
+                    let names = || stages.iter().map(Command::get_name);
+                    bail!(
+                        "configuration {path}: has a section [{name}], which is no stage; nearest: {}; the stages \
+                         are {}",
+                        nearest(name, names()),
+                        names().collect::<Vec<_>>().join(", ")
+                    );
+                }
+                (None, Some(_)) => {
+                    bail!("configuration {path}: {name} is a stage; write its keys below [{name}]")
+                }
+                (None, None) if stages.iter().any(|stage| knows(stage, name)) => {}
+                (None, None) => {
+                    let known: BTreeSet<&str> = stages.iter().flat_map(keys).collect();
+                    bail!(
+                        "configuration {path}: no stage has a key \"{name}\"; nearest: {}",
+                        nearest(name, known.into_iter())
+                    );
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn check_section(
+        &self,
+        section: &str,
+        own: &toml::Table,
+        command: &Command,
+    ) -> anyhow::Result<()> {
+        for (key, value) in own {
+            let kind = command.get_subcommands().find(|kind| kind.get_name() == key);
+            match (value.as_table(), kind) {
+                (Some(own), Some(kind)) => {
+                    self.check_section(&format!("{section}.{key}"), own, kind)?;
+                }
+                _ if knows(command, key) => {}
+                _ => bail!("configuration {}: {}", self.path, unknown_key(command, section, key)),
+            }
+        }
+        Ok(())
+    }
+
     /// Makes values the defaults of `command` and of the kind of it that was chosen.
     ///
-    /// `shared` are values for whoever knows them; those of the command's own table win over them
-    /// and must be known.
+    /// `shared` are values for whoever knows them; those of the command's own table win over them.
     fn configure(
         &self,
         mut command: Command,
@@ -134,15 +191,9 @@ impl File<'_> {
             value.is_table() && command.get_subcommands().any(|kind| kind.get_name() == *key)
         };
         let own_values: Vec<_> = own.into_iter().flatten().filter(|kv| !is_kind(kv)).collect();
-        let entries = shared.iter().map(|kv| (*kv, false));
-        for ((key, value), is_own) in entries.chain(own_values.iter().map(|kv| (*kv, true))) {
-            let Some(id) = find(&command, key) else {
-                // A shared key may be meant for another stage, an own one for a kind.
-                if is_own && !command.get_subcommands().any(|kind| find(kind, key).is_some()) {
-                    bail!("configuration {path}: {}", unknown_key(&command, section, key));
-                }
-                continue;
-            };
+        for (key, value) in shared.iter().chain(&own_values).copied() {
+            // A shared key may be meant for another stage, an own one for a kind.
+            let Some(id) = find(&command, key) else { continue };
             let values = texts(value).with_context(|| {
                 format!("configuration {path}: [{section}] {key} cannot be a table")
             })?;
@@ -165,20 +216,26 @@ fn find(command: &Command, key: &str) -> Option<Id> {
     command.get_arguments().find(is_it).filter(|_| flag != FLAG).map(|a| a.get_id().clone())
 }
 
-fn unknown_key(command: &Command, section: &str, key: &str) -> String {
-    let mut known: Vec<_> = std::iter::once(command)
-        .chain(command.get_subcommands())
-        .flat_map(Command::get_arguments)
-        .filter(|a| !matches!(a.get_action(), ArgAction::Count))
-        .filter_map(|a| a.get_long())
-        .filter(|flag| !["help", "version", FLAG].contains(flag))
-        .collect();
+/// Returns whether a key sets a flag of a command or of one of its kinds.
+fn knows(command: &Command, key: &str) -> bool {
+    find(command, key).is_some() || command.get_subcommands().any(|kind| knows(kind, key))
+}
+
+/// Returns the flags of a command and its kinds that keys may set, each once.
+fn keys(command: &Command) -> Vec<&str> {
     let mut seen = BTreeSet::new();
-    known.retain(|flag| seen.insert(*flag));
-    let nearest = known
-        .iter()
-        .max_by(|a, b| strsim::jaro_winkler(key, a).total_cmp(&strsim::jaro_winkler(key, b)))
-        .map_or("", |flag| flag);
+    let own = command
+        .get_arguments()
+        .filter(|a| !matches!(a.get_action(), ArgAction::Count))
+        .filter_map(Arg::get_long)
+        .filter(|flag| !["help", "version", FLAG].contains(flag));
+    let of_kinds = command.get_subcommands().flat_map(keys);
+    own.chain(of_kinds).filter(|flag| seen.insert(*flag)).collect()
+}
+
+fn unknown_key(command: &Command, section: &str, key: &str) -> String {
+    let known = keys(command);
+    let nearest = nearest(key, known.iter().copied());
     format!(
         "[{section}] has no key \"{key}\"; nearest: {nearest}; {section} knows {}",
         known.join(", ")

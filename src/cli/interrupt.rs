@@ -1,27 +1,45 @@
-//! Ctrl-C and signals to terminate, for stages that finish what is under way first.
+//! Ctrl-C and signals to terminate: the first asks for an end, the second ends the program at once.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, OnceLock};
 
 use signal_hook::consts::{SIGINT, SIGTERM};
-use signal_hook::flag;
+use signal_hook::iterator::Signals;
+use signal_hook::low_level;
 
-/// Exit code of a program that a second signal ended at once: 128 + SIGINT, as shells have it.
-const ENDED_BY_SIGNAL: i32 = 130;
+use super::exit;
 
-static ASKED: OnceLock<Arc<AtomicBool>> = OnceLock::new();
+/// Added to the number of a signal, the exit code of a program that it ended, as shells have it.
+const ENDED_BY_SIGNAL: i32 = 128;
 
-/// Returns whether the user asked for an end; from the first call on, that is all that a signal does.
-pub fn is_asked_for() -> bool {
-    let asked = ASKED.get_or_init(|| {
-        let asked = Arc::new(AtomicBool::new(false));
-        for signal in [SIGINT, SIGTERM] {
-            // In this order, so that the second signal finds the flag set and ends the program. Where
-            // the system refuses, signals end it as ever.
-            flag::register_conditional_shutdown(signal, ENDED_BY_SIGNAL, Arc::clone(&asked)).ok();
-            flag::register(signal, Arc::clone(&asked)).ok();
+/// Whether an end was asked for.
+static ASKED: AtomicBool = AtomicBool::new(false);
+/// Whether the stage looks at [`ASKED`], and finishes what is under way.
+static HEEDED: AtomicBool = AtomicBool::new(false);
+
+/// Listens to signals from now on. Before the stage looks for the first time, a signal ends the program at once
+/// with the exit code of a job that was stopped, after `stopped`.
+pub fn listen(stopped: impl Fn() + Send + 'static) {
+    // Where the system refuses, signals end the program as ever.
+    let Ok(mut signals) = Signals::new([SIGINT, SIGTERM]) else { return };
+    let handle = signals.handle();
+    let listener = std::thread::Builder::new().name("signals".to_owned()).spawn(move || {
+        for signal in signals.forever() {
+            if ASKED.swap(true, Ordering::Relaxed) {
+                low_level::exit(ENDED_BY_SIGNAL + signal);
+            }
+            if !HEEDED.load(Ordering::Relaxed) {
+                stopped();
+                low_level::exit(i32::from(exit::STOPPED));
+            }
         }
-        asked
     });
-    asked.load(Ordering::Relaxed)
+    if listener.is_err() {
+        handle.close();
+    }
+}
+
+/// Returns whether the user asked for an end; from the first call on, that is all that a first signal does.
+pub fn is_asked_for() -> bool {
+    HEEDED.store(true, Ordering::Relaxed);
+    ASKED.load(Ordering::Relaxed)
 }

@@ -6,6 +6,7 @@ use tracing_subscriber::EnvFilter;
 use tracing_subscriber::fmt::MakeWriter;
 
 use super::progress::Bars;
+use crate::stages::redacted;
 
 pub const VERBOSE: &str = "verbose";
 pub const QUIET: &str = "quiet";
@@ -65,6 +66,7 @@ impl Write for Line<'_> {
 impl Drop for Line<'_> {
     fn drop(&mut self) {
         // A log that cannot be written must not stop the work.
-        self.bars.suspend(|| io::stderr().write_all(&self.bytes).ok());
+        let line = redacted(&String::from_utf8_lossy(&self.bytes));
+        self.bars.suspend(|| io::stderr().write_all(line.as_bytes()).ok());
     }
 }

@@ -1,9 +1,11 @@
 //! The command line: flags, configuration, logging, progress and exit codes.
 //!
-//! This is the only room that prints, and `exit::report` is the only place that prints an error
-//! and chooses the exit code.
+//! This is the only room that prints, and `exit` is the only place that prints an error and chooses the exit
+//! code.
 
 mod config;
+mod environment;
+mod escaped;
 mod exit;
 mod interrupt;
 mod log;
@@ -11,9 +13,11 @@ mod progress;
 mod shell;
 
 use std::ffi::OsString;
-use std::io::Write as _;
+use std::io::Write;
+use std::path::Path;
 use std::process::ExitCode;
 
+use clap::builder::EnumValueParser;
 use clap::{Arg, ArgAction, ArgMatches, Command, FromArgMatches as _};
 
 use crate::stages::compact::Compact;
@@ -31,7 +35,8 @@ use crate::stages::query::Query;
 use crate::stages::train::Train;
 use crate::stages::vacuum::Vacuum;
 use crate::stages::view::View;
-use crate::stages::{Stage, Summary};
+use crate::stages::{Stage, Summary, is_standard_output};
+use exit::Form;
 use progress::Bars;
 
 /// A stage with its types taken away, for the front door.
@@ -39,7 +44,7 @@ struct Entry {
     name: &'static str,
     about: &'static str,
     command: fn() -> Command,
-    run: fn(&ArgMatches) -> anyhow::Result<Box<dyn Summary>>,
+    run: fn(&ArgMatches) -> ExitCode,
 }
 
 impl Entry {
@@ -69,71 +74,102 @@ fn entries() -> Vec<Entry> {
     ]
 }
 
+/// Returns the commands of every stage, without what runs them: a stage's own executable needs no other stage.
+fn commands() -> Vec<Command> {
+    vec![
+        command::<Ingest>(),
+        command::<Extract>(),
+        command::<Library>(),
+        command::<Train>(),
+        command::<Finetune>(),
+        command::<Export>(),
+        command::<Generate>(),
+        command::<Evaluate>(),
+        command::<Model>(),
+        command::<Plot>(),
+        command::<View>(),
+        #[cfg(feature = "query")]
+        command::<Query>(),
+    ]
+}
+
 /// Runs one stage's own executable, `motiongen-<stage>`.
 pub fn stage<S: Stage>() -> ExitCode {
     let command = command::<S>().name(format!("motiongen-{}", S::NAME)).version(VERSION);
     let arguments: Vec<OsString> = std::env::args_os().collect();
-    let matches = match matches(command, false, &arguments) {
-        Ok(matches) => matches,
-        Err(code) => return code,
-    };
-    exit::report(run_stage::<S>(&matches))
+    match matches(command, S::NAME, false, &arguments) {
+        Ok(matches) => run_stage::<S>(&matches),
+        Err(code) => code,
+    }
 }
 
 /// Runs `motiongen`, which has every stage as a subcommand.
 pub fn front_door() -> ExitCode {
     let entries = entries();
-    let mut command = Command::new("motiongen")
+    let mut command = Command::new(PROGRAM)
         .version(VERSION)
         .about("Turns a music library into motion, stage by stage.")
         .subcommand_value_name("STAGE")
-        .subcommand_help_heading("Stages, in the order of a pipeline");
+        .subcommand_help_heading("Stages, in the order of a pipeline")
+        .args(general("Take defaults from this TOML file".to_owned()));
     for entry in &entries {
         command = command.subcommand((entry.command)());
     }
     let stages: Vec<&'static str> = entries.iter().map(|entry| entry.name).collect();
-    command = command.after_help(shell::HINT).subcommands(shell::commands(&stages));
+    let hint = format!("{}\n\n{EXIT_CODES}", shell::HINT);
+    command = command.after_help(hint).subcommands(shell::commands(&stages));
     let program = command.clone();
     let arguments: Vec<OsString> = std::env::args_os().collect();
     if arguments.len() < 2 {
-        return exit::report(list_stages(&entries));
+        return exit::report(PROGRAM, Form::Text, list_stages(&entries));
     }
-    let matches = match matches(command, true, &arguments) {
+    let chosen = config::subcommand_named(&command, &arguments);
+    let name = chosen.as_deref().unwrap_or(PROGRAM);
+    let matches = match matches(command, name, true, &arguments) {
         Ok(matches) => matches,
         Err(code) => return code,
     };
     if let Some(told) = matches.subcommand().and_then(|chosen| shell::run(chosen, program)) {
-        return exit::report(told);
+        return exit::report(name, Form::Text, told);
     }
     let chosen = matches.subcommand().and_then(|(name, matches)| {
         entries.iter().find(|entry| entry.name == name).map(|entry| (entry, matches))
     });
     match chosen {
-        Some((entry, matches)) => exit::report((entry.run)(matches)),
-        None => exit::report(list_stages(&entries)),
+        Some((entry, matches)) => (entry.run)(matches),
+        None => exit::report(PROGRAM, Form::Text, list_stages(&entries)),
     }
 }
 
 /// Parses the command line over the configuration file; what is wrong is printed.
 fn matches(
     command: Command,
+    name: &str,
     is_front_door: bool,
     arguments: &[OsString],
 ) -> Result<ArgMatches, ExitCode> {
-    let command =
-        config::apply(command, is_front_door, arguments).map_err(|e| exit::report(Err(e)))?;
+    let form = Form::asked(arguments);
+    let stages = commands();
+    let variables = std::env::vars_os().map(|(variable, _)| variable);
+    let command = environment::check(&stages, variables)
+        .and_then(|()| config::apply(command, is_front_door, &stages, arguments))
+        .map_err(|e| exit::report(name, form, Err(e)))?;
     command
         .try_get_matches_from(arguments)
-        .map_err(|e| exit::usage(&e, config::file_named(arguments).as_deref()))
+        .map_err(|e| exit::usage(name, form, &e, config::file_named(arguments).as_deref()))
 }
 
+const PROGRAM: &str = "motiongen";
 const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 /// Returns a stage's command: its parameters and the flags that every stage has.
 fn command<S: Stage>() -> Command {
     use clap::Args as _;
-    let contract =
-        format!("Reads: {}\nWrites: {}\n\n{AFTER}", S::CONTRACT.reads, S::CONTRACT.writes);
+    let contract = format!(
+        "Reads: {}\nWrites: {}\n\n{AFTER}\n{EXIT_CODES}",
+        S::CONTRACT.reads,
+        S::CONTRACT.writes
+    );
     // The parameters' own doc comment would become the text about the stage, so that comes after.
     let mut command = S::Params::augment_args(Command::new(S::NAME))
         .about(S::ABOUT)
@@ -147,47 +183,67 @@ fn command<S: Stage>() -> Command {
             .mut_subcommands(|kind| kind.after_help(contract.clone()));
     }
     let config_help = config::help(&command);
-    let command = command
-        .arg(
-            Arg::new(config::FLAG)
-                .long(config::FLAG)
-                .value_name("FILE")
-                .help(config_help)
-                .help_heading("General")
-                .global(true),
-        )
-        .arg(
-            Arg::new(log::VERBOSE)
-                .long(log::VERBOSE)
-                .short('v')
-                .action(ArgAction::Count)
-                .help("Log more: -v progress of the work, -vv details, -vvv requests")
-                .help_heading("General")
-                .global(true),
-        )
-        .arg(
-            Arg::new(log::QUIET)
-                .long(log::QUIET)
-                .short('q')
-                .action(ArgAction::SetTrue)
-                .help("Show neither progress nor warnings")
-                .help_heading("General")
-                .global(true),
-        );
-    config::with_environment(command)
+    environment::with_environment(command.args(general(config_help)))
+}
+
+/// Returns the flags that every stage has, and that may stand before its name.
+fn general(config_help: String) -> [Arg; 4] {
+    let arg = |name: &'static str| Arg::new(name).long(name).help_heading("General").global(true);
+    [
+        arg(config::FLAG).value_name("FILE").help(config_help),
+        arg(exit::FLAG)
+            .value_name("FORM")
+            .value_parser(EnumValueParser::<Form>::new())
+            .default_value("text")
+            .help(
+                "What is told at the end, on standard output: text for people, or one JSON object",
+            ),
+        arg(log::VERBOSE)
+            .short('v')
+            .action(ArgAction::Count)
+            .help("Log more: -v progress of the work, -vv details, -vvv requests"),
+        arg(log::QUIET)
+            .short('q')
+            .action(ArgAction::SetTrue)
+            .help("Show neither progress nor warnings"),
+    ]
 }
 
 const AFTER: &str = "A value comes from the flag, else from the environment, else from the --config \
-                     file, else it is the default shown.\nExit codes: 0 done, 1 done but some items \
-                     failed (see the failures table), 2 could not run.";
+                     file, else it is the default shown.";
+const EXIT_CODES: &str = "Exit codes: 0 done, 1 done but some items failed (see the failures table), 2 could not \
+                          run, 75 stopped before it was done (SIGTERM, Ctrl-C): the same command goes on.";
 
-fn run_stage<S: Stage>(matches: &ArgMatches) -> anyhow::Result<Box<dyn Summary>> {
+fn run_stage<S: Stage>(matches: &ArgMatches) -> ExitCode {
     let quiet = matches.get_flag(log::QUIET);
+    let form = matches.get_one::<Form>(exit::FLAG).copied().unwrap_or_default();
     let bars = Bars::new(quiet);
     log::start(matches.get_count(log::VERBOSE), quiet, bars.clone());
-    let params = S::Params::from_arg_matches(matches)?;
-    S::run(params, &bars)
+    interrupt::listen(move || exit::stopped(S::NAME, form));
+    let run = || {
+        let params = S::Params::from_arg_matches(matches)?;
+        let is_aside = writes_to_standard_output(matches);
+        let claimed = S::claims_stdout(&params).or(is_aside.then_some("--output -"));
+        if let Some(what) = claimed.filter(|_| form == Form::Json) {
+            anyhow::bail!(
+                "{what} and --summary json both want standard output; give {what} a file, or leave --summary out"
+            );
+        }
+        let summary = S::run(params, &bars)?;
+        Ok(if is_aside { Box::new(AccountAside(summary)) as Box<dyn Summary> } else { summary })
+    };
+    exit::report(S::NAME, form, run())
 }
+
+/// Returns whether the file that a stage writes is standard output.
+fn writes_to_standard_output(matches: &ArgMatches) -> bool {
+    let of_kind = matches.subcommand().is_some_and(|(_, kind)| writes_to_standard_output(kind));
+    let named = OUTPUTS.iter().filter_map(|id| matches.try_get_raw(id).ok().flatten());
+    of_kind || named.flatten().any(|value| is_standard_output(Path::new(value)))
+}
+
+/// Parameters that name one file to be written.
+const OUTPUTS: [&str; 2] = ["output", "report"];
 
 fn list_stages(entries: &[Entry]) -> anyhow::Result<Box<dyn Summary>> {
     struct Stages(Vec<(&'static str, &'static str)>);
@@ -202,15 +258,30 @@ fn list_stages(entries: &[Entry]) -> anyhow::Result<Box<dyn Summary>> {
         fn n_failed(&self) -> u64 {
             0
         }
+        fn figures(&mut self) -> serde_json::Value {
+            serde_json::Value::Null
+        }
     }
     Ok(Box::new(Stages(entries.iter().map(|e| (e.name, e.about)).collect())))
 }
 
-/// Flushes what a stage has to say; a reader that went away is not an error.
-fn print(summary: &mut dyn Summary) -> std::io::Result<()> {
-    let mut out = std::io::BufWriter::new(std::io::stdout().lock());
-    match summary.write(&mut out).and_then(|()| out.flush()) {
-        Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
-        written => written,
+/// A stage whose file went to standard output, which has no room for its account.
+struct AccountAside(Box<dyn Summary>);
+
+impl Summary for AccountAside {
+    fn write(&mut self, _out: &mut dyn Write) -> std::io::Result<()> {
+        exit::account(self.0.as_mut(), &mut std::io::stderr().lock())
+    }
+
+    fn n_failed(&self) -> u64 {
+        self.0.n_failed()
+    }
+
+    fn is_stopped(&self) -> bool {
+        self.0.is_stopped()
+    }
+
+    fn figures(&mut self) -> serde_json::Value {
+        self.0.figures()
     }
 }

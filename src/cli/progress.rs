@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressState, ProgressStyle};
 
 use super::interrupt;
-use crate::stages::Progress;
+use crate::stages::{Progress, one_line, redacted};
 
 /// Time between plain lines.
 const LINE_EVERY: Duration = Duration::from_secs(10);
@@ -144,17 +144,17 @@ impl Progress for Bars {
     fn say(&self, text: &str) {
         let mut state = self.lock();
         if let Some(bar) = &state.bar {
-            bar.set_message(text.to_owned());
+            bar.set_message(one_line(text));
         }
         if let Some(count) = &mut state.count {
-            text.clone_into(&mut count.said);
+            count.said = one_line(text);
         }
     }
 
     #[expect(clippy::print_stderr, reason = "notes are for people, data for standard output")]
     fn note(&self, line: &str) {
         if self.mode != Mode::Silent {
-            self.suspend(|| eprintln!("{line}"));
+            self.suspend(|| eprintln!("{}", one_line(&redacted(line))));
         }
     }
 

@@ -89,4 +89,12 @@ impl Summary for Printed {
     fn n_failed(&self) -> u64 {
         0
     }
+
+    fn figures(&mut self) -> serde_json::Value {
+        serde_json::Value::Null
+    }
+
+    fn is_data(&self) -> bool {
+        true
+    }
 }

@@ -1,19 +1,32 @@
 //! `model.json`: what a model's folder says of itself.
 
-use serde::{Deserialize, Serialize};
+use std::fmt;
+
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use super::LearnedFrom;
 use crate::audio::{FEATURE_DIM, FeatureScale, feature_names};
 use crate::diffusion::DiffusionConfig;
-use crate::model::{DecoderConfig, UNetConfig};
+use crate::model::{DecoderConfig, MotionDecoder, UNet1D, UNetConfig};
 use crate::motion::postprocess::FusionVariances;
 use crate::motion::rates::MotionRange;
-use crate::motion::{CHANNEL_NAMES, Normalizer};
+use crate::motion::{CHANNEL_NAMES, MOTION_DIM, Normalizer};
 use crate::onnx::Storage;
 use crate::units::FPS;
 
 /// Layout of the card; raised when a field changes its meaning.
 pub const MODEL_FORMAT: u32 = 1;
+
+/// Largest card that is read, in bytes: the digests of ten million songs and phrases.
+pub const MAX_CARD_BYTES: u64 = 256 << 20;
+/// Parameters that a network may have, 8 GiB in f32.
+const MAX_PARAMETERS: usize = 1 << 31;
+/// Bytes of a file beside eight for each parameter and each value of the table of steps.
+const MAX_GRAPH_BYTES: u64 = 64 << 20;
+/// Longest window, in frames: over half an hour.
+const MAX_WINDOW_FRAMES: usize = 1 << 16;
+/// Longest name of a model, in bytes.
+const MAX_NAME_BYTES: usize = 100;
 
 /// The names of a model's files.
 pub mod file_names {
@@ -23,6 +36,58 @@ pub mod file_names {
     pub const UNET_WEIGHTS: &str = "unet.weights.bin";
     pub const DECODER: &str = "decoder.onnx";
     pub const DECODER_WEIGHTS: &str = "decoder.weights.bin";
+}
+
+/// The files that a model can have beside its card; a card can name no other.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum ModelFileName {
+    Unet,
+    UnetWeights,
+    Decoder,
+    DecoderWeights,
+}
+
+impl ModelFileName {
+    /// Every name, in the order in which cards list them.
+    pub const ALL: [Self; 4] = [Self::Unet, Self::UnetWeights, Self::Decoder, Self::DecoderWeights];
+
+    /// Returns the name of the file.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Unet => file_names::UNET,
+            Self::UnetWeights => file_names::UNET_WEIGHTS,
+            Self::Decoder => file_names::DECODER,
+            Self::DecoderWeights => file_names::DECODER_WEIGHTS,
+        }
+    }
+
+    /// Returns the file of that name; none where no model has such a file.
+    pub fn of_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|file| file.name() == name)
+    }
+}
+
+impl fmt::Display for ModelFileName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl Serialize for ModelFileName {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(self.name())
+    }
+}
+
+impl<'de> Deserialize<'de> for ModelFileName {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let text = String::deserialize(deserializer)?;
+        Self::of_name(&text).ok_or_else(|| {
+            let start: String = text.chars().take(MAX_NAME_BYTES).collect();
+            let known = Self::ALL.map(Self::name).join(", ");
+            serde::de::Error::custom(format!("a model has no file {start:?}, only {known}"))
+        })
+    }
 }
 
 /// A model: where it comes from, how it is used, and its files.
@@ -102,7 +167,7 @@ pub struct Networks<T> {
 /// A file of a model.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FileEntry {
-    pub name: String,
+    pub name: ModelFileName,
     pub n_bytes: u64,
     pub sha256: String,
 }
@@ -126,7 +191,12 @@ pub enum CardError {
     #[error("{place}: {problem}")]
     Config { place: String, problem: String },
     #[error("{place}: has no file {name}; export the model again")]
-    NoFile { place: String, name: &'static str },
+    NoFile { place: String, name: ModelFileName },
+    #[error(
+        "{place}: has {found} bytes, model.json says {expected}; the file was changed or damaged; copy it again \
+         or export the model again"
+    )]
+    Size { place: String, found: u64, expected: u64 },
     #[error(
         "{place}: SHA-256 is {found}, model.json says {expected}; the file was changed or damaged; copy it \
          again or export the model again"
@@ -162,13 +232,16 @@ impl ModelCard {
         if card.fps != FPS {
             return layout("frames", format!("{} a second instead of {FPS}", card.fps));
         }
-        let n_scaled = card.feature_scale.centre.len().min(card.feature_scale.scale.len());
-        if n_scaled != FEATURE_DIM {
-            return layout("features", format!("{n_scaled} are scaled instead of {FEATURE_DIM}"));
+        for n_scaled in [card.feature_scale.centre.len(), card.feature_scale.scale.len()] {
+            if n_scaled != FEATURE_DIM {
+                let detail = format!("{n_scaled} are scaled instead of {FEATURE_DIM}");
+                return layout("features", detail);
+            }
         }
         let config = |problem: String| CardError::Config { place: place(), problem };
-        card.unet.check().map_err(|e| config(e.to_string()))?;
-        card.diffusion.check().map_err(|e| config(e.to_string()))?;
+        let n_elements = card.check_networks().map_err(config)?;
+        card.check_scales().map_err(config)?;
+        card.check_files(&n_elements).map_err(config)?;
         if let Some(sampling) = &card.sampling {
             if !(sampling.guidance.is_finite() && sampling.guidance >= 0.0) {
                 return Err(config(format!(
@@ -182,10 +255,88 @@ impl ModelCard {
                 )));
             }
         }
-        if card.window_frames < 2 {
-            return Err(config("window_frames is below 2; export the model again".to_owned()));
+        if !(2..=MAX_WINDOW_FRAMES).contains(&card.window_frames) {
+            return Err(config(format!(
+                "window_frames is {}; it must be 2 to {MAX_WINDOW_FRAMES}; export the model again",
+                card.window_frames
+            )));
+        }
+        if !is_name(&card.name) {
+            let name: String = card.name.chars().take(MAX_NAME_BYTES).collect();
+            return Err(config(format!(
+                "name {name:?} is none of a model: 1 to {MAX_NAME_BYTES} letters, digits, -, _ and ., and no . at \
+                 the beginning; export the model again"
+            )));
         }
         Ok(card)
+    }
+
+    /// Refuses networks that do not fit this program, or any memory; returns how many parameters each has.
+    fn check_networks(&self) -> Result<Networks<usize>, String> {
+        let Self { unet, decoder, diffusion, .. } = self;
+        unet.check().map_err(|e| e.to_string())?;
+        decoder.check().map_err(|e| e.to_string())?;
+        diffusion.check().map_err(|e| e.to_string())?;
+        let again = "export the model again";
+        for (name, found, expected) in [
+            ("in_channels", unet.in_channels, MOTION_DIM),
+            ("out_channels", unet.out_channels, MOTION_DIM),
+            ("audio_cond_dim", unet.audio_cond_dim, FEATURE_DIM),
+            ("input_dim of the decoder", decoder.input_dim, MOTION_DIM),
+            ("n_steps of the network", unet.n_steps, diffusion.n_steps),
+        ] {
+            if found != expected {
+                return Err(format!("{name} is {found}, expected {expected}; {again}"));
+            }
+        }
+        let n_elements = Networks {
+            unet: UNet1D::new(unet).1.n_elements(),
+            decoder: MotionDecoder::new(decoder).1.n_elements(),
+        };
+        for (name, n) in [("UNet", n_elements.unet), ("decoder", n_elements.decoder)] {
+            if n > MAX_PARAMETERS {
+                return Err(format!(
+                    "the {name} has {n} parameters, at most {MAX_PARAMETERS} are read; {again}"
+                ));
+            }
+        }
+        Ok(n_elements)
+    }
+
+    /// Refuses scales by which nothing can be divided.
+    fn check_scales(&self) -> Result<(), String> {
+        let Self { normalizer, feature_scale, .. } = self;
+        let centres = normalizer.centre.iter().chain(&feature_scale.centre);
+        let scales = normalizer.scale.iter().chain(&feature_scale.scale);
+        if let Some(centre) = centres.into_iter().find(|x| !x.is_finite()) {
+            return Err(format!("a centre is {centre}; export the model again"));
+        }
+        if let Some(scale) = scales.into_iter().find(|x| !(x.is_finite() && **x > 0.0)) {
+            return Err(format!("a scale is {scale}; it must be above 0; export the model again"));
+        }
+        Ok(())
+    }
+
+    /// Refuses files that are listed twice, or are larger than what they hold.
+    fn check_files(&self, n_elements: &Networks<usize>) -> Result<(), String> {
+        let n_table = self.unet.n_steps * self.unet.time_embed_dim;
+        let most = |n_values: usize| 8 * n_values as u64 + MAX_GRAPH_BYTES;
+        let (of_unet, of_decoder) = (most(n_elements.unet + n_table), most(n_elements.decoder));
+        for (i, FileEntry { name, n_bytes, .. }) in self.files.iter().enumerate() {
+            if self.files[..i].iter().any(|before| before.name == *name) {
+                return Err(format!("{name} is listed twice; export the model again"));
+            }
+            let most = match name {
+                ModelFileName::Unet | ModelFileName::UnetWeights => of_unet,
+                ModelFileName::Decoder | ModelFileName::DecoderWeights => of_decoder,
+            };
+            if *n_bytes > most {
+                return Err(format!(
+                    "{name} has {n_bytes} bytes, a network of these sizes at most {most}; export the model again"
+                ));
+            }
+        }
+        Ok(())
     }
 
     /// Returns the guidance that the model is sampled with unless the user says otherwise.
@@ -202,10 +353,19 @@ impl ModelCard {
     ///
     /// # Errors
     /// [`CardError::NoFile`] when the card lists none.
-    pub fn file(&self, name: &'static str, place: &str) -> Result<&FileEntry, CardError> {
+    pub fn file(&self, name: ModelFileName, place: &str) -> Result<&FileEntry, CardError> {
         let found = self.files.iter().find(|file| file.name == name);
         found.ok_or_else(|| CardError::NoFile { place: place.to_owned(), name })
     }
+}
+
+/// Returns whether a name can be that of a model: 1 to 100 letters, digits, `-`, `_` and `.`, and no `.` at the
+/// beginning.
+pub fn is_name(name: &str) -> bool {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || ['-', '_', '.'].contains(&c);
+    (1..=MAX_NAME_BYTES).contains(&name.len())
+        && name.chars().all(is_plain)
+        && !name.starts_with('.')
 }
 
 /// Returns the names of the channels, as cards have them.
@@ -230,3 +390,6 @@ fn difference(found: &[String], own: &[String]) -> Option<String> {
         name(own)
     ))
 }
+
+#[cfg(test)]
+mod tests;

@@ -19,8 +19,8 @@ mod walk;
 mod windows;
 
 pub use card::{
-    CardError, FileEntry, MODEL_FORMAT, ModelCard, Networks, Provenance, SamplingDefaults,
-    file_names, own_channels, own_features,
+    CardError, FileEntry, MAX_CARD_BYTES, MODEL_FORMAT, ModelCard, ModelFileName, Networks,
+    Provenance, SamplingDefaults, file_names, is_name, own_channels, own_features,
 };
 pub use control::{Constraints, ControlError, Miss, REACH_FRAMES, Wanted, continuing, facing};
 pub use eager::EagerEngine;

@@ -10,6 +10,7 @@ use crate::motion::{Channel, ChannelLimits, MOTION_DIM};
 use super::graph::{Activation, Graph, Result};
 use super::layers::{LayerNorm, Linear};
 use super::parameter::{ParameterList, Scope};
+use super::unet::{ConfigError, MAX_BLOCKS, MAX_WIDTH};
 use fusion::{Kinematics, PoseFusion};
 
 /// Below this norm a quaternion is divided by it instead (PyTorch's `normalize`).
@@ -47,6 +48,39 @@ impl Default for DecoderConfig {
         }
     }
 }
+
+impl DecoderConfig {
+    /// Refuses sizes of which no network can be made.
+    ///
+    /// # Errors
+    /// One sentence: the number and what it must be.
+    pub fn check(&self) -> Result<(), ConfigError> {
+        for (name, value, least, most) in [
+            ("input_dim", self.input_dim, 1, MAX_WIDTH),
+            ("hidden_dim", self.hidden_dim, 1, MAX_WIDTH),
+            ("n_blocks", self.n_blocks, 0, MAX_BLOCKS),
+            ("expansion", self.expansion, 1, MAX_EXPANSION),
+        ] {
+            if !(least..=most).contains(&value) {
+                let rule =
+                    format!("{name} of the decoder is {value}; it must be {least} to {most}");
+                return Err(ConfigError(rule));
+            }
+        }
+        if !(0.0..1.0).contains(&self.dropout) {
+            let rule = "it must lie in [0, 1)";
+            return Err(ConfigError(format!("dropout of the decoder is {}; {rule}", self.dropout)));
+        }
+        if let Some((name, variance)) = self.fusion.as_ref().and_then(FusionVariances::unsound) {
+            let rule = "it must be above 0";
+            return Err(ConfigError(format!("{name} of the decoder is {variance}; {rule}")));
+        }
+        Ok(())
+    }
+}
+
+/// Widest inner layer of a block, in units of its width.
+const MAX_EXPANSION: usize = 16;
 
 /// Maps a latent, frame by frame, to motion that keeps its channels' constraints.
 #[derive(Clone, Debug)]

@@ -394,6 +394,11 @@ mod tests {
         }
 
         #[test]
+        fn arbitrary_bytes_never_panic(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
+            let _ = Beats::parse(&String::from_utf8_lossy(&bytes));
+        }
+
+        #[test]
         fn phases_lie_in_the_half_open_bar(
             steps in prop::collection::vec(0.01..2.0f64, 1..9), at in -50.0..50.0f64,
             bars in 1..7u32

@@ -134,6 +134,14 @@ fn tensor_rules(tensor: &Tensor) -> Result<(), String> {
         Ok(DataType::Int64) => 8,
         _ => return Err(format!("initializer {name} has elements of a kind that is not written")),
     };
+    let location = tensor.external_data.iter().find(|entry| entry.key == "location");
+    if let Some(location) = location.map(|entry| entry.value.as_str())
+        && (location.contains(['/', '\\']) || location.starts_with('.'))
+    {
+        return Err(format!(
+            "initializer {name} lies in {location:?}, which is not beside the file"
+        ));
+    }
     let n =
         tensor.dims.iter().try_fold(1_usize, |n, &dim| n.checked_mul(usize::try_from(dim).ok()?));
     let expected = n.and_then(|n| n.checked_mul(size));

@@ -15,9 +15,10 @@ mod parts;
 mod proto;
 mod runtime;
 mod session;
+mod storage;
 mod weights;
 
-pub use builder::{Axes, Builder, Form, Storage, Value};
+pub use builder::{Axes, Builder, Form, Value};
 pub use check::check;
 pub use error::OnnxError;
 pub use file::{EMBEDDED_BYTES, Encoded, IR_VERSION, ModelFile, OPSET};
@@ -25,4 +26,5 @@ pub use networks::{DecoderNames, UNetNames, decoder, unet};
 pub use proto::{Graph, Model};
 pub use runtime::{Device, PINNED_VERSION, Runtime};
 pub use session::{Numbers, Session, SessionOptions, Tensor};
+pub use storage::Storage;
 pub use weights::values_of;

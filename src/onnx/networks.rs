@@ -6,8 +6,9 @@ use crate::model::{
 };
 use crate::motion::{CLOCK_DIM, MOTION_DIM};
 
-use super::builder::{Axes, Builder, Form, Storage};
+use super::builder::{Axes, Builder, Form};
 use super::proto::Graph;
+use super::storage::Storage;
 
 /// The inputs and the output of `unet.onnx`.
 #[derive(Clone, Copy, Debug)]

@@ -43,7 +43,7 @@ impl Stage for Compact {
         let lease = match params.dry_run {
             true => None,
             false => {
-                store.sweep()?;
+                store.sweep();
                 Some(Lease::take(&store, Self::NAME, &waiting)?)
             }
         };
@@ -117,5 +117,26 @@ impl Summary for CompactSummary {
 
     fn n_failed(&self) -> u64 {
         0
+    }
+
+    fn is_stopped(&self) -> bool {
+        self.done.is_interrupted
+    }
+
+    fn figures(&mut self) -> serde_json::Value {
+        let Compaction { n_parts_before, n_parts_old, n_parts_new, n_rows, n_bytes, .. } =
+            self.done;
+        serde_json::json!({
+            "store": self.store,
+            "dry_run": self.dry_run,
+            "n_parts_before": n_parts_before,
+            "n_parts_old": n_parts_old,
+            "n_parts_new": n_parts_new,
+            "n_rows": n_rows,
+            "n_bytes": n_bytes,
+            "n_unknown": self.done.n_unknown,
+            "delta": self.delta,
+            "took_s": self.took_s,
+        })
     }
 }

@@ -4,7 +4,7 @@ use std::fmt;
 use std::io::{self, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-use crate::store::digest;
+use crate::store::{digest, one_line};
 
 /// Spells each kind once: its name here, its name in tables, and its place among all.
 macro_rules! kinds {
@@ -70,6 +70,8 @@ kinds! {
     QuaternionNorm = "quaternion_norm",
     Shape = "shape",
     SoundFont = "soundfont",
+    /// Features of other content than the phrase has now.
+    StaleFeatures = "stale_features",
     Symlink = "symlink",
     /// A tempo that nobody dances to.
     Tempo = "tempo",
@@ -152,7 +154,9 @@ pub(in crate::stages) fn write_failures<'a, N: fmt::Display>(
 ) -> io::Result<()> {
     let n_failed = failed.len();
     for (name, failure) in failed.take(N_SHOWN) {
-        writeln!(out, "  failed [{}] {name}: {}", failure.kind.name(), failure.message)?;
+        // Names come from files, whose owners may have called them anything.
+        let sentence = one_line(&format!("{name}: {}", failure.message));
+        writeln!(out, "  failed [{}] {sentence}", failure.kind.name())?;
     }
     if n_failed > N_SHOWN {
         writeln!(out, "  … and {} more", n_failed - N_SHOWN)?;
@@ -163,7 +167,31 @@ pub(in crate::stages) fn write_failures<'a, N: fmt::Display>(
     }
 }
 
+/// Returns the first failures of a job as JSON, each with its name, kind and sentence.
+pub(in crate::stages) fn failures_json<'a, N: fmt::Display>(
+    failed: impl Iterator<Item = (N, &'a Failure)>,
+) -> serde_json::Value {
+    let told = failed.take(N_SHOWN).map(|(name, failure)| {
+        serde_json::json!({
+            "item": name.to_string(),
+            "kind": failure.kind.name(),
+            "message": failure.message,
+        })
+    });
+    told.collect()
+}
+
 /// Returns the command that shows the failures of a store.
 pub(in crate::stages) fn query_of_failures(store: &str) -> String {
+    let store = quoted(store);
     format!("motiongen query --store {store} \"select phrase_id, kind, message from failures\"")
+}
+
+/// Quotes a word for the shell where it needs it.
+pub(in crate::stages) fn quoted(word: &str) -> String {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./:=,@+%".contains(c);
+    if !word.is_empty() && word.chars().all(is_plain) {
+        return word.to_owned();
+    }
+    format!("'{}'", word.replace('\'', r"'\''"))
 }

@@ -6,11 +6,12 @@ use std::time::Duration;
 
 use anyhow::ensure;
 
+use super::failure::quoted;
 use super::learned::{learned_path, remember};
 use super::train::session::{
     Looker, MachineParams, check_run_name, claim, claim_path, lease_of, read_phrases,
 };
-use super::train::{Account, StageAccount, quoted, restore};
+use super::train::{Account, DryRun, StageAccount, restore};
 use super::trained::{Stand, Trained};
 use super::{ClientParams, Contract, Progress, Stage, Summary};
 use crate::store::Location;
@@ -104,6 +105,9 @@ pub struct Params {
     /// Seed of everything that is left to chance.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
+    /// Say what would be done, and do nothing.
+    #[arg(long)]
+    pub dry_run: bool,
     /// Start fine-tuning anew: its checkpoints and its log are removed.
     #[arg(long)]
     pub force: bool,
@@ -290,17 +294,17 @@ impl Stage for Finetune {
         );
         let Trained { state: trained, unet, decoder, .. } =
             Trained::read(&store, run, Stand::Train)?;
-        let lease = lease_of(&store, run, &watch)?;
-        if params.force {
-            checkpoints.clear()?;
-            Journal::open(&store, Self::NAME, run, Self::NAME)?.clear()?;
-            store.remove(&claim_path(run, Self::NAME))?;
-            store.remove(&learned_path(run, Self::NAME))?;
+        let lease = match params.dry_run {
+            true => None,
+            false => Some(lease_of(&store, run, &watch)?),
+        };
+        if !params.dry_run {
+            store.sweep();
         }
-        store.sweep()?;
         let machine = &params.machine;
-        let limit = config.num_phrases;
-        let phrases = read_phrases(&store, Self::NAME, machine, limit, progress, &watch)?;
+        let (limit, is_dry_run) = (config.num_phrases, params.dry_run);
+        let phrases =
+            read_phrases(&store, Self::NAME, machine, limit, progress, &watch, is_dry_run)?;
         let network = &trained.config.network;
         let windows = Windows::new(
             Arc::clone(&phrases.dataset),
@@ -321,6 +325,23 @@ impl Stage for Finetune {
         .on(&Arc::new(machine.start_threads()?));
         // The learner has copies; of `base` they are half a gigabyte.
         drop((unet, decoder));
+        if params.dry_run {
+            return Ok(Box::new(DryRun {
+                run: params.run.clone(),
+                what: "fine-tune both networks".to_owned(),
+                n_train: windows.n_train(),
+                n_validation: windows.n_validation(),
+                n_left_out: phrases.left_out.len(),
+                steps_per_epoch: windows.n_train().div_ceil(params.batch_size.get()),
+            }));
+        }
+        // Only now is it certain that there is something to learn and to learn from.
+        if params.force {
+            checkpoints.clear()?;
+            Journal::open(&store, Self::NAME, run, Self::NAME)?.clear()?;
+            store.remove(&claim_path(run, Self::NAME))?;
+            store.remove(&learned_path(run, Self::NAME))?;
+        }
         claim(&store, run, Self::NAME, &config, machine.patience(), &watch)?;
         let fresh = State::new(
             Self::NAME,
@@ -332,11 +353,15 @@ impl Stage for Finetune {
         remember(&store, run, Self::NAME, &phrases.dataset, machine.patience(), &watch)?;
         let started_at = state.progress.step;
         let plan = params.plan(&windows);
+        let journal = Journal::open(&store, Self::NAME, run, Self::NAME)?;
         let mut drive = Drive {
             plan,
             state,
             checkpoints,
-            journal: Journal::open(&store, Self::NAME, run, Self::NAME)?.under(&lease),
+            journal: match &lease {
+                Some(lease) => journal.under(lease),
+                None => journal,
+            },
             watch: &watch,
             anchor: claim_path(run, Self::NAME),
         };

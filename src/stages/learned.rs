@@ -8,7 +8,7 @@ use super::train::session::{Looker, MachineParams, read_phrases};
 use super::trained::{Trained, Tuned};
 use super::{Progress, Stage as _, finetune::Finetune, pretrained, train::Train};
 
-use crate::generation::{CardError, LearnedFrom, ModelCard, Purpose, file_names};
+use crate::generation::{CardError, LearnedFrom, MAX_CARD_BYTES, ModelCard, Purpose, file_names};
 use crate::store::{Location, Patience, StoreError};
 use crate::training::{Dataset, Split};
 
@@ -78,9 +78,10 @@ pub fn of_run(
     trained: &Trained,
     machine: &MachineParams,
     progress: &dyn Progress,
+    is_dry_run: bool,
 ) -> anyhow::Result<Option<LearnedFrom>> {
     let of = |command, data: &str, most| {
-        of_command(store, run, command, (data, most), machine, progress)
+        of_command(store, run, command, (data, most), machine, progress, is_dry_run)
     };
     let Some(by_train) = of(Train::NAME, &trained.state.data, None)? else { return Ok(None) };
     let Some(Tuned { data, num_phrases }) = &trained.tuned else { return Ok(Some(by_train)) };
@@ -100,6 +101,7 @@ fn of_command(
     (data, max_train_phrases): (&str, Option<usize>),
     machine: &MachineParams,
     progress: &dyn Progress,
+    is_dry_run: bool,
 ) -> anyhow::Result<Option<LearnedFrom>> {
     let text = store.read_if_there(&learned_path(run, command))?;
     let listed: Option<LearnedFrom> = text.and_then(|text| serde_json::from_slice(&text).ok());
@@ -109,7 +111,8 @@ fn of_command(
     }
     let watch = Looker(progress);
     let stage = super::export::Export::NAME;
-    let phrases = read_phrases(store, stage, machine, max_train_phrases, progress, &watch)?;
+    let phrases =
+        read_phrases(store, stage, machine, max_train_phrases, progress, &watch, is_dry_run)?;
     if phrases.dataset.fingerprint() != data {
         return Ok(listed);
     }
@@ -197,5 +200,8 @@ fn card_of(store: &Location, model: &str) -> Result<Option<Bytes>, StoreError> {
     }
     let path = format!("{}/{}", current_folder(store, &folder_of(model))?, file_names::CARD);
     let of_program = || (model == pretrained::NAME).then(|| pretrained::file(file_names::CARD));
-    Ok(store.read_if_there(&path)?.or_else(|| of_program().flatten()))
+    match store.read_regular(&path, MAX_CARD_BYTES) {
+        Err(StoreError::NotFound { .. }) => Ok(of_program().flatten()),
+        read => read.map(Some),
+    }
 }

@@ -20,6 +20,7 @@ mod pretrained;
 #[cfg(feature = "query")]
 pub mod query;
 mod retrieval;
+mod seen;
 pub mod train;
 mod trained;
 pub mod vacuum;
@@ -29,6 +30,7 @@ use std::io::{self, Write};
 use std::num::NonZeroUsize;
 
 use crate::store::ClientOptions;
+pub use crate::store::{STANDARD_OUTPUT, is_standard_output, lines, one_line, redacted};
 
 /// One stage of the pipeline.
 pub trait Stage {
@@ -39,6 +41,11 @@ pub trait Stage {
     /// Tables read and written, for the help text.
     const CONTRACT: Contract;
     type Params: clap::Args;
+
+    /// Returns the flag by which these parameters ask for standard output while the stage runs.
+    fn claims_stdout(_params: &Self::Params) -> Option<&'static str> {
+        None
+    }
 
     /// Does the work.
     ///
@@ -69,7 +76,7 @@ pub trait Progress: Sync {
     fn say(&self, text: &str);
     /// Says something that stays.
     fn note(&self, line: &str);
-    /// Returns whether the user asked for an end (Ctrl-C, or a signal to terminate). Who asks gets a
+    /// Returns whether the user asked for an end (Ctrl-C, or a signal to terminate). A stage that asks gets a
     /// chance to finish what is under way: until the first call such a signal ends the program at once,
     /// and a second one always does.
     fn is_interrupted(&self) -> bool;
@@ -104,11 +111,31 @@ pub trait Summary {
 
     /// Returns how many items failed; they are in the `failures` table.
     fn n_failed(&self) -> u64;
+
+    /// Returns whether the stage was stopped before it was done.
+    fn is_stopped(&self) -> bool {
+        false
+    }
+
+    /// Returns the figures of the account as a JSON object, for programs; names carry units.
+    fn figures(&mut self) -> serde_json::Value;
+    /// Returns whether what is written is data, whose bytes are for a program, and no account for people.
+    fn is_data(&self) -> bool {
+        false
+    }
 }
 
 /// Returns how many threads this machine runs side by side, the default of every stage that has workers.
 pub(in crate::stages) fn all_threads() -> NonZeroUsize {
     std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN)
+}
+
+/// How links in a source are treated; the same flag in every stage that reads one.
+#[derive(Clone, Copy, Debug, Default, clap::Args)]
+pub struct LinkParams {
+    /// Follow symbolic links that lead out of the source, whose files are failures otherwise.
+    #[arg(long)]
+    pub follow_links: bool,
 }
 
 /// How remote storage is used; the same flags in every stage.

@@ -10,11 +10,13 @@ use sha2::{Digest as _, Sha256};
 
 use super::{all_threads, pretrained};
 use crate::autodiff::Parameters;
+pub use crate::generation::is_name as is_model_name;
 use crate::generation::{
-    CardError, EagerEngine, Engine, FileEntry, ModelCard, OnnxEngine, SessionPlan, file_names,
+    CardError, EagerEngine, Engine, FileEntry, MAX_CARD_BYTES, ModelCard, ModelFileName,
+    OnnxEngine, SessionPlan, file_names,
 };
 use crate::model::{MotionDecoder, ParameterList, UNet1D};
-use crate::onnx::{Device, Model, OnnxError, PINNED_VERSION, Runtime, Session, values_of};
+use crate::onnx::{Device, Model, OnnxError, PINNED_VERSION, Runtime, Session, check, values_of};
 use crate::store::{Location, StoreError, prepared};
 
 /// What runs a model.
@@ -122,13 +124,6 @@ pub fn current_folder(store: &Location, folder: &str) -> Result<String, StoreErr
     }
 }
 
-/// Returns whether a name can be that of a model: 1 to 100 letters, digits, `-`, `_` and `.`, and no `.` at the
-/// beginning.
-pub fn is_model_name(name: &str) -> bool {
-    let is_plain = |c: char| c.is_ascii_alphanumeric() || ['-', '_', '.'].contains(&c);
-    (1..=100).contains(&name.len()) && name.chars().all(is_plain) && !name.starts_with('.')
-}
-
 impl OpenModel {
     /// Opens a model of a store, and fetches its files if the store is far away.
     ///
@@ -147,7 +142,7 @@ impl OpenModel {
     fn of_store_once(store: &Location, name: &str, cache: &Path) -> anyhow::Result<Self> {
         let folder = current_folder(store, &folder_of(name))?;
         let path = format!("{folder}/{}", file_names::CARD);
-        let bytes = match store.read(&path) {
+        let bytes = match store.read_regular(&path, MAX_CARD_BYTES) {
             Err(StoreError::NotFound { .. }) if name == pretrained::NAME => {
                 return Self::pretrained();
             }
@@ -167,11 +162,8 @@ impl OpenModel {
         let key = format!("model-{}", &sha256(&bytes)[..32]);
         let fetched = prepared(cache, &key, |into| {
             for file in &card.files {
-                let bytes = store.read(&format!("{folder}/{}", file.name))?;
-                verify(file, &sha256(&bytes), &place)?;
-                let to = into.join(&file.name);
-                crate::store::write_file(&to, |out| out.write_all(&bytes))
-                    .with_context(|| to.display().to_string())?;
+                let bytes = read_listed(store, &folder, file, &place)?;
+                write_verified(into, file, &bytes, &place)?;
             }
             anyhow::Ok(())
         })?;
@@ -186,7 +178,7 @@ impl OpenModel {
         let current = current_folder(&Location::local(folder)?, "")?;
         let folder = &folder.join(current);
         let store = Location::local(folder)?;
-        let bytes = store.read(file_names::CARD)?;
+        let bytes = store.read_regular(file_names::CARD, MAX_CARD_BYTES)?;
         let card = ModelCard::read(&bytes, &store.url_of(file_names::CARD))?;
         let place = folder.display().to_string();
         let source = Source::Folder(folder.to_owned());
@@ -217,23 +209,18 @@ impl OpenModel {
         let key = format!("model-{}", &sha256(&serde_json::to_vec(&self.card)?)[..32]);
         prepared(cache, &key, |into| {
             for file in &self.card.files {
-                let bytes = self.bytes(&file.name)?;
-                verify(file, &sha256(&bytes), &self.place)?;
-                let to = into.join(&file.name);
-                crate::store::write_file(&to, |out| out.write_all(&bytes))
-                    .with_context(|| to.display().to_string())?;
+                write_verified(into, file, &self.bytes(file)?, &self.place)?;
             }
             anyhow::Ok(())
         })
     }
 
     /// Reads a file as it is.
-    fn bytes(&self, name: &str) -> anyhow::Result<Bytes> {
+    fn bytes(&self, file: &FileEntry) -> anyhow::Result<Bytes> {
         match &self.source {
-            Source::Folder(folder) => Ok(Location::local(folder)?.read(name)?),
-            Source::Pretrained => {
-                pretrained::file(name).with_context(|| format!("{} has no file {name}", self.place))
-            }
+            Source::Folder(folder) => read_listed(&Location::local(folder)?, "", file, &self.place),
+            Source::Pretrained => pretrained::file(file.name.name())
+                .with_context(|| format!("{} has no file {}", self.place, file.name)),
         }
     }
 
@@ -283,10 +270,11 @@ impl OpenModel {
     ) -> anyhow::Result<EagerEngine> {
         let card = &self.card;
         let (_, list) = UNet1D::new(&card.unet);
-        let unet_parameters = self.parameters(file_names::UNET, file_names::UNET_WEIGHTS, list)?;
+        let unet_parameters =
+            self.parameters(ModelFileName::Unet, ModelFileName::UnetWeights, list)?;
         let (decoder, list) = MotionDecoder::new(&card.decoder);
         let decoder_parameters =
-            self.parameters(file_names::DECODER, file_names::DECODER_WEIGHTS, list)?;
+            self.parameters(ModelFileName::Decoder, ModelFileName::DecoderWeights, list)?;
         let engine = EagerEngine::new(
             (&card.unet, unet_parameters),
             (decoder, decoder_parameters),
@@ -327,15 +315,11 @@ impl OpenModel {
 
     fn parameters(
         &self,
-        name: &'static str,
-        weights_name: &'static str,
+        name: ModelFileName,
+        weights_name: ModelFileName,
         list: ParameterList,
     ) -> anyhow::Result<Parameters<f32>> {
-        let bytes = self.read(name)?;
-        let has_weights = self.card.files.iter().any(|file| file.name == weights_name);
-        let weights = if has_weights { Some(self.read(weights_name)?) } else { None };
-        let place = format!("{}/{name}", self.place);
-        let model = Model::read(bytes, weights.as_ref(), &place)?;
+        let (model, place) = self.graph(name, weights_name)?;
         // Looked up first, since filling cannot fail.
         for (_, parameter) in list.iter() {
             values_of(&model, parameter, &place)?;
@@ -346,10 +330,29 @@ impl OpenModel {
         Ok(Parameters::from_fn(list, values))
     }
 
+    /// Reads a network, and what messages call its file.
+    fn graph(
+        &self,
+        name: ModelFileName,
+        weights_name: ModelFileName,
+    ) -> anyhow::Result<(Model, String)> {
+        let bytes = self.read(name)?;
+        let has_weights = self.card.files.iter().any(|file| file.name == weights_name);
+        let weights = if has_weights { Some(self.read(weights_name)?) } else { None };
+        let place = format!("{}/{name}", self.place);
+        Ok((Model::read(bytes, weights.as_ref(), &place)?, place))
+    }
+
+    /// Refuses a network that is not made as this program makes them: onnxruntime runs whatever a file says.
+    fn check_graph(&self, name: ModelFileName, weights_name: ModelFileName) -> anyhow::Result<()> {
+        let (model, place) = self.graph(name, weights_name)?;
+        Ok(check(&model, &place)?)
+    }
+
     /// Reads a file and holds it against the card.
-    fn read(&self, name: &'static str) -> anyhow::Result<Bytes> {
+    fn read(&self, name: ModelFileName) -> anyhow::Result<Bytes> {
         let entry = self.card.file(name, &self.place)?;
-        let bytes = self.bytes(name)?;
+        let bytes = self.bytes(entry)?;
         if !self.is_verified {
             verify(entry, &sha256(&bytes), &self.place)?;
         }
@@ -370,14 +373,17 @@ impl OpenModel {
         let folder = self.folder(cache)?;
         let unet = folder.join(file_names::UNET);
         let decoder = folder.join(file_names::DECODER);
+        let check_unet = || self.check_graph(ModelFileName::Unet, ModelFileName::UnetWeights);
+        self.check_graph(ModelFileName::Decoder, ModelFileName::DecoderWeights)?;
         // Files are looked through while onnxruntime loads what it has of them already.
         std::thread::scope(|scope| {
             let verified = scope.spawn(|| self.verify());
             let opened = (|| {
                 if plan.device != Device::Cpu {
+                    check_unet()?;
                     return Ok(OnnxEngine::open(runtime, (&unet, false), &decoder, config, plan)?);
                 }
-                let entry = self.card.file(file_names::UNET, &self.place)?;
+                let entry = self.card.file(ModelFileName::Unet, &self.place)?;
                 let key = format!(
                     "optimized-{}",
                     &sha256(
@@ -393,6 +399,7 @@ impl OpenModel {
                 let optimized = prepared(cache, &key, |into| {
                     // What is kept must come from the file that the card names.
                     self.verify()?;
+                    check_unet()?;
                     Ok::<_, anyhow::Error>(Session::optimize(
                         runtime,
                         &unet,
@@ -414,10 +421,37 @@ impl OpenModel {
             return Ok(());
         }
         for file in &self.card.files {
-            verify(file, &sha256(&self.bytes(&file.name)?), &self.place)?;
+            verify(file, &sha256(&self.bytes(file)?), &self.place)?;
         }
         Ok(())
     }
+}
+
+/// Reads a file that a card lists, if it is a regular one of the size that the card says.
+fn read_listed(
+    location: &Location,
+    folder: &str,
+    file: &FileEntry,
+    place: &str,
+) -> anyhow::Result<Bytes> {
+    let path = match folder {
+        "" => file.name.name().to_owned(),
+        folder => format!("{folder}/{}", file.name),
+    };
+    let found = location.size_bytes(&path)?;
+    if found != file.n_bytes {
+        let place = format!("{place}/{}", file.name);
+        return Err(CardError::Size { place, found, expected: file.n_bytes }.into());
+    }
+    Ok(location.read_regular(&path, file.n_bytes)?)
+}
+
+/// Writes a file into a folder of the cache if it is what the card says.
+fn write_verified(into: &Path, file: &FileEntry, bytes: &[u8], place: &str) -> anyhow::Result<()> {
+    verify(file, &sha256(bytes), place)?;
+    let to = into.join(file.name.name());
+    crate::store::write_file(&to, |out| out.write_all(bytes))
+        .with_context(|| to.display().to_string())
 }
 
 fn verify(file: &FileEntry, found: &str, folder: &str) -> Result<(), CardError> {

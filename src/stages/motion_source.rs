@@ -13,7 +13,10 @@ use super::ingest::{Ingest, read_beats, read_trajectory};
 use super::plot::nearest::nearest;
 use crate::motion::{Trajectory, exchange, npy};
 use crate::store::tables::{self, FailureRow, GenerationRow, PhraseRow};
-use crate::store::{ClientOptions, ItemTables, Location, Row as _, Snapshot, StoreError};
+use crate::store::{
+    ClientOptions, ItemTables, Location, Row as _, Snapshot, StoreError, StoreSnapshot,
+    outdated_generations,
+};
 
 /// Most motions that one page shows.
 const MAX_SHOWN: usize = 16;
@@ -106,7 +109,8 @@ impl MotionParams {
         let known: Option<PhraseRow> = rows.rows()?.pop();
         let (title, shown) = match &self.run {
             Some(run) => {
-                (format!("{phrase} by {run}"), of_run(store, run, phrase, &self.samples, room)?)
+                let shown = of_run(store, run, (phrase, known.as_ref()), &self.samples, room)?;
+                (format!("{phrase} by {run}"), shown)
             }
             None => {
                 let Some(frames) = rows.frames(tables::motion())? else {
@@ -194,7 +198,7 @@ fn bytes_of(path: &Path) -> anyhow::Result<Vec<u8>> {
 fn of_run(
     store: &Location,
     run: &str,
-    phrase: &str,
+    (phrase, known): (&str, Option<&PhraseRow>),
     wanted: &[usize],
     room: Room,
 ) -> anyhow::Result<Vec<Shown>> {
@@ -226,6 +230,13 @@ fn of_run(
             "store {store} has no generated motion; run motiongen generate --store {store} first"
         );
     }
+
+    let present = known.map(|row| row.content_hash.as_str());
+    ensure!(
+        outdated_generations(&StoreSnapshot::take(store)?, &rows, |_| present)?.is_empty(),
+        "store {store}: the motion of run \"{run}\" for phrase \"{phrase}\" was made for files that were replaced \
+         since; run motiongen extract and generate again"
+    );
 
     // By number: how many candidates there were, and the one that was kept.
     let mut samples: BTreeMap<usize, (usize, Option<GenerationRow>)> = BTreeMap::new();

@@ -105,6 +105,19 @@ impl Summary for VacuumSummary {
     fn n_failed(&self) -> u64 {
         0
     }
+
+    fn figures(&mut self) -> serde_json::Value {
+        let Vacuumed { paths, n_bytes, n_kept } = &self.done;
+        serde_json::json!({
+            "store": self.store,
+            "dry_run": self.dry_run,
+            "older_than_s": self.older_than.0.as_secs(),
+            "paths": paths,
+            "n_files": paths.len(),
+            "n_bytes": n_bytes,
+            "n_kept": n_kept,
+        })
+    }
 }
 
 #[cfg(test)]

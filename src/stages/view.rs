@@ -1,15 +1,17 @@
 //! `view`: a page on which a motion is played with its music.
 
-use std::io::{self, Write};
+use std::io::{self, Read as _, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, anyhow, bail, ensure};
 
 use super::generate::listen;
+use super::ingest::Ingest;
 use super::motion_source::{MotionParams, Room, Subject};
 use super::{ClientParams, Contract, Progress, Stage, Summary};
+use crate::audio::header::read_header;
 use crate::store::tables::PhraseRow;
-use crate::store::{self, ClientOptions, Source};
+use crate::store::{self, ClientOptions, Content, Ledger, Location, Source};
 use crate::units::frames_to_s;
 use crate::view::{self, Audio, View as Page, ViewSample};
 
@@ -33,11 +35,14 @@ pub struct Params {
     /// Leave out the audio of the phrase.
     #[arg(long, conflicts_with = "audio")]
     pub no_audio: bool,
-    /// The page; written whole or not at all [default: FILE.html beside --motion, or RUN.PHRASE.html here]
+    /// The page; written whole or not at all, - is standard output [default: FILE.html beside --motion, or RUN.PHRASE.html here]
     #[arg(long, value_name = "FILE")]
     pub output: Option<PathBuf>,
     #[command(flatten)]
     pub client: ClientParams,
+    /// Say what would be done, and do nothing.
+    #[arg(long)]
+    pub dry_run: bool,
 }
 
 impl Stage for View {
@@ -55,7 +60,10 @@ impl Stage for View {
         let subject = params.source.read(Room::Many, &options)?;
         let audio = match (&params.audio, &subject.phrase) {
             (Some(path), _) => Some(read_audio(path)?),
-            (None, Some(row)) if !params.no_audio => phrase_audio(row, &options, progress),
+            (None, Some(row)) if !params.no_audio => {
+                let store = params.source.store.as_deref().unwrap_or_default();
+                phrase_audio(store, row, &options, progress)
+            }
             _ => None,
         };
         let mut page = page_of(subject, audio);
@@ -65,14 +73,17 @@ impl Stage for View {
             page.beats_s = tracked(path, progress);
         }
         let text = view::page(&page);
-        store::write_file(&output, |out| out.write_all(text.as_bytes()))
-            .with_context(|| format!("while writing {}", output.display()))?;
+        if !params.dry_run {
+            store::write_file(&output, |out| out.write_all(text.as_bytes()))
+                .with_context(|| format!("while writing {}", output.display()))?;
+        }
         Ok(Box::new(Made {
             n_motions: page.samples.len(),
             n_frames: page.samples.first().map_or(0, |sample| sample.frames.nrows()),
             n_beats: page.beats_s.len(),
             has_audio: page.audio.is_some(),
             n_bytes: text.len(),
+            dry_run: params.dry_run,
             output,
         }))
     }
@@ -82,6 +93,9 @@ impl Stage for View {
 fn output_of(params: &Params) -> anyhow::Result<PathBuf> {
     let source = &params.source;
     if let Some(output) = &params.output {
+        if store::is_standard_output(output) {
+            return Ok(output.clone());
+        }
         let extension = output.extension().map(|e| e.to_string_lossy()).unwrap_or_default();
         let is_page = extension.eq_ignore_ascii_case(EXTENSION);
         ensure!(
@@ -132,6 +146,7 @@ fn audio_of(path: &Path, bytes: Vec<u8>) -> Audio {
 
 /// Reads the audio of a phrase; a page without it is still a page.
 fn phrase_audio(
+    store: &str,
     row: &PhraseRow,
     options: &ClientOptions,
     progress: &dyn Progress,
@@ -140,10 +155,31 @@ fn phrase_audio(
         let Some(url) = &row.audio_url else { return Ok(None) };
         let size_bytes = row.audio_bytes.and_then(|n| u64::try_from(n).ok()).unwrap_or(0);
         check_size(url, size_bytes)?;
+        // A page may be passed on, and a table may have been written by anybody: what goes into the page is audio
+        // that was ingested from where it lies.
+        let ledger = Ledger::read(&Location::open(store, options)?, Ingest::NAME)?;
+        let is_ingested =
+            ledger.get(&row.phrase_id).is_some_and(|known| known.origin == row.source);
         let source = Source::open(&row.source, options, None)?;
-        let Some(file) = source.recorded(url, size_bytes, "") else { return Ok(None) };
-        let bytes = source.location().read(&file.path)?;
-        Ok(Some(audio_of(Path::new(&file.path), bytes.to_vec())))
+        let file = source.recorded(url, size_bytes, "").filter(|_| is_ingested);
+        let file = file.with_context(|| {
+            format!("{url} is in none of the sources that the store was ingested from")
+        })?;
+        let path = file.path.clone();
+        let content = source.read_in_order(vec![file]).next().context("nothing was read")?.0?;
+        let bytes = match content {
+            Content::Bytes(bytes) => bytes.to_vec(),
+            Content::File(file) => {
+                let mut bytes = Vec::new();
+                file.take(MAX_AUDIO_BYTES + 1).read_to_end(&mut bytes)?;
+                bytes
+            }
+        };
+        check_size(url, bytes.len() as u64)?;
+        let audio = audio_of(Path::new(&path), bytes);
+        let extension = Path::new(&path).extension().and_then(|e| e.to_str()).unwrap_or_default();
+        read_header(&audio.bytes, extension).with_context(|| format!("{url} is no audio"))?;
+        Ok(Some(audio))
     };
     read().unwrap_or_else(|e| {
         progress.note(&format!("the page has no audio: {e:#}; name a file with --audio"));
@@ -179,22 +215,39 @@ struct Made {
     n_beats: usize,
     has_audio: bool,
     n_bytes: usize,
+    dry_run: bool,
     output: PathBuf,
 }
 
 impl Summary for Made {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        let Self { n_motions, n_frames, n_beats, has_audio, n_bytes, output } = self;
+        let Self { n_motions, n_frames, n_beats, has_audio, n_bytes, dry_run, output } = self;
         let counted = |n: usize, one: &str| format!("{n} {one}{}", if n == 1 { "" } else { "s" });
         let (motions, beats) = (counted(*n_motions, "motion"), counted(*n_beats, "beat"));
         let duration_s = frames_to_s(*n_frames);
         let audio = if *has_audio { "with audio" } else { "without audio" };
         let mb = *n_bytes as f64 / 1e6;
         let place = output.display();
-        writeln!(out, "{motions} ({duration_s:.2} s), {beats}, {audio} → {place} ({mb:.2} MB)")
+        let would = if *dry_run { "would write " } else { "" };
+        writeln!(
+            out,
+            "{would}{motions} ({duration_s:.2} s), {beats}, {audio} → {place} ({mb:.2} MB)"
+        )
     }
 
     fn n_failed(&self) -> u64 {
         0
+    }
+
+    fn figures(&mut self) -> serde_json::Value {
+        serde_json::json!({
+            "to": self.output,
+            "dry_run": self.dry_run,
+            "n_motions": self.n_motions,
+            "n_frames": self.n_frames,
+            "n_beats": self.n_beats,
+            "has_audio": self.has_audio,
+            "n_bytes": self.n_bytes,
+        })
     }
 }

@@ -119,6 +119,9 @@ fn copy_into(content: Content, to: &mut std::fs::File) -> std::io::Result<(u64, 
     }
 }
 
+/// Hexadecimal digits of the name of an entry.
+const N_DIGITS: usize = 32;
+
 struct Entry {
     path: PathBuf,
     size_bytes: u64,
@@ -129,9 +132,12 @@ fn entries(folder: &FsPath) -> std::io::Result<Vec<Entry>> {
     let mut found = Vec::new();
     for entry in std::fs::read_dir(folder)? {
         let entry = entry?;
-        let hidden = entry.file_name().as_encoded_bytes().starts_with(b".");
+        // Files of others in the folder are none of the cache's.
+        let name = entry.file_name();
+        let digits = name.as_encoded_bytes();
+        let is_ours = digits.len() == N_DIGITS && digits.iter().all(u8::is_ascii_hexdigit);
         let Ok(meta) = entry.metadata() else { continue };
-        if hidden || !meta.is_file() {
+        if !is_ours || !meta.is_file() {
             continue;
         }
         let used = meta.modified().unwrap_or(SystemTime::UNIX_EPOCH);
@@ -183,6 +189,18 @@ mod tests {
         assert_eq!(bytes_of(cache.get("c", "1", 40).expect("c stays")), vec![3; 40]);
         let total: u64 = entries(folder.path()).expect("listed").iter().map(|e| e.size_bytes).sum();
         assert_eq!(total, 80);
+    }
+
+    #[test]
+    fn files_of_others_are_neither_counted_nor_removed() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        std::fs::write(folder.path().join("thesis.tex"), [7; 90]).expect("written");
+        let cache = Cache::open(folder.path(), 100).expect("a cache");
+        for (url, n) in [("a", 60), ("b", 70), ("c", 80)] {
+            cache.put(url, "1", content(n, 1)).expect("kept");
+        }
+        assert!(cache.get("c", "1", 80).is_some() && cache.get("b", "1", 70).is_none());
+        assert_eq!(std::fs::read(folder.path().join("thesis.tex")).expect("there"), [7; 90]);
     }
 
     #[test]

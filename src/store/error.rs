@@ -15,6 +15,25 @@ pub enum StoreError {
     #[error("{place}: not found{hint}")]
     NotFound { place: String, hint: &'static str },
 
+    #[error("{place}: is no regular file; remove it or put the file in its place")]
+    NotAFile { place: String },
+
+    #[error(
+        "{place}: is a symbolic link that leads out of the source; copy what it names into the source, or pass \
+         --follow-links"
+    )]
+    OutsideSource { place: String },
+
+    #[error(
+        "{place}: has {n_bytes} bytes, at most {max_bytes} are read; it is not what it should be"
+    )]
+    TooLarge { place: String, n_bytes: u64, max_bytes: u64 },
+
+    #[error(
+        "{place}: holds no store (it has no commits); check --store, or fill it with motiongen ingest"
+    )]
+    NoStore { place: String },
+
     #[error("{place}: could not {action}")]
     Io {
         action: &'static str,
@@ -29,7 +48,7 @@ pub enum StoreError {
         place: String,
         hint: &'static str,
         #[source]
-        source: Box<object_store::Error>,
+        source: Box<RemoteError>,
     },
 
     #[error(
@@ -91,7 +110,8 @@ impl StoreError {
             source if is_refusal(source) => credentials_hint(place),
             _ => "",
         };
-        StoreError::Remote { action, place: place.to_owned(), hint, source: Box::new(source) }
+        let source = Box::new(RemoteError(source));
+        StoreError::Remote { action, place: place.to_owned(), hint, source }
     }
 
     /// Returns whether the same may succeed later: the place is out of reach, not wrong, full or closed
@@ -107,7 +127,7 @@ impl StoreError {
             // Parts are never removed: one that is not there lies on a disk that is not there.
             StoreError::NotFound { .. } => true,
             StoreError::Io { source, .. } => is_passing(source),
-            StoreError::Remote { source, .. } => !is_refusal(source),
+            StoreError::Remote { source, .. } => !is_refusal(&source.0),
             StoreError::Parquet { source, .. } => match source.as_ref() {
                 ParquetError::External(cause) => {
                     let remote = cause.downcast_ref::<object_store::Error>();
@@ -126,6 +146,33 @@ impl StoreError {
         }
         StoreError::Io { action, place: place.to_owned(), source }
     }
+}
+
+/// An error of a client of remote storage, told on one line.
+#[derive(Debug)]
+pub struct RemoteError(object_store::Error);
+
+impl std::fmt::Display for RemoteError {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(&without_markup(&self.0.to_string()))
+    }
+}
+
+impl std::error::Error for RemoteError {}
+
+/// Returns the text of a client's error with the code and the message of the XML that a server sent in its
+/// place, and its lines joined.
+fn without_markup(text: &str) -> String {
+    let start = ["<?xml", "<Error"].iter().filter_map(|tag| text.find(tag)).min();
+    let (before, markup) = text.split_at(start.unwrap_or(text.len()));
+    let element = |name: &str| {
+        let (_, rest) = markup.split_once(&format!("<{name}>"))?;
+        rest.split_once(&format!("</{name}>")).map(|(content, _)| content)
+    };
+    let said = ["Code", "Message"].into_iter().filter_map(element).collect::<Vec<_>>().join(": ");
+    let said = if said.is_empty() { markup } else { &said };
+    let words = before.split_whitespace().chain(said.split_whitespace());
+    words.collect::<Vec<_>>().join(" ")
 }
 
 /// Returns whether the storage knew who asked and said no, or asked for credentials.
@@ -147,5 +194,20 @@ fn credentials_hint(place: &str) -> &'static str {
         "; access was refused: set AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY"
     } else {
         "; access was refused"
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_server_says_in_markup_is_told_on_one_line() {
+        let text = "Generic S3 error: status code: 403 Forbidden: <?xml version=\"1.0\"?>\n<Error>\n  \
+                    <Code>AccessDenied</Code><Message>Access\nDenied.</Message>\n</Error>";
+        let expected = "Generic S3 error: status code: 403 Forbidden: AccessDenied: Access Denied.";
+        assert_eq!(without_markup(text), expected);
+        assert_eq!(without_markup("one\n  two"), "one two");
+        assert_eq!(without_markup("bad: <Error>\nodd"), "bad: <Error> odd");
     }
 }

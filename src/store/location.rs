@@ -17,8 +17,11 @@ use url::Url;
 
 use super::StoreError;
 use super::client::{self, ClientOptions, block_on};
-use super::{local, remote};
+use super::redaction::redacted_location;
+use super::{local, output, remote};
 
+/// Folder of the manifests, without which a folder is no store.
+const COMMITS: &str = "commits";
 /// Small objects that are read at once.
 const READS_IN_FLIGHT: usize = 32;
 
@@ -61,7 +64,8 @@ impl Location {
     /// [`StoreError::BadLocation`] for an unknown scheme, a missing bucket or incomplete
     /// credentials.
     pub fn open(text: &str, options: &ClientOptions) -> Result<Self, StoreError> {
-        let bad = |reason: String| StoreError::BadLocation { text: text.to_owned(), reason };
+        let bad =
+            |reason: String| StoreError::BadLocation { text: redacted_location(text), reason };
         if text.is_empty() {
             return Err(bad("is empty".into()));
         }
@@ -138,14 +142,10 @@ impl Location {
         &self.kind
     }
 
-    /// Removes temporary files that killed writers left in a local store more than a day ago.
-    ///
-    /// # Errors
-    /// [`StoreError::Io`] when the store's folders cannot be listed.
-    pub fn sweep(&self) -> Result<(), StoreError> {
-        match &self.kind {
-            Kind::Local(root) => local::sweep(root),
-            Kind::Remote { .. } => Ok(()),
+    /// Removes temporary files that killed writers left in a local store's own folders more than a day ago.
+    pub fn sweep(&self) {
+        if let Kind::Local(root) = &self.kind {
+            local::sweep(root);
         }
     }
 
@@ -211,16 +211,22 @@ impl Location {
         Ok(found)
     }
 
-    /// Returns the size of an object.
+    /// Returns the size of an object, which locally must be a regular file.
     ///
     /// # Errors
-    /// [`StoreError::NotFound`] or what the storage says.
+    /// [`StoreError::NotFound`], [`StoreError::NotAFile`] or what the storage says.
     pub(crate) fn size_bytes(&self, path: &str) -> Result<u64, StoreError> {
         let place = || self.url_of(path);
         match &self.kind {
-            Kind::Local(root) => std::fs::metadata(root.join(path))
-                .map(|meta| meta.len())
-                .map_err(|e| StoreError::io("measure", &place(), e)),
+            Kind::Local(root) => {
+                let found = std::fs::metadata(root.join(path))
+                    .map_err(|e| StoreError::io("measure", &place(), e))?;
+                if found.is_file() {
+                    Ok(found.len())
+                } else {
+                    Err(StoreError::NotAFile { place: place() })
+                }
+            }
             Kind::Remote { store, prefix } => block_on(store.head(&remote::join(prefix, path)))
                 .map(|meta| meta.size)
                 .map_err(|e| StoreError::remote("measure", &place(), e)),
@@ -240,6 +246,35 @@ impl Location {
             Kind::Remote { store, prefix } => {
                 block_on(remote::read_object(store, &remote::join(prefix, path)))
                     .map_err(|e| StoreError::remote("read", &place(), e))
+            }
+        }
+    }
+
+    /// Reads a whole object that somebody else wrote, if it is a regular file of at most so many bytes.
+    ///
+    /// # Errors
+    /// [`StoreError::NotAFile`], [`StoreError::TooLarge`], and as [`Location::read`].
+    pub fn read_regular(&self, path: &str, max_bytes: u64) -> Result<Bytes, StoreError> {
+        let n_bytes = self.size_bytes(path)?;
+        if n_bytes > max_bytes {
+            let place = self.url_of(path);
+            return Err(StoreError::TooLarge { place, n_bytes, max_bytes });
+        }
+        self.read(path)
+    }
+
+    /// Returns whether anything was ever committed here.
+    ///
+    /// # Errors
+    /// What the storage says.
+    pub fn is_store(&self) -> Result<bool, StoreError> {
+        match &self.kind {
+            Kind::Local(root) => Ok(root.join(COMMITS).is_dir()),
+            Kind::Remote { store, prefix } => {
+                let below = remote::join(prefix, COMMITS);
+                let first = block_on(store.list(Some(&below)).try_next());
+                let first = first.map_err(|e| StoreError::remote("list", &self.url, e))?;
+                Ok(first.is_some())
             }
         }
     }
@@ -282,7 +317,7 @@ impl Location {
         match &self.kind {
             Kind::Local(root) => {
                 let io = |e| StoreError::io("write", &place(), e);
-                let mut file = local::temporary_beside(&root.join(path)).map_err(io)?;
+                let mut file = local::temporary_in(&folder_of(root, path)).map_err(io)?;
                 file.write_all(&bytes).map_err(io)?;
                 local::persist_new(file, &root.join(path)).map_err(io)
             }
@@ -303,9 +338,9 @@ impl Location {
         match &self.kind {
             Kind::Local(root) => {
                 let io = |e| StoreError::io("write", &place(), e);
-                let mut file = local::temporary_beside(&root.join(path)).map_err(io)?;
+                let mut file = output::temporary_beside(&root.join(path)).map_err(io)?;
                 file.write_all(&bytes).map_err(io)?;
-                local::replace_file(&root.join(path), file).map_err(io)
+                output::replace_file(&root.join(path), file).map_err(io)
             }
             Kind::Remote { store, prefix } => {
                 block_on(store.put(&remote::join(prefix, path), bytes.into()))
@@ -322,7 +357,7 @@ impl Location {
     /// [`StoreError::Io`] when no file can be made.
     pub fn temporary(&self, path: &str) -> Result<tempfile::NamedTempFile, StoreError> {
         match &self.kind {
-            Kind::Local(root) => local::temporary_beside(&root.join(path)),
+            Kind::Local(root) => local::temporary_in(&folder_of(root, path)),
             Kind::Remote { .. } => tempfile::NamedTempFile::new(),
         }
         .map_err(|e| StoreError::io("make a temporary file beside it", &self.url_of(path), e))
@@ -397,6 +432,12 @@ impl Location {
             }
         }
     }
+}
+
+/// Returns the folder of an object below a local root.
+fn folder_of(root: &FsPath, path: &str) -> PathBuf {
+    let path = root.join(path);
+    path.parent().map_or_else(|| root.to_owned(), FsPath::to_owned)
 }
 
 impl fmt::Display for Location {

@@ -50,12 +50,21 @@ fn touch(folder: &FsPath) {
     }
 }
 
+/// Returns whether a name is one that this program gives to what it prepares: a word, `-` and 32 hexadecimal
+/// digits. A cache may lie in a folder that has others.
+fn is_key(name: &str) -> bool {
+    let (kind, digest) = name.split_once('-').unwrap_or_default();
+    ["model", "optimized"].contains(&kind)
+        && digest.len() == 32
+        && digest.bytes().all(|byte| byte.is_ascii_hexdigit())
+}
+
 /// Removes folders that were not used for longest.
 fn forget_old(root: &FsPath, newest: &FsPath) {
     let Ok(entries) = std::fs::read_dir(root) else { return };
     let mut folders: Vec<(SystemTime, PathBuf)> = entries
         .flatten()
-        .filter(|entry| !entry.file_name().to_string_lossy().starts_with(PARTIAL))
+        .filter(|entry| is_key(&entry.file_name().to_string_lossy()))
         .filter_map(|entry| {
             let metadata = entry.metadata().ok()?;
             metadata.is_dir().then_some((metadata.modified().ok()?, entry.path()))
@@ -103,16 +112,26 @@ mod tests {
     fn the_oldest_go_first() {
         let root = tempfile::tempdir().unwrap();
         let hour = std::time::Duration::from_secs(3600);
+        let key = |i: usize| format!("model-{i:032x}");
+        let of_others =
+            ["documents", "model-of-mine", "optimized-00000000000000000000000000000000.bak"];
+        for name in of_others {
+            std::fs::create_dir(root.path().join(name)).unwrap();
+            let then = SystemTime::now() - hour * 1000;
+            std::fs::File::open(root.path().join(name)).unwrap().set_modified(then).unwrap();
+        }
         for i in 0..N_KEPT {
-            let folder = make(root.path(), &format!("k{i}"), "x").unwrap();
+            let folder = make(root.path(), &key(i), "x").unwrap();
             let then = SystemTime::now() - hour * (100 - i as u32);
             std::fs::File::open(folder).unwrap().set_modified(then).unwrap();
         }
         // The oldest is used, so the second oldest is the one to go.
-        make(root.path(), "k0", "x").unwrap();
-        make(root.path(), "new", "x").unwrap();
-        assert!(root.path().join("k0").is_dir());
-        assert!(!root.path().join("k1").exists());
-        assert_eq!(std::fs::read_dir(root.path()).unwrap().count(), N_KEPT);
+        make(root.path(), &key(0), "x").unwrap();
+        make(root.path(), &key(99), "x").unwrap();
+        assert!(root.path().join(key(0)).is_dir());
+        assert!(!root.path().join(key(1)).exists());
+        assert!(of_others.iter().all(|name| root.path().join(name).is_dir()));
+        let n_folders = std::fs::read_dir(root.path()).unwrap().count();
+        assert_eq!(n_folders, N_KEPT + of_others.len());
     }
 }

@@ -1,58 +1,27 @@
-//! SQL over the tables of a store: the one file that knows polars.
+//! SQL over the tables of a store: the only files that know polars.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::io::Write;
-use std::str::FromStr;
+mod answer;
+mod explain;
 
-use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
+use std::collections::BTreeMap;
+
 use polars::io::cloud::{CloudOptions, options::CloudRetryConfig};
 use polars::prelude::*;
 use polars::sql::{SQLContext, extract_table_identifiers};
 
+pub use answer::{Answer, DataFormat, Format, TextTable};
+use explain::{Explainer, first_line, unknown_table};
+
 use super::location::{Kind, Location};
 use super::reader::check_version;
 use super::schema::{Column as TableColumn, ColumnType, TableSchema};
+use super::sql::{self, Asked};
 use super::store_snapshot::{LivePart, StoreSnapshot};
 use super::tables;
 use super::{ClientOptions, StoreError};
 
-/// Names offered when a name is not found.
-const N_SUGGESTIONS: usize = 3;
-/// Statements that polars would act out on the answer's own copy of a table.
-const CHANGING: [&str; 7] = ["alter", "create", "delete", "drop", "insert", "truncate", "update"];
-
 /// What polars calls a count that has no name.
 const COUNT_COLUMN: &str = "len";
-
-/// How an answer is written.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Format {
-    Table,
-    Csv,
-    /// An array with one object per row.
-    Json,
-    Parquet,
-}
-
-impl FromStr for Format {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        match text {
-            "table" => Ok(Format::Table),
-            "csv" => Ok(Format::Csv),
-            "json" => Ok(Format::Json),
-            "parquet" => Ok(Format::Parquet),
-            _ => Err("use table, csv, json or parquet".into()),
-        }
-    }
-}
-
-/// The rows that a query selected.
-#[derive(Debug)]
-pub struct Answer {
-    frame: DataFrame,
-}
 
 /// What a store holds of one table.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -65,27 +34,35 @@ pub struct TableInfo {
     pub schema_version: u32,
 }
 
-/// Runs one SQL statement over the tables of a store.
+/// Reads one SQL statement over the tables of a store.
 ///
-/// Selections and filters are pushed down to the Parquet parts; a table that nobody has written yet
-/// is empty.
+/// Selections and filters are pushed down to the Parquet parts; a table that nobody has written yet is empty.
+/// Rows are read when the answer is written.
 ///
 /// # Errors
-/// [`StoreError::Query`] in the user's terms: an unknown column or table comes with the nearest
-/// names; [`StoreError::SchemaVersion`] when a part is of a version that is not read.
+/// [`StoreError::NoStore`] where nothing was ever committed; [`StoreError::Query`] in the user's terms: an
+/// unknown column or table comes with the nearest names; [`StoreError::SchemaVersion`] when a part is of a
+/// version that is not read.
 pub fn query(store: &Location, sql: &str, options: &ClientOptions) -> Result<Answer, StoreError> {
-    let verb = sql.split_whitespace().next().unwrap_or_default().to_lowercase();
-    if CHANGING.contains(&verb.as_str()) {
-        let reason = "would change the tables, which only stages do; begin with \"select\"";
-        return Err(StoreError::Query(format!("\"{verb}\" {reason}")));
-    }
+    let asked = sql::read(sql).map_err(StoreError::Query)?;
+    check_is_store(store)?;
     let schemas = tables::all();
+    let named_sql = match asked {
+        Asked::Tables => return Ok(Answer::of_frame(frame_of_tables(store, options)?)),
+        Asked::Columns { table } => {
+            let schema = schemas.iter().find(|schema| schema.name.eq_ignore_ascii_case(&table));
+            let schema =
+                schema.ok_or_else(|| StoreError::Query(unknown_table(&table, &schemas)))?;
+            return Ok(Answer::of_frame(frame_of_columns(schema)));
+        }
+        Asked::Rows { named } => named,
+    };
     let snapshot = StoreSnapshot::take(store)?;
     if let Some((table, column)) = counted_table(sql)
         && let Some(schema) = schemas.iter().find(|s| s.name.eq_ignore_ascii_case(table))
     {
         let n_rows = count_rows(store, schema, &snapshot.parts(schema.name)?, options)?;
-        return Ok(Answer { frame: count_frame(column, n_rows)? });
+        return Ok(Answer::of_frame(count_frame(column, n_rows)?));
     }
     let mut context = SQLContext::new();
     let named = extract_table_identifiers(sql, false, true).unwrap_or_default();
@@ -98,9 +75,21 @@ pub fn query(store: &Location, sql: &str, options: &ClientOptions) -> Result<Ans
             spellings.for_each(|name| context.register(name, frame.clone()));
         }
     }
-    let explain = |e: PolarsError| StoreError::Query(explain(&e, &schemas, &named));
-    let frame = context.execute(sql).and_then(LazyFrame::collect).map_err(explain)?;
-    Ok(Answer { frame })
+    let mut planned = |sql: &str| {
+        let mut frame = context.execute(sql)?;
+        let columns = frame.collect_schema()?;
+        Ok((frame, columns))
+    };
+    let explainer = Explainer::new(schemas, named);
+    // Names are a courtesy: what the engine does not take with them, it is given as it was typed.
+    let plan = named_sql.and_then(|sql| planned(&sql).ok()).map_or_else(|| planned(sql), Ok);
+    let (frame, columns) = plan.map_err(|e| StoreError::Query(explainer.explain(&e)))?;
+    Ok(Answer::new(frame, columns, explainer))
+}
+
+/// Refuses a place where nothing was ever committed, which is mistyped more often than empty.
+fn check_is_store(store: &Location) -> Result<(), StoreError> {
+    if store.is_store()? { Ok(()) } else { Err(StoreError::NoStore { place: store.to_string() }) }
 }
 
 /// Returns what a store holds, a line per table.
@@ -111,6 +100,7 @@ pub fn table_infos(
     store: &Location,
     options: &ClientOptions,
 ) -> Result<Vec<TableInfo>, StoreError> {
+    check_is_store(store)?;
     let mut parts = StoreSnapshot::take(store)?.live_parts()?;
     let info = |schema: TableSchema| {
         let live = parts.remove(schema.name).unwrap_or_default();
@@ -192,61 +182,34 @@ fn no_count() -> PolarsError {
     PolarsError::NoData("a count without a row".into())
 }
 
-impl Answer {
-    pub fn n_rows(&self) -> usize {
-        self.frame.height()
-    }
-
-    /// Writes the answer in a format.
-    ///
-    /// # Errors
-    /// What the writer says.
-    pub fn write(&mut self, format: Format, out: &mut dyn Write) -> std::io::Result<()> {
-        let other = |e: PolarsError| match e {
-            PolarsError::IO { error, .. } => std::io::Error::new(error.kind(), error),
-            e => std::io::Error::other(e),
-        };
-        let frame = &mut self.frame;
-        match format {
-            Format::Table => writeln!(out, "{}", text_table(frame)),
-            Format::Csv => CsvWriter::new(out).finish(frame).map_err(other),
-            Format::Json => {
-                let json = JsonFormat::Json;
-                JsonWriter::new(&mut *out).with_json_format(json).finish(frame).map_err(other)?;
-                writeln!(out)
-            }
-            Format::Parquet => ParquetWriter::new(out)
-                .with_compression(ParquetCompression::Zstd(None))
-                .finish(frame)
-                .map(|_| ())
-                .map_err(other),
-        }
-    }
+/// Returns what [`table_infos`] tells, as `show tables` answers it.
+fn frame_of_tables(store: &Location, options: &ClientOptions) -> Result<DataFrame, StoreError> {
+    let infos = table_infos(store, options)?;
+    let names: Vec<&str> = infos.iter().map(|info| info.name).collect();
+    let numbers = |number: fn(&TableInfo) -> u64| infos.iter().map(number).collect::<Vec<u64>>();
+    let columns = vec![
+        Column::new("name".into(), names),
+        Column::new("n_rows".into(), numbers(|info| info.n_rows)),
+        Column::new("n_bytes".into(), numbers(|info| info.n_bytes)),
+        Column::new("n_parts".into(), numbers(|info| info.n_parts as u64)),
+        Column::new("schema_version".into(), numbers(|info| info.schema_version.into())),
+    ];
+    DataFrame::new_infer_height(columns).map_err(|e| StoreError::Query(first_line(&e)))
 }
 
-fn text_table(frame: &DataFrame) -> Table {
-    let mut table = Table::new();
-    table.load_preset(presets::UTF8_FULL_CONDENSED);
-    table.set_content_arrangement(ContentArrangement::Disabled);
-    table.set_header(frame.get_column_names().iter().map(|n| n.as_str()));
-    for (column, series) in table.column_iter_mut().zip(frame.columns()) {
-        if series.dtype().is_numeric() {
-            column.set_cell_alignment(CellAlignment::Right);
-        }
-    }
-    for row in 0..frame.height() {
-        table.add_row(frame.columns().iter().map(|column| match column.get(row) {
-            Ok(AnyValue::String(text)) => text.to_owned(),
-            Ok(AnyValue::StringOwned(text)) => text.to_string(),
-            Ok(AnyValue::Null) => String::new(),
-            // Display would round floats to a few digits.
-            Ok(AnyValue::Float32(x)) => x.to_string(),
-            Ok(AnyValue::Float64(x)) => x.to_string(),
-            Ok(value) => value.to_string(),
-            Err(_) => String::new(),
-        }));
-    }
-    table
+/// Returns the columns of a table, as `describe` answers them.
+fn frame_of_columns(schema: &TableSchema) -> DataFrame {
+    let texts =
+        |text: fn(&TableColumn) -> String| schema.columns.iter().map(text).collect::<Vec<String>>();
+    let nullable: Vec<bool> = schema.columns.iter().map(|column| column.nullable).collect();
+    let columns = vec![
+        Column::new("name".into(), texts(|column| column.name.to_string())),
+        Column::new("type".into(), texts(|column| column.column_type.name().to_owned())),
+        Column::new("nullable".into(), nullable),
+        Column::new("unit".into(), texts(|column| column.unit.to_owned())),
+        Column::new("description".into(), texts(|column| column.description.to_string())),
+    ];
+    DataFrame::new_infer_height(columns).expect("invariant: a value for each column in each")
 }
 
 /// Returns the live rows of a table as a lazy frame.
@@ -351,59 +314,4 @@ fn data_type(column_type: ColumnType) -> DataType {
         ColumnType::Float64 => DataType::Float64,
         ColumnType::TimestampUs => DataType::Datetime(TimeUnit::Microseconds, Some(TimeZone::UTC)),
     }
-}
-
-/// Says what is wrong with a statement in terms of the store's tables.
-fn explain(error: &PolarsError, schemas: &[TableSchema], named: &[String]) -> String {
-    let text = first_line(error);
-    if let Some(table) = between(&text, "relation '", "'") {
-        let known: Vec<_> = schemas.iter().map(|s| s.name).collect();
-        return format!(
-            "table \"{table}\" not found; nearest: {}; a store has {}",
-            nearest(table, &known).join(", "),
-            known.join(", ")
-        );
-    }
-    let column = between(&text, "unable to find column \"", "\"")
-        .or_else(|| between(&text, "no column named '", "'"));
-    let Some(column) = column else { return text };
-    let of_tables: Vec<_> =
-        schemas.iter().filter(|s| named.iter().any(|n| n.eq_ignore_ascii_case(s.name))).collect();
-    let columns: Vec<&str> =
-        of_tables.iter().flat_map(|s| s.columns.iter().map(|c| c.name.as_ref())).collect();
-    if columns.is_empty() {
-        return text;
-    }
-    let lists: Vec<_> = of_tables
-        .iter()
-        .map(|s| {
-            let names: Vec<_> = s.columns.iter().map(|c| c.name.as_ref()).collect();
-            format!("table {} has {}", s.name, names.join(", "))
-        })
-        .collect();
-    format!(
-        "column \"{column}\" not found; nearest: {}; {}",
-        nearest(column, &columns).join(", "),
-        lists.join("; ")
-    )
-}
-
-/// Returns the names most like `name`, best first.
-fn nearest<'a>(name: &str, known: &[&'a str]) -> Vec<&'a str> {
-    // Tables that are joined share columns; each is offered once.
-    let known: BTreeSet<_> = known.iter().collect();
-    let mut scored: Vec<_> =
-        known.iter().map(|k| (strsim::jaro_winkler(&name.to_lowercase(), k), **k)).collect();
-    scored.sort_by(|a, b| b.0.total_cmp(&a.0));
-    scored.into_iter().take(N_SUGGESTIONS).map(|(_, k)| k).collect()
-}
-
-fn between<'a>(text: &'a str, before: &str, after: &str) -> Option<&'a str> {
-    let start = text.find(before)? + before.len();
-    let length = text[start..].find(after)?;
-    Some(&text[start..start + length])
-}
-
-fn first_line(error: &PolarsError) -> String {
-    error.to_string().lines().next().unwrap_or_default().to_owned()
 }

@@ -14,14 +14,17 @@ use super::StoreError;
 const SHARD_SEED: u64 = 0;
 const SPLIT_SEED: u64 = 1;
 
-/// Environment variables (index, count) that array jobs set, and the first index they use.
-///
-/// Slurm may start an array at any index, so its own minimum is subtracted.
-const ARRAY_VARIABLES: [(&str, &str, Option<&str>); 3] = [
-    ("SLURM_ARRAY_TASK_ID", "SLURM_ARRAY_TASK_COUNT", Some("SLURM_ARRAY_TASK_MIN")),
-    ("JOB_COMPLETION_INDEX", "JOB_COMPLETION_COUNT", None),
-    ("BATCH_TASK_INDEX", "BATCH_TASK_COUNT", None),
+/// Environment variables (index, count) that array jobs set.
+const ARRAY_VARIABLES: [(&str, &str); 3] = [
+    (SLURM_INDEX, "SLURM_ARRAY_TASK_COUNT"),
+    ("JOB_COMPLETION_INDEX", "JOB_COMPLETION_COUNT"),
+    ("BATCH_TASK_INDEX", "BATCH_TASK_COUNT"),
 ];
+/// A Slurm array may start at any index and go in steps of any size, or be a list.
+const SLURM_INDEX: &str = "SLURM_ARRAY_TASK_ID";
+const SLURM_MIN: &str = "SLURM_ARRAY_TASK_MIN";
+const SLURM_MAX: &str = "SLURM_ARRAY_TASK_MAX";
+const SLURM_STEP: &str = "SLURM_ARRAY_TASK_STEP";
 
 /// Part `index` of `count` of a job.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -51,15 +54,20 @@ impl Shard {
                 .map_err(|_| bad(format!("has no number in {what} ({digits:?})")))
         };
         if text == "auto" {
-            for (index, count, first) in ARRAY_VARIABLES {
+            for (index, count) in ARRAY_VARIABLES {
                 let Some(i) = environment(index) else { continue };
                 let Some(n) = environment(count) else {
                     return Err(bad(format!("finds {index} set but not {count}; set both")));
                 };
-                let first = first.and_then(&environment).unwrap_or_else(|| "0".into());
-                let i = number(index, &i)?.checked_sub(number("the first index", &first)?);
-                let i = i.ok_or_else(|| bad(format!("finds {index} below its first index")))?;
-                return Self::new(i, number(count, &n)?).map_err(bad);
+                let (mut i, n) = (number(index, &i)?, number(count, &n)?);
+                if index == SLURM_INDEX {
+                    let of =
+                        |name: &str| environment(name).map(|text| number(name, &text)).transpose();
+                    let (first, last, step) = (of(SLURM_MIN)?, of(SLURM_MAX)?, of(SLURM_STEP)?);
+                    i = place_in_array(i, n, first.unwrap_or(0), last, step.unwrap_or(1))
+                        .map_err(bad)?;
+                }
+                return Self::new(i, n).map_err(bad);
             }
             let names: Vec<_> = ARRAY_VARIABLES.iter().map(|v| v.0).collect();
             return Err(bad(format!("finds none of {} set", names.join(", "))));
@@ -82,6 +90,43 @@ impl Shard {
     pub fn takes(self, item: &str) -> bool {
         range_of(stable_hash(item), u64::from(self.count)) == u64::from(self.index)
     }
+}
+
+/// Returns the place of a Slurm task among the `count` of its array.
+///
+/// A list of tasks does not say how many there were when the job was cut into shards, so whoever did only its own
+/// would leave phrases to nobody.
+fn place_in_array(
+    id: u32,
+    count: u32,
+    first: u32,
+    last: Option<u32>,
+    step: u32,
+) -> Result<u32, String> {
+    let way_out = format!(
+        "submit the whole array again, since what is done is skipped, or give the shard of the former array: \
+         --shard ${SLURM_INDEX}/N for --array=0-(N-1)"
+    );
+    let Some(from_first) = id.checked_sub(first) else {
+        return Err(format!("finds {SLURM_INDEX} {id} below {SLURM_MIN} {first}"));
+    };
+    if step == 0 {
+        return Err(format!("finds {SLURM_STEP} 0"));
+    }
+    if let Some(last) = last
+        && last.saturating_sub(first) / step + 1 != count
+    {
+        return Err(format!(
+            "finds a Slurm array of {count} tasks from {first} to {last} in steps of {step}, so it is a list of tasks, \
+             which does not tell the shards of the whole; {way_out}"
+        ));
+    }
+    if from_first % step != 0 {
+        return Err(format!(
+            "finds {SLURM_INDEX} {id}, which is no step of {step} from {first}; {way_out}"
+        ));
+    }
+    Ok(from_first / step)
 }
 
 impl fmt::Display for Shard {
@@ -180,12 +225,52 @@ mod tests {
             _ => None,
         };
         assert_eq!(Shard::parse("auto", slurm).expect("a shard").to_string(), "4/5");
+        // --array=0-12:4
+        let stepped = |id: &'static str| {
+            move |name: &str| {
+                let value = match name {
+                    "SLURM_ARRAY_TASK_ID" => id,
+                    "SLURM_ARRAY_TASK_COUNT" | "SLURM_ARRAY_TASK_STEP" => "4",
+                    "SLURM_ARRAY_TASK_MIN" => "0",
+                    "SLURM_ARRAY_TASK_MAX" => "12",
+                    _ => return None,
+                };
+                Some(value.to_owned())
+            }
+        };
+        for (id, shard) in [("0", "0/4"), ("4", "1/4"), ("8", "2/4"), ("12", "3/4")] {
+            assert_eq!(Shard::parse("auto", stepped(id)).expect("a shard").to_string(), shard);
+        }
         let batch = |name: &str| match name {
             "BATCH_TASK_INDEX" => Some("0".into()),
             "BATCH_TASK_COUNT" => Some("3".into()),
             _ => None,
         };
         assert_eq!(Shard::parse("auto", batch).expect("a shard").to_string(), "0/3");
+    }
+
+    #[test]
+    fn a_list_of_tasks_is_refused_with_the_way_out() {
+        // --array=3,7,12: tasks of a former 0-15 that failed.
+        for id in ["3", "7", "12"] {
+            let list = |name: &str| {
+                let value = match name {
+                    "SLURM_ARRAY_TASK_ID" => id,
+                    "SLURM_ARRAY_TASK_COUNT" | "SLURM_ARRAY_TASK_MIN" => "3",
+                    "SLURM_ARRAY_TASK_MAX" => "12",
+                    "SLURM_ARRAY_TASK_STEP" => "1",
+                    _ => return None,
+                };
+                Some(value.to_owned())
+            };
+            assert_eq!(
+                Shard::parse("auto", list).expect_err("a list").to_string(),
+                "shard \"auto\" finds a Slurm array of 3 tasks from 3 to 12 in steps of 1, so it is a list of tasks, \
+                 which does not tell the shards of the whole; submit the whole array again, since what is done is \
+                 skipped, or give the shard of the former array: --shard $SLURM_ARRAY_TASK_ID/N for \
+                 --array=0-(N-1); write it as i/n with 0 <= i < n, or \"auto\""
+            );
+        }
     }
 
     #[test]

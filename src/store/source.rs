@@ -51,7 +51,7 @@ pub enum SourceProblemKind {
     Name,
     /// A folder, pipe, socket or device stands where a file is expected.
     NotAFile,
-    /// A symbolic link leads back to one of its own folders, or nowhere.
+    /// A symbolic link leads back to one of its own folders, out of the source, or nowhere.
     Symlink,
     /// The operating system refused.
     Unreadable,
@@ -83,6 +83,8 @@ pub struct Source {
     read_ahead: usize,
     /// Bytes fetched ahead of the reader.
     read_ahead_bytes: u64,
+    /// Whether symbolic links may lead out of the source.
+    follows_links: bool,
 }
 
 impl Source {
@@ -105,7 +107,14 @@ impl Source {
             cache: cache.map(Arc::new),
             read_ahead: options.n_requests.max(1),
             read_ahead_bytes: 64 << 20,
+            follows_links: false,
         }
+    }
+
+    /// Returns the source with symbolic links followed out of it, or refused.
+    #[must_use]
+    pub fn following_links(self, follows_links: bool) -> Self {
+        Self { follows_links, ..self }
     }
 
     pub fn location(&self) -> &Location {
@@ -119,7 +128,7 @@ impl Source {
     /// in [`Listing::problems`].
     pub fn list(&self) -> Result<Listing, StoreError> {
         match self.location.kind() {
-            Kind::Local(root) => list_tree(root),
+            Kind::Local(root) => list_tree(root, self.follows_links),
             Kind::Remote { store, prefix } => {
                 let metas: Vec<_> = block_on(store.list(Some(prefix)).try_collect())
                     .map_err(|e| StoreError::remote("list", self.location.url(), e))?;
@@ -153,7 +162,10 @@ impl Source {
     /// Reads files in the order given, remote ones ahead of the caller within the budget.
     pub fn read_in_order(&self, files: Vec<SourceFile>) -> InOrder {
         match self.location.kind() {
-            Kind::Local(root) => InOrder::Local { root: root.clone(), files: files.into() },
+            Kind::Local(root) => {
+                let (root, follows_links) = (root.clone(), self.follows_links);
+                InOrder::Local { root, follows_links, files: files.into() }
+            }
             Kind::Remote { store, prefix } => {
                 let (sender, receiver) = mpsc::channel(1);
                 let fetcher = Fetcher {
@@ -185,7 +197,7 @@ impl Source {
 
 /// The contents of files, one after the other in the order asked for.
 pub enum InOrder {
-    Local { root: std::path::PathBuf, files: VecDeque<SourceFile> },
+    Local { root: std::path::PathBuf, follows_links: bool, files: VecDeque<SourceFile> },
     Remote { receiver: mpsc::Receiver<Fetched> },
 }
 
@@ -197,9 +209,16 @@ impl Iterator for InOrder {
 
     fn next(&mut self) -> Option<Self::Item> {
         match self {
-            InOrder::Local { root, files } => {
+            InOrder::Local { root, follows_links, files } => {
                 let file = files.pop_front()?;
-                Some((read_local(&root.join(&file.path), file.size_bytes), None))
+                let path = root.join(&file.path);
+                // A file may have become a link since it was listed.
+                let read = if *follows_links || !leads_out(root, &path) {
+                    read_local(&path, file.size_bytes)
+                } else {
+                    Err(StoreError::OutsideSource { place: path.display().to_string() })
+                };
+                Some((read, None))
             }
             InOrder::Remote { receiver } => receiver.blocking_recv(),
         }
@@ -285,7 +304,12 @@ fn fingerprint_of(text: &str) -> String {
     format!("{:032x}", xxh3_128(text.as_bytes()))
 }
 
-fn list_tree(root: &FsPath) -> Result<Listing, StoreError> {
+/// Returns whether a path below a source ends elsewhere; a root that exists is spelled without links.
+fn leads_out(root: &FsPath, path: &FsPath) -> bool {
+    path.canonicalize().is_ok_and(|target| !target.starts_with(root))
+}
+
+fn list_tree(root: &FsPath, follows_links: bool) -> Result<Listing, StoreError> {
     let place = root.display().to_string();
     let meta = std::fs::metadata(root).map_err(|e| StoreError::io("list", &place, e))?;
     if !meta.is_dir() {
@@ -293,7 +317,8 @@ fn list_tree(root: &FsPath) -> Result<Listing, StoreError> {
         return Err(StoreError::Io { action: "list", place, source });
     }
     let mut listing = Listing::default();
-    for entry in walkdir::WalkDir::new(root).follow_links(true).min_depth(1) {
+    let mut walk = walkdir::WalkDir::new(root).follow_links(true).min_depth(1).into_iter();
+    while let Some(entry) = walk.next() {
         let entry = match entry {
             Ok(entry) => entry,
             Err(e) => {
@@ -301,6 +326,21 @@ fn list_tree(root: &FsPath) -> Result<Listing, StoreError> {
                 continue;
             }
         };
+        if !follows_links && entry.path_is_symlink() && leads_out(root, entry.path()) {
+            if entry.file_type().is_dir() {
+                walk.skip_current_dir();
+            }
+            let path = entry.path().strip_prefix(root).unwrap_or(entry.path());
+            listing.problems.push(SourceProblem {
+                path: path.to_string_lossy().into_owned(),
+                kind: SourceProblemKind::Symlink,
+                message:
+                    "is a symbolic link that leads out of the source; copy what it names into \
+                          the source, or pass --follow-links"
+                        .into(),
+            });
+            continue;
+        }
         let below = entry.path().strip_prefix(root).unwrap_or(entry.path());
         let (Some(path), file_type) = (below.to_str(), entry.file_type()) else {
             listing.problems.push(SourceProblem {

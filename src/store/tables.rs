@@ -70,7 +70,7 @@ rows! {
 
 rows! {
     "One row per phrase whose features extract has, with what holds for the whole phrase."
-    ExtractionRow in "extractions" version 1 sorted by [phrase_id]
+    ExtractionRow in "extractions" version 2 reads 1 sorted by [phrase_id]
     {
         phrase_id: String, "", "The phrase, as in `phrases`.";
         origin: String, "", "`audio` (extracted here) or `feature_file` (brought in from `features.npz`, as it was).";
@@ -85,6 +85,7 @@ rows! {
         audio_codec: Option<String>, "", "Codec that was decoded.";
         sample_rate_hz: Option<i32>, "Hz", "Sample rate of the file.";
         n_channels: Option<i32>, "channels", "Channels of the file.";
+        content_hash: Option<String>, "BLAKE3", "`content_hash` of the phrase when its features were extracted; where `phrases` has another, the features are of files that were replaced. None in rows of version 1.";
     }
 }
 
@@ -164,7 +165,7 @@ rows! {
 
 rows! {
     "One row per motion that generate sampled, kept or not; measured times differ from run to run, nothing else does."
-    GenerationRow in "generations" version 2 reads 1 sorted by [generation, candidate]
+    GenerationRow in "generations" version 3 reads 1 sorted by [generation, candidate]
     {
         generation: String, "", "The motion: `RUN/PHRASE/SAMPLE`.";
         run: String, "", "Name of the generation (--run), by default that of the model.";
@@ -193,6 +194,7 @@ rows! {
         generate_s: f64, "s", "Time that sampling, decoding and post-processing took.";
         real_time_factor: f64, "", "That time over the length of the motion.";
         settings: Option<String>, "JSON", "What determines the motion beside its music, the model's weights and the seed: sampler, guidance, candidates, style, overlap, priming, post-processing, and of constraints the digest. None where release 0.1 made it.";
+        content_hash: Option<String>, "BLAKE3", "`content_hash` of the phrase that it was made for, as it was then; where `phrases` has another, the motion is for music that was replaced. None in rows of versions 1 and 2.";
         time: TimestampUs, "", "When it was made.";
     }
 }

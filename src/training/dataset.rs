@@ -14,7 +14,7 @@ use crate::motion::{Channel, MOTION_DIM, Trajectory, TrajectoryError, clock};
 use crate::store::tables::{self, PhraseRow};
 use crate::store::{
     FrameSpool, Location, Patience, Row as _, Snapshot, StoreError, StoreSnapshot, TableSchema,
-    digest,
+    digest, outdated_features,
 };
 
 /// Motion and features of one phrase may differ by this much: ingest lets a frame pass, the last frame of
@@ -179,6 +179,8 @@ impl Dataset {
             .filter(|row| row.has_motion)
             .map(|row| (row.phrase_id.clone(), row))
             .collect();
+        let outdated =
+            reading.patience.wait_out(wait, || outdated_features(snapshot, rows.values()))?;
         let wanted: BTreeSet<String> = rows.keys().cloned().collect();
         let spool = |width| match reading.in_memory {
             true => Ok(FrameSpool::in_memory(width)),
@@ -214,6 +216,13 @@ impl Dataset {
                 }
             };
             let (motion, features) = found;
+            if outdated.contains(&id) {
+                let message = format!(
+                    "phrase {id} has features of files that were replaced since; run extract again"
+                );
+                left_out.push(LeftOut { phrase_id: id, kind: "stale_features", message });
+                continue;
+            }
             if motion.n_frames.abs_diff(features.n_frames) > LENGTH_TOLERANCE_FRAMES {
                 let message = format!(
                     "phrase {id}: motion has {} frames but features have {}; they may differ by \

@@ -246,6 +246,7 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
         }
         let n_steps = self.state.progress.n_steps;
         self.watch.begin(L::STAGE, self.state.progress.step, n_steps);
+        self.journal.determined_by(&self.state.config, &self.state.data, n_steps);
         self.journal.begin(self.state.progress.step);
         let before_s = self.state.progress.elapsed_s;
         let started = Instant::now();

@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use serde::Serialize;
+
 use crate::store::tables::TrainingLogRow;
 use crate::store::{
     Commit, Item, Lease, Ledger, Location, Patience, Row as _, StoreError, TimestampUs, checkpoint,
@@ -81,6 +83,10 @@ pub struct Journal<'a> {
     run: String,
     stage: &'static str,
     command: &'static str,
+    /// Digest of the run's configuration.
+    params_hash: String,
+    /// What determines the rows beside configuration and steps.
+    data: String,
     ledger: Ledger,
     first_step: u64,
     rows: Vec<TrainingLogRow>,
@@ -106,6 +112,8 @@ impl<'a> Journal<'a> {
             run,
             stage,
             command,
+            params_hash: String::new(),
+            data: String::new(),
             ledger,
             first_step: 0,
             rows: Vec::new(),
@@ -116,6 +124,14 @@ impl<'a> Journal<'a> {
     /// Writes under a lease of the run, and no more once it is lost.
     pub fn under(self, lease: &'a Lease) -> Self {
         Self { lease: Some(lease), ..self }
+    }
+
+    /// Says what determines the rows beside their steps: the configuration, the digest of the data, and the steps in
+    /// all, on which learning rates depend.
+    pub fn determined_by(&mut self, config: &impl Serialize, data: &str, n_steps: u64) {
+        let config = serde_json::to_vec(config).expect("invariant: numbers and texts become JSON");
+        self.params_hash = digest(&config);
+        self.data = format!("{data} in {n_steps} steps");
     }
 
     /// Begins a stretch after `step` steps.
@@ -194,11 +210,12 @@ impl<'a> Journal<'a> {
         let id = self.name(self.first_step);
         let ledger = &mut self.ledger;
         patience.wait_out(notice, || {
-            let mut commit = Commit::new(self.store, self.command, "", &self.run);
+            let mut commit = Commit::new(self.store, self.command, &self.params_hash, &self.run);
             let schema = TrainingLogRow::schema;
             commit.part(schema().name, schema)?.write_rows(&self.rows)?;
-            // The same steps of the same run have the same losses, whoever takes them.
-            let input_hash = digest(format!("{id} to {step}").as_bytes());
+            // The same steps of the same run have the same losses, whoever takes them: a run is a name, and what it
+            // learns from and how.
+            let input_hash = digest(format!("{id} to {step} of {}", self.data).as_bytes());
             let fingerprint = input_hash.clone();
             let item = Item { id: id.clone(), fingerprint, input_hash, failure: None };
             commit.settle(item, ledger);

@@ -92,6 +92,7 @@ fn tables_hold_what_the_files_hold() {
 
     let rows = extractions(&store);
     assert_eq!(rows.keys().collect::<Vec<_>>(), ["a b/ü", "clicks", "imported", "one", "sine"]);
+    let phrases = crate::support::phrases(&store);
     let expected = ExtractionRow {
         phrase_id: "clicks".into(),
         origin: "audio".into(),
@@ -106,6 +107,7 @@ fn tables_hold_what_the_files_hold() {
         audio_codec: Some("flac".into()),
         sample_rate_hz: Some(44_100),
         n_channels: Some(1),
+        content_hash: Some(phrases["clicks"].content_hash.clone()),
     };
     assert_eq!(rows["clicks"], expected);
     let expected = ExtractionRow {
@@ -122,6 +124,7 @@ fn tables_hold_what_the_files_hold() {
         audio_codec: None,
         sample_rate_hz: None,
         n_channels: None,
+        content_hash: Some(phrases["imported"].content_hash.clone()),
     };
     assert_eq!(rows["imported"], expected);
     let row = &rows["a b/ü"];

@@ -92,7 +92,9 @@ fn no_files() -> Vec<Case> {
                 create_dir_all(source.join("audio")).unwrap();
                 symlink("/dev/zero", source.join("audio/link-to-a-device.wav")).unwrap();
             },
-            "not_a_file", "{path} is a pipe, socket or device, not a file; remove it"),
+            "symlink",
+            "{path} is a symbolic link that leads out of the source; copy what it names into the \
+             source, or pass --follow-links"),
     ]
 }
 

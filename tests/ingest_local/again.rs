@@ -62,7 +62,7 @@ fn a_second_run_does_nothing_and_says_so() {
 }
 
 #[test]
-fn a_file_that_was_only_touched_is_read_but_not_written() {
+fn a_file_that_was_only_touched_is_read_once_and_not_written() {
     let (_dir, source, store) = ingested();
     let before = tree(&store);
     touch(&source.join("motion/c/d/trajectory.npy"));
@@ -71,7 +71,16 @@ fn a_file_that_was_only_touched_is_read_but_not_written() {
         &output,
         "0 ingested (0.0 s of music or motion, 0 motion frames), 6 up to date, 0 failed; ",
     );
-    assert_eq!(tree(&store), before);
+    // All that is new says under which time the file was seen.
+    let mut after = tree(&store);
+    let seen: Vec<_> =
+        after.keys().filter(|p| p.starts_with("commits/ingest-seen")).cloned().collect();
+    assert_eq!(seen.len(), 1);
+    let again = ingest(&source, &store, &[]);
+    says(&again, "nothing to do: 6 phrases are up to date\n");
+    assert_eq!(tree(&store), after);
+    after.remove(&seen[0]);
+    assert_eq!(after, before);
 }
 
 #[test]

@@ -23,7 +23,7 @@ fn a_flag_wins_over_the_environment_over_the_file_over_the_default() {
     let (source, store) = fast(&dir);
     let reference = dir.write("reference.toml", "limits = \"reference\"\n");
     let own = dir.write("own.toml", "limits = \"wide\"\n[ingest]\nlimits = \"reference\"\n");
-    let wide = dir.write("wide.toml", "[ingest]\nlimits = \"wide\"\n[query]\nlimits = 3\n");
+    let wide = dir.write("wide.toml", "[ingest]\nlimits = \"wide\"\n[generate]\nlimits = 3\n");
     let file = |path: &PathBuf| Some(path.to_str().unwrap().to_owned());
     for (flag, variable, file, expected) in [
         (None, None, None, WIDE),

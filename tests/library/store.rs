@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use motiongen::motion::{Beats, bar_phase};
 use motiongen::stages::beats::of_phrases;
-use motiongen::store::tables::BeatRow;
+use motiongen::store::tables::{BeatRow, PhraseRow};
 use motiongen::store::{Location, StoreSnapshot};
 use motiongen::units::frames_to_s;
 
@@ -220,10 +220,69 @@ fn songs_that_leave_take_their_phrases_along() {
     dir.write("songs/marches/one.wav", clicks(93.7, 11.0));
     assert_eq!(library(&store, &flags).code, 0);
     assert!(motion(&store) == whole);
-    // Touched, but not changed: nothing is written.
+    // Touched, but not changed: nothing is written but under which time it was seen.
     let before = contents(&store);
     dir.write("songs/marches/one.wav", clicks(93.7, 11.0));
     let output = library(&store, &flags);
     assert!(output.stdout.contains("  0 songs danced to (0 phrases), 3 up to date"), "{output:?}");
-    contents(&store).assert_same_as(&before);
+    let mut after = contents(&store);
+    after.manifests.retain(|path, _| !path.starts_with("commits/library-seen/"));
+    after.assert_same_as(&before);
+}
+
+#[test]
+fn songs_whose_files_were_replaced_wait_for_their_features() {
+    let dir = Dir::new();
+    let (songs, store) = make(&dir);
+    assert_eq!(library(&store, &["--takes", "1"]).code, 0);
+    let before = constructed(&store);
+    let is_song =
+        |row: &PhraseRow| row.audio_url.as_deref().is_some_and(|url| url.ends_with("/tracked.wav"));
+    let song = phrases(&store).into_values().find(is_song).expect("a song");
+    let id = &song.phrase_id;
+    // Another song of the same name.
+    dir.write("songs/tracked.wav", clicks(126.0, 8.5));
+    assert_eq!(ingest(&songs, &store, &[]).code, 0);
+    let output = library(&store, &["--takes", "1"]);
+    assert_eq!(output.code, 1, "{output:?}");
+    let failed = failures(&store);
+    assert_eq!(failed[id].kind, "stale_features");
+    assert_eq!(
+        failed[id].message,
+        format!(
+            "{id}: its features are of a file that was replaced since; run motiongen extract --store {} first",
+            store.display()
+        )
+    );
+    assert_eq!(constructed(&store), before, "its phrases stay until then");
+    assert_eq!(finish(motiongen().args(["extract", "--store"]).arg(&store)).code, 0);
+    let output = library(&store, &["--takes", "1"]);
+    assert!(output.stdout.contains("  1 songs danced to ("), "{output:?}");
+    assert_eq!(output.code, 0, "{output:?}");
+    assert!(failures(&store).is_empty());
+}
+
+#[test]
+fn songs_that_were_only_touched_are_read_once() {
+    let dir = Dir::new();
+    let (songs, captures) = (write_songs(&dir), write_captures(&dir));
+    let store = dir.at("store");
+    let run = || library(&store, &from(&songs, &captures, &["--takes", "1"]));
+    assert_eq!(run().code, 0);
+    let motions = motion(&store);
+    let mut n_touched = 0;
+    for entry in walkdir::WalkDir::new(&songs).into_iter().flatten() {
+        if entry.path().extension().is_some_and(|e| e != "txt") {
+            let file = std::fs::File::options().write(true).open(entry.path()).expect("a file");
+            file.set_modified(std::time::SystemTime::now()).expect("touched");
+            n_touched += 1;
+        }
+    }
+    assert!(n_touched > 0);
+    let read = run();
+    assert!(read.stdout.contains("  0 songs danced to (0 phrases), "), "{read:?}");
+    let before = tree(&store);
+    let again = run();
+    assert!(again.stdout.contains("  nothing to do: "), "{again:?}");
+    assert!(tree(&store) == before && motion(&store) == motions);
 }

@@ -97,6 +97,26 @@ fn rules_that_are_broken_are_named() {
 }
 
 #[test]
+fn weights_lie_beside_their_file() {
+    let model = Model::read(tiny().model, None, "m.onnx").expect("a model");
+    let Encoded { model, weights } =
+        file(model.graph.expect("a graph")).encode("unet.weights.bin", 0);
+    let mut model = Model::read(model, weights.as_ref(), "m.onnx").expect("a model");
+    check(&model, "m.onnx").expect("the rules are kept");
+    for place in ["/etc/passwd", "../weights.bin", ".."] {
+        let graph = model.graph.as_mut().expect("a graph");
+        let outside = graph.initializer.iter_mut().find(|tensor| !tensor.external_data.is_empty());
+        let outside = outside.expect("a large weight");
+        place.clone_into(&mut outside.external_data[0].value);
+        let expected = format!(
+            "m.onnx: initializer {} lies in {place:?}, which is not beside the file",
+            outside.name
+        );
+        assert_eq!(check(&model, "m.onnx").expect_err("outside").to_string(), expected);
+    }
+}
+
+#[test]
 fn a_missing_weight_is_named() {
     let mut model = Model::read(tiny().model, None, "m.onnx").expect("a model");
     let graph = model.graph.as_mut().expect("a graph");

@@ -104,7 +104,7 @@ fn who_interrupts_gets_a_checkpoint_and_the_command_that_goes_on() {
         assert!(asked.success());
         let output = child.wait_with_output().expect("an end");
         let stdout = String::from_utf8(output.stdout).expect("UTF-8");
-        assert_eq!(output.status.code(), Some(0), "{stdout}");
+        assert_eq!(output.status.code(), Some(75), "{stdout}");
         assert!(stdout.contains("diffusion: was interrupted, "), "{stdout}");
         let last = stdout.lines().last().expect("a line");
         assert!(last.starts_with("saved; go on with: ") && last.ends_with(" --resume"), "{last}");

@@ -13,7 +13,7 @@ use motiongen::training::{
 use super::given;
 use crate::engine::golden::{Golden, assert_near, parameters, uniform};
 
-/// The limit.
+/// What is allowed.
 const SINGLE: f64 = 1e-4;
 /// Of what one step of AdamW changes: where a gradient is near zero its rounding decides which way, and
 /// of the position's bias the larger part cancels.

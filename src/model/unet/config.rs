@@ -130,18 +130,40 @@ impl UNetConfig {
                 n - 1
             ));
         }
-        for (name, value) in [
-            ("in_channels", self.in_channels),
-            ("out_channels", self.out_channels),
-            ("num_res_blocks", self.num_res_blocks),
-            ("num_heads", self.num_heads),
-            ("audio_cond_dim", self.audio_cond_dim),
-            ("context_dim", self.context_dim),
-            ("n_steps", self.n_steps),
+        if let Some(width) = self.widths.iter().find(|&&width| width > MAX_WIDTH) {
+            return refuse(format!("widths has {width}; use at most {MAX_WIDTH} channels"));
+        }
+        for (name, value, most) in [
+            ("in_channels", self.in_channels, MAX_WIDTH),
+            ("out_channels", self.out_channels, MAX_WIDTH),
+            ("num_res_blocks", self.num_res_blocks, MAX_BLOCKS),
+            ("num_heads", self.num_heads, MAX_WIDTH),
+            ("num_head_channels", self.num_head_channels.unwrap_or(1), MAX_WIDTH),
+            ("audio_cond_dim", self.audio_cond_dim, MAX_WIDTH),
+            ("context_dim", self.context_dim, MAX_WIDTH),
+            ("time_embed_dim", self.time_embed_dim, MAX_WIDTH),
+            ("n_steps", self.n_steps, MAX_TABLE_VALUES),
         ] {
-            if value == 0 {
+            if value == 0 && name != "time_embed_dim" {
                 return refuse(format!("{name} is 0; it must be at least 1"));
             }
+            if value > most {
+                return refuse(format!("{name} is {value}; it must be at most {most}"));
+            }
+        }
+        if self.style_dim > MAX_WIDTH {
+            let value = self.style_dim;
+            return refuse(format!("style_dim is {value}; it must be at most {MAX_WIDTH}"));
+        }
+        // Both are bounded by now, so that the product cannot overflow.
+        if self.n_steps * self.time_embed_dim > MAX_TABLE_VALUES {
+            return refuse(format!(
+                "n_steps {} and time_embed_dim {} make a table of {} values; at most \
+                 {MAX_TABLE_VALUES} are kept, so lower one of the two",
+                self.n_steps,
+                self.time_embed_dim,
+                self.n_steps * self.time_embed_dim
+            ));
         }
         if self.time_embed_dim == 0 || !self.time_embed_dim.is_multiple_of(2) {
             return refuse(format!(
@@ -185,6 +207,12 @@ impl UNetConfig {
 
 /// More levels would need phrases of thousands of frames.
 const MAX_LEVELS: usize = 10;
+/// Channels that a layer may have, eight times those of the widest preset.
+pub(in crate::model) const MAX_WIDTH: usize = 16_384;
+/// Blocks that a level or a decoder may have.
+pub(in crate::model) const MAX_BLOCKS: usize = 64;
+/// Values of the table of steps, 256 MB in f64.
+const MAX_TABLE_VALUES: usize = 1 << 25;
 
 /// Sizes of which no network can be made.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -233,9 +261,43 @@ mod tests {
              num_head_channels or the width"
         );
         assert_eq!(
+            refusal(|c| c.num_head_channels = Some(0)),
+            "num_head_channels is 0; it must be at least 1"
+        );
+        assert_eq!(
             refusal(|c| c.num_head_channels = Some(20)),
             "a width of 48 does not divide into heads of 24 channels; change num_head_channels or \
              the width"
+        );
+    }
+
+    #[test]
+    fn sizes_that_no_memory_holds_are_refused() {
+        let refusal = |change: fn(&mut UNetConfig)| {
+            let mut config = Preset::Tiny.config();
+            change(&mut config);
+            config.check().expect_err("too large").to_string()
+        };
+        assert_eq!(
+            refusal(|c| c.widths[1] = usize::MAX),
+            format!("widths has {}; use at most 16384 channels", usize::MAX)
+        );
+        assert_eq!(
+            refusal(|c| c.num_res_blocks = 1_000_000_000),
+            "num_res_blocks is 1000000000; it must be at most 64"
+        );
+        assert_eq!(
+            refusal(|c| c.n_steps = usize::MAX),
+            format!("n_steps is {}; it must be at most 33554432", usize::MAX)
+        );
+        assert_eq!(
+            refusal(|c| c.n_steps = 2_000_000),
+            "n_steps 2000000 and time_embed_dim 32 make a table of 64000000 values; at most \
+             33554432 are kept, so lower one of the two"
+        );
+        assert_eq!(
+            refusal(|c| c.style_dim = 20_001),
+            "style_dim is 20001; it must be at most 16384"
         );
     }
 }

@@ -293,6 +293,20 @@ mod tests {
 
     proptest! {
         #[test]
+        fn arbitrary_bytes_never_panic(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
+            let _ = read_csv(&String::from_utf8_lossy(&bytes));
+        }
+
+        #[test]
+        fn damaged_files_never_panic(at in 0..400_usize, n in 0..12_usize, patch in "[ -~\n]{0,9}") {
+            let mut text = written(&ramp(3)).into_bytes();
+            let at = at.min(text.len());
+            let end = (at + n).min(text.len());
+            text.splice(at..end, patch.into_bytes());
+            let _ = read_csv(&String::from_utf8_lossy(&text));
+        }
+
+        #[test]
         fn values_come_back_bit_for_bit(
             values in prop::collection::vec(prop::num::f32::ANY, 3 * MOTION_DIM)
         ) {

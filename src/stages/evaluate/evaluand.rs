@@ -24,7 +24,9 @@ use crate::stages::generate::MotionSettings;
 use crate::stages::learned;
 use crate::stages::motion_source::generated_frames;
 use crate::store::tables::{self, GenerationRow};
-use crate::store::{Location, StoreError, StoreSnapshot, digest};
+use crate::store::{
+    Location, StoreError, StoreSnapshot, digest, outdated_features, outdated_generations,
+};
 use crate::units::frames_to_s;
 
 /// Songs whose activity is read; that of others counts as its mean.
@@ -77,6 +79,7 @@ impl Evaluand {
         let generations = motions::of_run(&snapshot, run, most)?;
         let phrases =
             Phrases::read(&snapshot, generations.iter().map(|row| row.phrase_id.as_str()))?;
+        refuse_outdated(&snapshot, run, &phrases, &generations)?;
         let (splits, notes) = splits_of(store, &phrases, &generations)?;
         let motions = generations
             .iter()
@@ -313,11 +316,23 @@ impl Evaluand {
     }
 
     /// Reads the activity of the songs that were danced to, and of those with held-out real motion.
-    fn hear(&mut self, truth: &Truth) -> Result<(), StoreError> {
+    fn hear(&mut self, truth: &Truth) -> anyhow::Result<()> {
         let held_out = truth.phrases.iter().filter(|phrase| is_held_out(phrase.split));
         let ids = self.motions.iter().map(|motion| motion.phrase_id.as_str());
         let songs = self.phrases.songs_of(ids.chain(held_out.map(|phrase| phrase.id.as_str())));
         let songs: BTreeSet<String> = songs.into_iter().take(MAX_HEARD_SONGS).collect();
+        let motions = self.motions.iter().map(|motion| motion.phrase_id.as_str());
+        let real = truth.phrases.iter().map(|phrase| phrase.id.as_str());
+        let used: BTreeSet<&str> =
+            motions.chain(real).chain(songs.iter().map(String::as_str)).collect();
+        let rows = used.into_iter().filter_map(|id| self.phrases.row(id));
+        if let Some(first) = outdated_features(&self.snapshot, rows)?.first() {
+            bail!(
+                "phrase {first}: its features are of a file that was replaced since; run motiongen extract \
+                 --store {} first",
+                self.snapshot.store()
+            );
+        }
         let mut heard: Vec<(String, Array2<f32>)> = Vec::new();
         self.snapshot.table(tables::features())?.visit_items(&songs, |id, features| {
             heard.push((id.to_owned(), features));
@@ -389,6 +404,27 @@ impl Evaluand {
             .map(|(is, decoded)| Evaluated { is, decoded })
             .collect())
     }
+}
+
+/// Refuses motions that were made for other music than their phrases have now.
+fn refuse_outdated(
+    snapshot: &StoreSnapshot,
+    run: &str,
+    phrases: &Phrases,
+    generations: &[GenerationRow],
+) -> anyhow::Result<()> {
+    let content_of = |id: &str| phrases.row(id).map(|row| row.content_hash.as_str());
+    let outdated = outdated_generations(snapshot, generations, content_of)?;
+    let store = snapshot.store();
+    if let Some(first) = outdated.first() {
+        bail!(
+            "store {store}: {} of {} motions of run \"{run}\" were made for files that were replaced since; run \
+             motiongen extract and generate again. The first: {first}",
+            outdated.len(),
+            generations.len()
+        );
+    }
+    Ok(())
 }
 
 /// Notes on single files that are told; the table of failures has all that were refused.

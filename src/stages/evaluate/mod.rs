@@ -22,7 +22,7 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 
-use super::failure::write_failures;
+use super::failure::{failures_json, write_failures};
 use super::{Contract, Progress, Stage, Summary};
 use crate::evaluation::verdict::Quality;
 use crate::report::{self, Report};
@@ -72,10 +72,22 @@ impl Stage for Evaluate {
         for stage in &rows::STAGES[..n_wanted] {
             is_up_to_date = is_up_to_date && known.is_up_to_date(stage)?;
         }
+        if params.dry_run {
+            let (n_motions, length_s) = (subject.motions.len(), subject.length_s());
+            let n_refused = subject.refused.len();
+            return Ok(Box::new(DryRun {
+                store: store.to_string(),
+                run,
+                n_motions,
+                n_refused,
+                length_s,
+                is_up_to_date,
+            }));
+        }
         let found = if is_up_to_date {
             Rows::read(&store, &run, params.quick)?
         } else {
-            store.sweep()?;
+            store.sweep();
             let found = subject.evaluate(&store, &params, &data_hash, progress)?;
             known.commit_checks(&found, &subject.refused)?;
             if !params.quick {
@@ -212,5 +224,66 @@ impl Summary for EvaluateSummary {
         self.missed.iter().map(|(.., n)| *n as u64).sum::<u64>()
             + self.not_won.len() as u64
             + self.refused.len() as u64
+    }
+
+    fn figures(&mut self) -> serde_json::Value {
+        let verdicts: serde_json::Map<String, serde_json::Value> = self
+            .report
+            .verdicts
+            .iter()
+            .map(|told| (told.verdict.clone(), told.outcome.name().into()))
+            .collect();
+        let refused = self.refused.iter().map(|refused| (&refused.name, &refused.failure));
+        serde_json::json!({
+            "store": self.store,
+            "run": self.run,
+            "n_motions": self.n_motions,
+            "length_s": self.length_s,
+            "is_up_to_date": self.is_up_to_date,
+            "verdicts": verdicts,
+            "not_won": self.not_won.iter().map(|(verdict, _)| verdict).collect::<Vec<_>>(),
+            "report": self.page,
+            "failures": failures_json(refused),
+            "took_s": self.took_s,
+        })
+    }
+}
+
+/// What would be measured.
+struct DryRun {
+    store: String,
+    run: String,
+    n_motions: usize,
+    /// Files that hold no motion.
+    n_refused: usize,
+    length_s: f64,
+    is_up_to_date: bool,
+}
+
+impl Summary for DryRun {
+    fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
+        let Self { store, run, n_motions, n_refused, length_s, is_up_to_date } = self;
+        writeln!(out, "evaluate {run} → {store}")?;
+        let what = if *is_up_to_date { "nothing to do for" } else { "would evaluate" };
+        writeln!(
+            out,
+            "  {what} {n_motions} motions ({length_s:.1} s), {n_refused} files hold no motion"
+        )
+    }
+
+    fn n_failed(&self) -> u64 {
+        0
+    }
+
+    fn figures(&mut self) -> serde_json::Value {
+        serde_json::json!({
+            "store": self.store,
+            "run": self.run,
+            "dry_run": true,
+            "n_motions": self.n_motions,
+            "n_refused": self.n_refused,
+            "length_s": self.length_s,
+            "is_up_to_date": self.is_up_to_date,
+        })
     }
 }

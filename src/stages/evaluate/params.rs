@@ -98,6 +98,9 @@ pub struct Params {
     pub min_strict_pass_rate: Option<f64>,
     #[command(flatten)]
     pub client: ClientParams,
+    /// Say what would be done, and do nothing.
+    #[arg(long)]
+    pub dry_run: bool,
     /// Evaluate again what is evaluated.
     #[arg(long)]
     pub force: bool,

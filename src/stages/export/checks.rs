@@ -87,7 +87,7 @@ impl Checking<'_> {
         let machine = &self.params.machine;
         let folder = tempfile::tempdir().context("while making a temporary folder")?;
         for (name, bytes) in &self.files.bytes {
-            let path = folder.path().join(name);
+            let path = folder.path().join(name.name());
             write_file(&path, |out| out.write_all(bytes))
                 .with_context(|| format!("while writing {}", path.display()))?;
         }

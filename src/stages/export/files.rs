@@ -9,8 +9,8 @@ use super::Params;
 use crate::autodiff::Parameters;
 use crate::diffusion::Schedule;
 use crate::generation::{
-    FileEntry, LearnedFrom, MODEL_FORMAT, ModelCard, Networks, Provenance, SamplingDefaults,
-    file_names, own_channels, own_features,
+    FileEntry, LearnedFrom, MODEL_FORMAT, ModelCard, ModelFileName, Networks, Provenance,
+    SamplingDefaults, own_channels, own_features,
 };
 use crate::model::ParameterId;
 use crate::motion::rates::MotionRange;
@@ -24,7 +24,7 @@ pub struct Files {
     pub card: ModelCard,
     pub card_text: Bytes,
     /// Name and content, in the order in which they are written.
-    pub bytes: Vec<(String, Bytes)>,
+    pub bytes: Vec<(ModelFileName, Bytes)>,
 }
 
 impl Files {
@@ -88,8 +88,8 @@ impl Files {
         };
         let metadata = metadata(&card)?;
         let names = [
-            (file_names::UNET, file_names::UNET_WEIGHTS, &card.weights_sha256.unet),
-            (file_names::DECODER, file_names::DECODER_WEIGHTS, &card.weights_sha256.decoder),
+            (ModelFileName::Unet, ModelFileName::UnetWeights, &card.weights_sha256.unet),
+            (ModelFileName::Decoder, ModelFileName::DecoderWeights, &card.weights_sha256.decoder),
         ];
         let mut bytes = Vec::new();
         for (graph, (name, weights_name, weights_sha256)) in graphs.into_iter().zip(names) {
@@ -98,17 +98,17 @@ impl Files {
             let description = format!("{} of {}, by {}", graph.name, card.name, card.program);
             let file = ModelFile { graph, metadata, description };
             let embedded = params.embed_mb.saturating_mul(1_000_000);
-            let Encoded { model, weights } = file.encode(weights_name, embedded);
-            let read = Model::read(model.clone(), weights.as_ref(), name)?;
-            check(&read, name)
+            let Encoded { model, weights } = file.encode(weights_name.name(), embedded);
+            let read = Model::read(model.clone(), weights.as_ref(), name.name())?;
+            check(&read, name.name())
                 .map_err(|e: OnnxError| anyhow::anyhow!("{e}; please report this"))?;
-            bytes.push((name.to_owned(), model));
-            bytes.extend(weights.map(|weights| (weights_name.to_owned(), weights)));
+            bytes.push((name, model));
+            bytes.extend(weights.map(|weights| (weights_name, weights)));
         }
         card.files = bytes
             .iter()
             .map(|(name, bytes)| FileEntry {
-                name: name.clone(),
+                name: *name,
                 n_bytes: bytes.len() as u64,
                 sha256: sha256(bytes),
             })
@@ -120,7 +120,7 @@ impl Files {
 
     /// Returns the content of a file.
     pub fn get(&self, name: &str) -> Option<&Bytes> {
-        self.bytes.iter().find(|(known, _)| known == name).map(|(_, bytes)| bytes)
+        self.bytes.iter().find(|(known, _)| known.name() == name).map(|(_, bytes)| bytes)
     }
 }
 

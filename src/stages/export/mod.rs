@@ -89,9 +89,11 @@ impl Stage for Export {
         let mut trained = Trained::read(&store, &params.run, params.weights)?;
         let machine = &params.machine;
         let watch = Looker(progress);
-        let most = Some(MAX_TRAIN_PHRASES);
-        let phrases = read_phrases(&store, Self::NAME, machine, most, progress, &watch)?;
-        let learned_from = learned::of_run(&store, &params.run, &trained, machine, progress)?;
+        let (most, is_dry_run) = (Some(MAX_TRAIN_PHRASES), params.dry_run);
+        let phrases =
+            read_phrases(&store, Self::NAME, machine, most, progress, &watch, is_dry_run)?;
+        let learned_from =
+            learned::of_run(&store, &params.run, &trained, machine, progress, is_dry_run)?;
         if learned_from.is_none() {
             progress.note(&format!(
                 "run {} does not tell what it learned from, and the phrases of {store} are others by now: the \
@@ -140,6 +142,8 @@ impl Stage for Export {
             files: &files,
         };
         let held = checking.run(&runtime, progress)?;
+        // From here on a signal is left until the model is whole.
+        progress.is_interrupted();
         record(&store, &params, &files, &held)?;
         checkpoint(&store, &[Self::NAME]);
         if let Some(failed) = held.rows.iter().find(|row| !row.passed) {

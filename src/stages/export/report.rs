@@ -2,6 +2,8 @@
 
 use std::io::{self, Write};
 
+use serde_json::json;
+
 use super::Params;
 use super::checks::{Held, ROUNDING};
 use super::files::Files;
@@ -82,6 +84,28 @@ impl Summary for Report {
     fn n_failed(&self) -> u64 {
         0
     }
+
+    fn figures(&mut self) -> serde_json::Value {
+        let mut figures = of_card(&self.card, &self.place);
+        figures["is_up_to_date"] = self.is_up_to_date.into();
+        figures["n_checks"] = self.checks.len().into();
+        figures
+    }
+}
+
+/// Returns what is told of a model in either case.
+fn of_card(card: &ModelCard, place: &str) -> serde_json::Value {
+    let files = card
+        .files
+        .iter()
+        .map(|file| json!({ "name": file.name, "n_bytes": file.n_bytes, "sha256": file.sha256 }));
+    json!({
+        "model": card.name,
+        "to": place,
+        "run": card.provenance.run,
+        "precision": card.precision.name(),
+        "files": files.collect::<Vec<_>>(),
+    })
 }
 
 /// What `--dry-run` says.
@@ -118,5 +142,11 @@ impl Summary for Planned {
 
     fn n_failed(&self) -> u64 {
         0
+    }
+
+    fn figures(&mut self) -> serde_json::Value {
+        let mut figures = of_card(&self.card, &self.place);
+        figures["dry_run"] = true.into();
+        figures
     }
 }

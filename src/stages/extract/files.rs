@@ -15,7 +15,8 @@ use crate::motion::npz::NpzWriter;
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::feature_file::write_blocks;
 use crate::store::{
-    Content, PartWriter, SourceFile, StoreError, replace_file, tables, temporary_beside,
+    Content, PartWriter, SourceFile, StoreError, is_standard_output, replace_file, tables,
+    temporary_beside,
 };
 use anyhow::{Context as _, bail};
 
@@ -34,6 +35,13 @@ enum Output {
 
 impl Output {
     fn of(path: &Path, n_files: usize) -> anyhow::Result<Self> {
+        // Standard output, pipes and devices have no extension to go by.
+        let is_stream =
+            std::fs::metadata(path).is_ok_and(|found| !found.is_file() && !found.is_dir());
+        if is_standard_output(path) || is_stream && path.extension().is_none() {
+            let path = path.to_owned();
+            return Ok(if n_files == 1 { Self::Npz(path) } else { Self::Parquet(path) });
+        }
         match path.extension().and_then(|e| e.to_str()) {
             Some("npz") if !path.is_dir() => {
                 if n_files != 1 {
@@ -85,7 +93,14 @@ pub fn run(job: &Job<'_>, audio: &[PathBuf], output: &Path) -> anyhow::Result<Do
     let mut queue = tasks.into_iter();
     pool::run(
         job.n_workers,
-        || queue.next(),
+        || {
+            let task = queue.next()?;
+            if job.progress.is_interrupted() {
+                lock(&done).is_stopped = true;
+                return None;
+            }
+            Some(task)
+        },
         |task| -> anyhow::Result<()> {
             let outcome = {
                 let _share = budget.take(needed_bytes(task.duration_s, task.size_bytes));
@@ -110,7 +125,8 @@ pub fn run(job: &Job<'_>, audio: &[PathBuf], output: &Path) -> anyhow::Result<Do
         },
     )?;
     job.progress.finish();
-    if let Some(table) = table {
+    // A table is written whole or not at all.
+    if let Some(table) = table.filter(|_| !lock(&done).is_stopped) {
         table.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner).finish()?;
     }
     Ok(done.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner))
@@ -158,7 +174,7 @@ fn extract_file(task: &Task, job: &Job<'_>) -> Result<Extracted, Failure> {
 /// Writes the reference's keys, and what else a reader may want of the file.
 fn write_npz(path: &Path, extracted: &Extracted) -> anyhow::Result<()> {
     let write = || -> std::io::Result<()> {
-        let mut file = temporary_beside(&std::path::absolute(path)?)?;
+        let mut file = temporary_beside(path)?;
         let mut npz = NpzWriter::new(BufWriter::new(file.as_file_mut()));
         let n_frames = extracted.frames.nrows();
         write_blocks(&mut npz, extracted.frames.view())?;
@@ -188,9 +204,8 @@ struct Table {
 
 impl Table {
     fn new(path: &Path) -> anyhow::Result<Self> {
-        let file = std::path::absolute(path)
-            .and_then(|path| temporary_beside(&path))
-            .with_context(|| format!("while writing {}", path.display()))?;
+        let file =
+            temporary_beside(path).with_context(|| format!("while writing {}", path.display()))?;
         let writer = PartWriter::new(tables::features(), file)?;
         Ok(Self { path: path.to_owned(), writer, waiting: BTreeMap::new(), n_written: 0 })
     }

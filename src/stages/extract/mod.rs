@@ -10,7 +10,7 @@ use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use super::failure::{Failure, N_SHOWN, write_failures};
+use super::failure::{Failure, N_SHOWN, failures_json, write_failures};
 use super::{ClientParams, Contract, Progress, Stage, Summary, all_threads};
 use crate::audio::Tuning;
 use crate::store::{Location, Shard, digest};
@@ -152,6 +152,8 @@ struct Done {
     told: Vec<String>,
     n_done: u64,
     failed: Vec<(String, Failure)>,
+    /// Whether files are left because the user asked for an end.
+    is_stopped: bool,
 }
 
 impl Done {
@@ -226,6 +228,9 @@ impl Summary for Report {
                 done.duration_s / took_s.max(1e-9)
             )?;
         }
+        if done.is_stopped {
+            writeln!(out, "  stopped as asked; the same command goes on with what is missing")?;
+        }
         if done.n_imported > 0 {
             writeln!(out, "  {} of them brought in from feature files", done.n_imported)?;
         }
@@ -247,5 +252,28 @@ impl Summary for Report {
 
     fn n_failed(&self) -> u64 {
         self.done.failed.len() as u64
+    }
+
+    fn is_stopped(&self) -> bool {
+        self.done.is_stopped
+    }
+
+    fn figures(&mut self) -> serde_json::Value {
+        let Report { place, done, .. } = self;
+        let (Place::Store(name) | Place::Files(name)) = &*place;
+        serde_json::json!({
+            "to": name,
+            "dry_run": self.dry_run,
+            "n_todo": done.n_todo,
+            "todo_s": done.todo_s,
+            "n_done": done.n_done,
+            "n_unchanged": done.n_unchanged,
+            "n_without_audio": done.n_without,
+            "n_imported": done.n_imported,
+            "n_frames": done.n_frames,
+            "duration_s": done.duration_s,
+            "failures": failures_json(done.failed.iter().map(|(name, why)| (name, why))),
+            "took_s": self.took_s,
+        })
     }
 }

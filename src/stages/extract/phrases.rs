@@ -95,17 +95,20 @@ pub fn run(job: &Job<'_>, target: &Target<'_>) -> anyhow::Result<Done> {
     tasks.retain(|task| target.force || !is_settled(task, &ledger, target.params_hash));
     done.n_unchanged = (n_mine - tasks.len()) as u64;
     done.n_todo = tasks.len() as u64;
-    done.todo_s = tasks.iter().map(|task| task.row.duration_s).sum();
+    // An empty sum of f64 is -0.
+    done.todo_s = tasks.iter().fold(0.0, |sum, task| sum + task.row.duration_s);
     if job.dry_run {
         return Ok(done);
     }
-    target.store.sweep()?;
+    target.store.sweep();
     snapshot.checkpoint();
     job.progress.start_audio("extract", done.todo_s.ceil() as u64);
     let writer = Writer { target, ledger: &ledger };
     let done = Mutex::new(done);
     work_off(job, target, tasks, &writer, &done)?;
-    writer.forget_failures(&names)?;
+    if !lock(&done).is_stopped {
+        writer.forget_failures(&names)?;
+    }
     job.progress.finish();
     checkpoint(target.store, &[Extract::NAME]);
     Ok(done.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner))
@@ -205,10 +208,18 @@ fn work_off(
     let batches = Mutex::new(batches);
     let budget = Budget::new(job.memory_bytes);
     let mut inputs = Inputs::open(&tasks, &target.options);
-    let mut queue = tasks.into_iter();
+    let mut queue = tasks.into_iter().peekable();
+    let mut under_way = None;
     pool::run(
         job.n_workers,
         || {
+            // Who asks for an end gets the batch that is under way, whole.
+            let batch = Some(queue.peek()?.batch);
+            if batch != under_way && job.progress.is_interrupted() {
+                lock(done).is_stopped = true;
+                return None;
+            }
+            under_way = batch;
             let task = queue.next()?;
             let input = inputs.next(&task);
             Some((task, input))
@@ -258,7 +269,8 @@ impl Inputs {
             files.entry(&task.row.source).or_default().push(task);
         }
         let open = |url: &str, tasks: Vec<&Task>| {
-            let source = Source::open(url, options, None).ok()?;
+            // What is read is held against the digest that ingest recorded, wherever it lies.
+            let source = Source::open(url, options, None).ok()?.following_links(true);
             let wanted = tasks.iter().filter_map(|task| Self::file(&source, task)).collect();
             let reader = source.read_in_order(wanted);
             Some((source, reader))
@@ -407,6 +419,7 @@ fn extraction_row(id: &str, task: &Task, extracted: &Extracted) -> ExtractionRow
         audio_codec: heard.map(|h| h.encoding.codec.to_owned()),
         sample_rate_hz: heard.map(|h| h.encoding.sample_rate_hz as i32),
         n_channels: heard.map(|h| i32::from(h.encoding.n_channels)),
+        content_hash: Some(task.row.content_hash.clone()),
     }
 }
 

@@ -1,17 +1,25 @@
 //! The file in which a user says what a motion must do.
 
+use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, bail, ensure};
+use anyhow::{Context as _, anyhow, bail, ensure};
 use ndarray::Array2;
 use serde::Deserialize;
 
 use crate::generation::{Constraints, Wanted, continuing, facing};
-use crate::motion::{CHANNEL_NAMES, Channel, ChannelLimits};
+use crate::motion::{CHANNEL_NAMES, Channel, ChannelLimits, MOTION_DIM};
 use crate::units::s_to_frames;
 
 /// Frames of a motion that is continued, unless the file says otherwise: half a second.
 const CONTINUED_FRAMES: usize = 15;
+
+/// Values that may be asked of a frame: of each channel four times, since what agrees may be said again.
+const MAX_ASKED: usize = 4 * MOTION_DIM;
+/// A frame behind the end of every track, after which there is another number.
+const LAST_FRAME: usize = usize::MAX / 2;
+/// Largest file that is read, in bytes.
+const MAX_FILE_BYTES: u64 = 16 << 20;
 
 /// All that a file can say; TOML or JSON.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize)]
@@ -86,12 +94,18 @@ impl Asked {
         motion: impl FnOnce(&Path) -> anyhow::Result<Array2<f32>>,
     ) -> anyhow::Result<Self> {
         let name = path.display();
-        let text =
-            std::fs::read_to_string(path).with_context(|| format!("while reading {name}"))?;
+        let mut text = String::new();
+        std::fs::File::open(path)
+            .and_then(|file| file.take(MAX_FILE_BYTES + 1).read_to_string(&mut text))
+            .with_context(|| format!("while reading {name}"))?;
+        ensure!(
+            text.len() as u64 <= MAX_FILE_BYTES,
+            "{name}: has more than {MAX_FILE_BYTES} bytes, and is no file of constraints"
+        );
         let is_json = path.extension().is_some_and(|extension| extension == "json");
-        let file =
-            Self::parse(&text, is_json).with_context(|| format!("{name} has no constraints"))?;
-        let before = match &file.continue_from {
+        let asked =
+            Self::of_text(&text, is_json).with_context(|| format!("{name} has no constraints"))?;
+        let before = match &asked.file.continue_from {
             Some(continued) => {
                 let frames = continued.frames.unwrap_or(CONTINUED_FRAMES);
                 ensure!(frames > 0, "{name}: continue_from takes 0 frames; take 1 or more");
@@ -100,11 +114,26 @@ impl Asked {
             }
             None => None,
         };
-        Ok(Self { file, before })
+        Ok(Self { before, ..asked })
+    }
+
+    /// Reads a text, TOML or JSON, that continues no motion.
+    ///
+    /// # Errors
+    /// One sentence about what is wrong in it.
+    pub fn of_text(text: &str, is_json: bool) -> anyhow::Result<Self> {
+        Ok(Self { file: Self::parse(text, is_json)?, before: None })
     }
 
     fn parse(text: &str, is_json: bool) -> anyhow::Result<ConstraintsFile> {
-        Ok(if is_json { serde_json::from_str(text)? } else { toml::from_str(text)? })
+        if is_json {
+            return Ok(serde_json::from_str(text)?);
+        }
+        toml::from_str(text).map_err(|e: toml::de::Error| {
+            let start = e.span().map_or(0, |span| span.start);
+            let line = 1 + text.bytes().take(start).filter(|&byte| byte == b'\n').count();
+            anyhow!("line {line}: {}", e.message())
+        })
     }
 
     /// Returns what is asked of a track.
@@ -124,13 +153,15 @@ impl Asked {
             let last = n_frames.saturating_sub(1);
             add(pose, last..last + 1, &mut wanted)?;
         }
+        let most = MAX_ASKED.saturating_mul(n_frames.max(1));
         for Keyframe { time_s, frame, pose } in &file.keyframe {
             let frame = match (time_s, frame) {
                 (Some(time_s), None) => frame_of(*time_s)?,
-                (None, Some(frame)) => *frame,
+                (None, Some(frame)) => (*frame).min(LAST_FRAME),
                 _ => bail!("a keyframe needs time_s or frame, and not both"),
             };
             add(pose, frame..frame + 1, &mut wanted)?;
+            check_asked(wanted.len(), most, n_frames)?;
         }
         for Hold { from_s, to_s, pose } in &file.hold {
             let (from, to) = (frame_of(*from_s)?, frame_of(*to_s)?);
@@ -138,15 +169,28 @@ impl Asked {
                 from <= to,
                 "a hold goes from {from_s} s to {to_s} s; it must end after it begins"
             );
-            add(pose, from..to + 1, &mut wanted)?;
+            // What lies behind the end is not asked of anything; a hold that begins there is refused as a frame is.
+            let end = (to + 1).min(n_frames.max(from + 1));
+            add(pose, from..end, &mut wanted)?;
+            check_asked(wanted.len(), most, n_frames)?;
         }
         Ok(Constraints::new(wanted, n_frames, limits)?)
     }
 }
 
+/// Refuses more values than a track has places for.
+fn check_asked(n_asked: usize, most: usize, n_frames: usize) -> anyhow::Result<()> {
+    ensure!(
+        n_asked <= most,
+        "keyframes and holds ask for {n_asked} values and more of a track of {n_frames} frames, where {most} say all \
+         there is to say; leave out what is said again"
+    );
+    Ok(())
+}
+
 fn frame_of(time_s: f64) -> anyhow::Result<usize> {
     ensure!(time_s.is_finite() && time_s >= 0.0, "{time_s} s is no time in a track; begin at 0");
-    Ok(s_to_frames(time_s).round() as usize)
+    Ok((s_to_frames(time_s).round() as usize).min(LAST_FRAME))
 }
 
 /// Adds what a pose asks of some frames.
@@ -192,11 +236,12 @@ fn add(
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
-    use crate::motion::MOTION_DIM;
 
     fn asked(text: &str) -> Asked {
-        Asked { file: Asked::parse(text, false).expect("constraints"), before: None }
+        Asked::of_text(text, false).expect("constraints")
     }
 
     #[test]
@@ -241,6 +286,59 @@ mod tests {
         let asked = Asked { before: Some((before, 3)), ..asked("") };
         let constraints = asked.of_track(50, ChannelLimits::Wide).expect("constraints");
         assert_eq!(constraints.placement().z_m, 37.0);
+    }
+
+    #[test]
+    fn a_hold_ends_with_the_track_at_the_latest() {
+        let held = |to_s: &str| {
+            let text = format!("[[hold]]\nfrom_s = 0.1\nto_s = {to_s}\nposition_y = 0.5");
+            asked(&text).of_track(31, ChannelLimits::Wide)
+        };
+        let to_the_end = held("1.0").expect("constraints");
+        for to_s in ["1.1", "1e8", "1e300", "1.7e308"] {
+            assert_eq!(held(to_s).expect("constraints"), to_the_end, "{to_s}");
+        }
+        let behind = |text: &str| {
+            let refused = asked(text).of_track(31, ChannelLimits::Wide);
+            refused.expect_err("behind the end").to_string()
+        };
+        assert_eq!(
+            behind("[[hold]]\nfrom_s = 2.0\nto_s = 1e8\nposition_y = 0.5"),
+            "a constraint on position_y is at frame 60 (2.00 s), but the track has 31 frames (1.03 s); move it or \
+             leave it out"
+        );
+        for keyframe in ["frame = 9223372036854775807", "time_s = 1e300"] {
+            let said = behind(&format!("[[keyframe]]\n{keyframe}\nposition_y = 0.5"));
+            assert!(
+                said.ends_with("but the track has 31 frames (1.03 s); move it or leave it out"),
+                "{said}"
+            );
+        }
+    }
+
+    #[test]
+    fn the_same_said_without_end_is_refused() {
+        let hold = "[[hold]]\nfrom_s = 0.0\nto_s = 1e8\nposition_y = 0.5\n";
+        assert!(asked(&hold.repeat(99)).of_track(31, ChannelLimits::Wide).is_ok());
+        let refused = asked(&hold.repeat(101)).of_track(31, ChannelLimits::Wide);
+        assert_eq!(
+            refused.expect_err("too much").to_string(),
+            "keyframes and holds ask for 3131 values and more of a track of 31 frames, where 3100 say all there is to \
+             say; leave out what is said again"
+        );
+    }
+
+    proptest! {
+        #[test]
+        fn no_text_breaks_the_reader(
+            text in r#"(\[\[?(start|end|keyframe|hold)\]\]?\n|(time_s|frame|from_s|to_s|position_y|heading_deg) ?= ?(-?[0-9]{1,3}(e[0-9]{1,3})?|nan|inf|-inf)\n|position = \[1, 2.0, 3\]\n|[ -~]){0,12}"#,
+            is_json: bool,
+            n_frames in 0_usize..40,
+        ) {
+            if let Ok(asked) = Asked::of_text(&text, is_json) {
+                let _ = asked.of_track(n_frames, ChannelLimits::Wide);
+            }
+        }
     }
 
     #[test]

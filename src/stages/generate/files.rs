@@ -11,6 +11,7 @@ use ndarray::ArrayView2;
 use super::Done;
 use super::maker::{Made, Maker, Music};
 use super::outputs::{self, Format, Output};
+use super::receipt::{Receipt, digest_of_song};
 use crate::motion::exchange::{csv_header, write_csv_rows};
 use crate::motion::{Beats, BeatsError};
 use crate::stages::Progress;
@@ -34,6 +35,17 @@ pub struct Target<'a> {
     pub force: bool,
 }
 
+/// A motion to be made.
+struct Task<'a> {
+    path: &'a PathBuf,
+    stem: String,
+    /// Digest of the song.
+    song: String,
+    name: String,
+    sample: usize,
+    receipt: Receipt,
+}
+
 /// A file's features and beats.
 type Heard = Result<(Extracted, Option<Beats>), Failure>;
 
@@ -44,10 +56,9 @@ type Heard = Result<(Extracted, Option<Beats>), Failure>;
 pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::Result<Done> {
     let mut done = Done::default();
     let mut names = std::collections::BTreeMap::new();
-    let mut stream = target.stream.map(open_stream).transpose()?;
-    std::fs::create_dir_all(target.folder)
-        .with_context(|| format!("while making {}", target.folder.display()))?;
     let mut tasks = Vec::new();
+    // The first motion is streamed whenever that is asked for, made or not.
+    let mut is_streamed = target.stream.is_some();
     for path in target.audio {
         let stem = path.file_stem().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
         if let Some(other) = names.insert(stem.clone(), path) {
@@ -57,16 +68,19 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
                 path.display()
             );
         }
+        let song = digest_of_song(path, &beat_list_of(path));
         for sample in 0..target.n_samples {
             let name =
                 if target.n_samples == 1 { stem.clone() } else { format!("{stem}.{sample}") };
-            let is_there = target.formats.iter().all(|format| {
-                target.folder.join(format!("{name}.{}", format.extension())).exists()
-            });
-            if is_there && !target.force {
+            // A song that cannot be read fails when it is its turn.
+            let receipt = Receipt::new(maker, &stem, song.as_deref().unwrap_or_default(), sample);
+            let is_kept =
+                || song.is_some() && receipt.is_kept(target.folder, &name, target.formats);
+            if !target.force && !std::mem::take(&mut is_streamed) && is_kept() {
                 done.n_unchanged += 1;
             } else {
-                tasks.push((path, stem.clone(), name, sample));
+                let song = song.clone().unwrap_or_default();
+                tasks.push(Task { path, stem: stem.clone(), song, name, sample, receipt });
             }
         }
     }
@@ -74,9 +88,16 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
     if target.dry_run {
         return Ok(done);
     }
+    let mut stream = target.stream.map(open_stream).transpose()?;
+    std::fs::create_dir_all(target.folder)
+        .with_context(|| format!("while making {}", target.folder.display()))?;
     progress.start("generate", "motions", tasks.len() as u64);
     let mut heard: Option<(&PathBuf, Heard)> = None;
-    for (path, stem, name, sample) in tasks {
+    for Task { path, stem, song, name, sample, receipt } in tasks {
+        if progress.is_interrupted() {
+            done.is_interrupted = true;
+            break;
+        }
         if heard.as_ref().is_none_or(|(known, _)| *known != path) {
             progress.say(&format!("features of {stem}"));
             heard = Some((path, listen(path)));
@@ -86,6 +107,7 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
             let source = path.display().to_string();
             let music = Music {
                 phrase_id: &stem,
+                content_hash: &song,
                 source: &source,
                 features: extracted.frames.view(),
                 beats: beats.clone(),
@@ -114,7 +136,12 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
                     audio: path,
                     facts: facts(&made),
                 };
-                match outputs::write(&output, target.formats, target.folder) {
+                let written =
+                    outputs::write(&output, target.formats, target.folder).and_then(|written| {
+                        receipt.keep(target.folder, &name, target.formats)?;
+                        Ok(written)
+                    });
+                match written {
                     Ok(written) => {
                         done.add_made(&made);
                         done.told.push((told(&name, &made), written));
@@ -135,6 +162,11 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
     Ok(done)
 }
 
+/// Returns the place of the beat list beside a song.
+fn beat_list_of(audio: &Path) -> PathBuf {
+    audio.with_extension("beats.txt")
+}
+
 /// Extracts the features of a file, and its beats: those of a beats file beside it, else the tracked ones.
 pub(in crate::stages) fn listen(path: &Path) -> Heard {
     let name = path.display().to_string();
@@ -152,7 +184,7 @@ pub(in crate::stages) fn listen(path: &Path) -> Heard {
     let rules = Rules { tuning: None, max_duration_s: MAX_DURATION_S, timeout: Duration::MAX };
     let file = SourceFile { path: name.clone(), size_bytes, fingerprint: String::new() };
     let extracted = extract(Origin::Audio, &file, content, |_| true, &rules)?;
-    let beside = path.with_extension("beats.txt");
+    let beside = beat_list_of(path);
     let beats = if beside.exists() {
         let read = |e: &dyn std::fmt::Display| {
             let message = format!("{}: {e}", beside.display());

@@ -21,6 +21,8 @@ use crate::units::frames_to_s;
 /// What is danced to.
 pub struct Music<'a> {
     pub phrase_id: &'a str,
+    /// Digest of what the phrase's files hold, as `generations` has it.
+    pub content_hash: &'a str,
     /// What messages and failures name.
     pub source: &'a str,
     /// \[T, 163\]
@@ -47,6 +49,8 @@ pub struct Made {
 pub struct Maker<'a> {
     pub generator: Generator<'a>,
     pub card: &'a ModelCard,
+    /// Name of the model, as the user typed it.
+    pub model: &'a str,
     /// Digest of the model's weights.
     pub weights: &'a str,
     pub run: &'a str,
@@ -250,7 +254,7 @@ impl Maker<'_> {
             candidate: found.candidate as i32,
             selected: false,
             seed: found.seed as i64,
-            model: self.card.name.clone(),
+            model: self.model.to_owned(),
             weights: self.weights.to_owned(),
             engine: self.generator.engine.name().to_owned(),
             sampler: settings.sampler.sampler.name().to_owned(),
@@ -270,6 +274,7 @@ impl Maker<'_> {
             generate_s: found.generate_s,
             real_time_factor: found.generate_s / frames_to_s(n_frames).max(f64::MIN_POSITIVE),
             settings: Some(settings.to_row().to_json()),
+            content_hash: Some(music.content_hash.to_owned()),
             time: TimestampUs::now(),
         }
     }

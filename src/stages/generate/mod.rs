@@ -5,19 +5,20 @@ mod files;
 mod maker;
 mod outputs;
 mod params;
+mod receipt;
+mod report;
 mod settings;
 mod tracks;
 
 use std::collections::BTreeMap;
-use std::io::{self, Write};
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::bail;
 
-use super::failure::{Failure, N_SHOWN, write_failures};
-use super::model_files::{OpenModel, POINTER, sha256};
+use super::failure::Failure;
+use super::model_files::{EngineChoice, EngineParams, OpenModel, POINTER, is_model_name, sha256};
 use super::retrieval::Primer;
 use super::{Contract, Progress, Stage, Summary};
 use crate::diffusion::Schedule;
@@ -28,6 +29,7 @@ use crate::units::frames_to_s;
 use maker::{Made, Maker};
 use params::Settings;
 pub use params::{Params, SamplerName, Tracks};
+use report::{Place, Report};
 
 pub(in crate::stages) use files::listen;
 pub(in crate::stages) use maker::{generation_id, seed_of};
@@ -46,6 +48,10 @@ impl Stage for Generate {
         writes: "generated, decoded, generations, failures, or files",
     };
     type Params = Params;
+
+    fn claims_stdout(params: &Params) -> Option<&'static str> {
+        (params.stream.as_deref() == Some("-")).then_some("--stream")
+    }
 
     fn run(params: Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
         let started = Instant::now();
@@ -68,12 +74,19 @@ impl Stage for Generate {
                 Some(primer)
             }
         };
-        let run = params.run.clone().unwrap_or_else(|| model.card.name.clone());
+        let name = name_of_model(&params, &model.card);
+        let run = params.run.clone().unwrap_or_else(|| name.clone());
         super::train::session::check_run_name(&run)?;
         // A single track is fastest with all threads in one worker; many keep a worker each busy.
         let is_single = params.audio.len() == 1 || params.phrase.len() == 1;
         let n_workers = if is_single { NonZeroUsize::MIN } else { params.engine.threads };
-        let (engine, note): (Box<dyn Engine>, _) = model.engine(&params.engine, n_workers)?;
+        let engine_params = if params.dry_run {
+            // The one engine that keeps no prepared copy of a model.
+            EngineParams { engine: EngineChoice::Eager, ..params.engine.clone() }
+        } else {
+            params.engine.clone()
+        };
+        let (engine, note): (Box<dyn Engine>, _) = model.engine(&engine_params, n_workers)?;
         if let Some(note) = note {
             progress.note(&note);
         }
@@ -94,6 +107,7 @@ impl Stage for Generate {
                 overlap_frames: settings.overlap_frames,
             },
             card,
+            model: &name,
             weights: &weights,
             run: &run,
             settings: &settings,
@@ -132,16 +146,26 @@ impl Stage for Generate {
             (None, None) => bail!("nothing to do: give --store, or --audio with --output"),
         };
         let took_s = started.elapsed().as_secs_f64();
+        let by_card = match name == card.name {
+            true => String::new(),
+            false => format!(" (its card calls it {})", card.name),
+        };
         let made_with = format!(
-            "model {}, {} ({}), {} in {} steps, guidance {}",
-            card.name,
+            "model {name}{by_card}, {} ({}), {} in {} steps, guidance {}",
             engine.name(),
             engine.n_workers(),
             settings.sampler.sampler.name(),
             settings.sampler.n_steps,
             settings.guidance
         );
-        Ok(Box::new(Report { place, done, made_with, dry_run: params.dry_run, took_s }))
+        Ok(Box::new(Report {
+            place,
+            done,
+            model: name,
+            made_with,
+            dry_run: params.dry_run,
+            took_s,
+        }))
     }
 }
 
@@ -160,6 +184,19 @@ fn open_model(params: &Params, store: Option<&Location>) -> anyhow::Result<OpenM
             model
         ),
     }
+}
+
+/// Returns what a model is called: as the user typed it, whatever its card says; a folder by its own name.
+fn name_of_model(params: &Params, card: &ModelCard) -> String {
+    let Some(typed) = &params.model else { return card.name.clone() };
+    let folder = Path::new(typed);
+    if !folder.join(file_names::CARD).is_file() {
+        return typed.clone();
+    }
+    let absolute = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
+    let name = absolute.file_name().map(|name| name.to_string_lossy().into_owned());
+    // A folder may be called what no model can be.
+    name.filter(|name| is_model_name(name)).unwrap_or_else(|| card.name.clone())
 }
 
 /// Returns one digest for both networks of a model.
@@ -213,93 +250,5 @@ impl Done {
                 Err(failure) => self.failed.push((name.clone(), failure.clone())),
             }
         }
-    }
-}
-
-enum Place {
-    Store { store: String, run: String },
-    Folder(PathBuf),
-}
-
-struct Report {
-    place: Place,
-    done: Done,
-    made_with: String,
-    dry_run: bool,
-    took_s: f64,
-}
-
-impl Summary for Report {
-    fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        let Self { place, done, made_with, took_s, .. } = self;
-        match place {
-            Place::Store { store, .. } => writeln!(out, "generate → {store}")?,
-            Place::Folder(folder) => writeln!(out, "generate → {}", folder.display())?,
-        }
-        writeln!(out, "  {made_with}")?;
-        if self.dry_run {
-            let Done { n_todo, todo_s, n_unchanged, .. } = done;
-            let length = if *todo_s > 0.0 { format!(" ({todo_s:.1} s)") } else { String::new() };
-            writeln!(
-                out,
-                "  would make {n_todo} motions{length}, leave {n_unchanged} as they are"
-            )?;
-            return Ok(());
-        }
-        let n_failed = done.failed.len();
-        if done.n_todo == 0 {
-            writeln!(out, "  nothing to do: {} motions are up to date", done.n_unchanged)?;
-        } else {
-            writeln!(
-                out,
-                "  {} motions made ({:.1} s, {} frames), {} up to date, {n_failed} failed; {took_s:.1} s, {:.2} \
-                 of the music's length",
-                done.n_made,
-                done.made_s,
-                done.n_frames,
-                done.n_unchanged,
-                *took_s / done.made_s.max(f64::MIN_POSITIVE)
-            )?;
-        }
-        if done.n_candidates > done.n_made {
-            writeln!(out, "  the best of {} candidates", done.n_candidates)?;
-        }
-        if done.n_checks_failed > 0 {
-            writeln!(out, "  {} of them fail a sanity check", done.n_checks_failed)?;
-        }
-        if done.n_fused > 0 {
-            writeln!(
-                out,
-                "  fusion moved positions by {:.1} mm (root mean square), {:.1} mm at most",
-                (done.fused_mm2 / done.n_fused as f64).sqrt(),
-                done.fused_max_mm
-            )?;
-        }
-        for (line, files) in done.told.iter().take(N_SHOWN) {
-            writeln!(out, "  {line}")?;
-            for file in files {
-                writeln!(out, "    {}", file.display())?;
-            }
-        }
-        let url = match place {
-            Place::Store { store, .. } => Some(store.as_str()),
-            Place::Folder(_) => None,
-        };
-        write_failures(out, done.failed.iter().map(|(name, why)| (name, why)), url)?;
-        if let Place::Store { store, run } = place {
-            if done.is_interrupted {
-                writeln!(out, "  stopped as asked; the same command goes on with what is missing")?;
-            }
-            writeln!(
-                out,
-                "  motiongen query --store {store} \"select phrase_id, score, real_time_factor from \
-                 generations where run = '{run}' and selected\""
-            )?;
-        }
-        Ok(())
-    }
-
-    fn n_failed(&self) -> u64 {
-        self.done.failed.len() as u64
     }
 }

@@ -92,7 +92,7 @@ fn write_as(output: &Output, format: Format, path: &Path) -> anyhow::Result<()> 
             to_file(&|out| write_glb(frames, audio.as_deref(), out))
         }
         Format::Parquet => {
-            let file = temporary_beside(&std::path::absolute(path)?)?;
+            let file = temporary_beside(path)?;
             let mut writer = PartWriter::new(tables::motion(), file)?;
             writer.write_frames(output.name, frames)?;
             replace_file(path, writer.finish(&[])?.file)?;

@@ -21,7 +21,7 @@ use crate::stages::{Progress, Stage as _};
 use crate::store::tables::{self, ExtractionRow, FailureRow, GenerationRow, PhraseRow};
 use crate::store::{
     Commit, Item, Label, Ledger, Location, Row as _, Shard, Snapshot, StoreError, StoreSnapshot,
-    TimestampUs, batch_of, checkpoint, digest,
+    TimestampUs, batch_of, checkpoint, digest, outdated_features,
 };
 use crate::units::frames_to_s;
 
@@ -55,6 +55,8 @@ struct Task {
     row: PhraseRow,
     n_frames: usize,
     beats: PhraseBeats,
+    /// Whether its features are of other content than it has now.
+    has_old_features: bool,
     /// Samples that are missing.
     samples: Vec<usize>,
 }
@@ -91,7 +93,7 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
     if target.dry_run || tasks.is_empty() {
         return Ok(done);
     }
-    target.store.sweep()?;
+    target.store.sweep();
     snapshot.checkpoint();
     progress.start_audio("generate", done.todo_s.ceil() as u64);
     let mut batches: BTreeMap<u64, Vec<Task>> = BTreeMap::new();
@@ -106,7 +108,7 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
         done.add(&outcomes);
         commit(maker, target, &ledger, tasks, outcomes)?;
         ahead.forget(tasks);
-        if progress.is_interrupted() {
+        if progress.is_interrupted() && i + 1 < batches.len() {
             done.is_interrupted = true;
             break;
         }
@@ -185,6 +187,7 @@ fn plan(
     let extractions: Vec<ExtractionRow> = snapshot.table(ExtractionRow::schema())?.rows()?;
     let extracted: HashMap<&str, i64> =
         extractions.iter().map(|row| (row.phrase_id.as_str(), row.n_frames)).collect();
+    let outdated = outdated_features(snapshot, &rows)?;
     let is_wanted = |row: &PhraseRow| {
         let of_kind = match target.tracks {
             Tracks::All => true,
@@ -205,7 +208,8 @@ fn plan(
         .filter(|row| is_wanted(row))
         .map(|row| {
             let (n_frames, beats) = (n_frames(&row), PhraseBeats::default());
-            Task { batch: 0, n_frames, row, beats, samples: Vec::new() }
+            let has_old_features = outdated.contains(&row.phrase_id);
+            Task { batch: 0, n_frames, row, beats, has_old_features, samples: Vec::new() }
         })
         .collect();
     let total_s: f64 =
@@ -262,9 +266,11 @@ fn make_batch(
         |(task, sample): (&Task, usize)| -> anyhow::Result<()> {
             let id = &task.row.phrase_id;
             let outcome = match ahead.at_hand.get(id) {
+                Some(_) if task.has_old_features => Err(with_old_features(&task.row, target.store)),
                 Some(features) => {
                     let music = Music {
                         phrase_id: id,
+                        content_hash: &task.row.content_hash,
                         source: url_of(&task.row),
                         features: features.view(),
                         beats: task.beats.in_bars(&task.row),
@@ -301,6 +307,16 @@ fn without_features(row: &PhraseRow, store: &Location, unknown: Option<&str>) ->
         format!("phrase {id}: has no audio and no features, so that there is nothing to dance to")
     };
     Failure::new(FailureKind::NoMusic, url_of(row), message)
+}
+
+/// Returns why the features of a phrase are not danced to: its files were replaced since.
+fn with_old_features(row: &PhraseRow, store: &Location) -> Failure {
+    let id = &row.phrase_id;
+    let message = format!(
+        "phrase {id}: its features are of files that were replaced since; run motiongen extract --store {store} \
+         first"
+    );
+    Failure::new(FailureKind::StaleFeatures, url_of(row), message)
 }
 
 /// Writes a batch: its motions, what is known of them, and what failed.

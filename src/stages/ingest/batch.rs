@@ -12,6 +12,7 @@ use super::phrase::{Files, Phrase, Rules};
 use super::{BEATS_VERSION, Ingest, Refused, Tally};
 use crate::stages::beats::{self, BeatSource};
 use crate::stages::failure::{Failure, FailureKind, guarded};
+use crate::stages::seen::Seen;
 use crate::stages::{Progress, Stage as _};
 use crate::store::tables::{self, BeatRow, FailureRow, PhraseRow};
 use crate::store::{
@@ -27,6 +28,7 @@ pub struct Job<'a> {
     pub source: &'a Source,
     pub store: &'a Location,
     pub ledger: &'a Ledger,
+    pub seen: &'a Seen,
     pub rules: &'a Rules,
     pub params_hash: &'a str,
     pub progress: &'a dyn Progress,
@@ -58,7 +60,7 @@ pub fn batches<'p>(
 }
 
 impl Job<'_> {
-    /// Does all batches on `n_workers` threads.
+    /// Does all batches on `n_workers` threads; where the user asks for an end, those that are under way.
     ///
     /// # Errors
     /// The first [`StoreError`] of the store itself; what was committed stays.
@@ -73,6 +75,11 @@ impl Job<'_> {
                         let Some(batch) = batches.get(next.fetch_add(1, Ordering::Relaxed)) else {
                             return;
                         };
+                        if self.progress.is_interrupted() {
+                            let mut total = total.lock().unwrap_or_else(PoisonError::into_inner);
+                            total.iter_mut().for_each(|sum| sum.is_stopped = true);
+                            return;
+                        }
                         let done = self.batch(batch);
                         let mut total = total.lock().unwrap_or_else(PoisonError::into_inner);
                         match (done, total.as_mut()) {
@@ -114,6 +121,7 @@ impl Job<'_> {
         let mut tally = Tally::default();
         let mut commit =
             Commit::new(self.store, Ingest::NAME, self.params_hash, self.source.location().url());
+        let mut seen = self.seen.start(self.store, self.source.location().url());
         let mut rows = Rows::default();
         let readable = batch.iter().filter(|p| p.problem.is_none());
         let files = readable.flat_map(|p| p.files.iter().map(|(_, f)| f.clone())).collect();
@@ -131,6 +139,7 @@ impl Job<'_> {
                 })
                 .unzip();
             let (content_hash, outcome) = self.phrase(planned, files);
+            self.see(planned, &content_hash, &outcome, &mut seen);
             self.settle(planned, &content_hash, outcome, &mut commit, &mut tally, &mut rows)?;
             self.progress.advance(1);
         }
@@ -149,7 +158,32 @@ impl Job<'_> {
         if !commit.is_empty() {
             commit.publish()?;
         }
+        if !seen.is_empty() {
+            seen.publish()?;
+        }
         Ok(tally)
+    }
+
+    /// Keeps the fingerprint of a phrase whose rows the store has, and which is met under another: its files were
+    /// touched, or are those of a second source.
+    fn see(
+        &self,
+        planned: &Planned,
+        content_hash: &str,
+        outcome: &Result<Phrase, Failure>,
+        seen: &mut Commit<'_>,
+    ) {
+        let Some(known) = self.ledger.get(&planned.id) else { return };
+        let origin = self.source.location().url();
+        let fingerprint = fingerprint(planned);
+        let is_same = known.params_hash == self.params_hash
+            && known.item.succeeded()
+            && known.item.input_hash == input_hash(planned, content_hash);
+        let is_news = known.item.fingerprint != fingerprint || known.origin != origin;
+        let stays = !self.force && !self.unidentified.contains(&planned.id);
+        if outcome.is_ok() && is_same && is_news && stays {
+            self.seen.settle(known, origin, &fingerprint, seen);
+        }
     }
 
     /// Reads and checks one phrase, and returns its content hash with it; a defect of ours costs the phrase,

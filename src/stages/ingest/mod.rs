@@ -10,13 +10,14 @@ use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::time::Instant;
 
-use super::{ClientParams, Contract, Progress, Stage, Summary, all_threads};
+use super::{ClientParams, Contract, LinkParams, Progress, Stage, Summary, all_threads};
 use crate::store::tables::PhraseRow;
 use crate::store::{
     Cache, Ledger, Location, Row as _, Shard, Source, StoreError, StoreSnapshot, checkpoint, digest,
 };
 
-use super::failure::{Failure, write_failures};
+use super::failure::{Failure, failures_json, write_failures};
+use super::seen::Seen;
 pub(in crate::stages) use layout::is_audio;
 pub use layout::{Layout, Plan, Planned, Role, plan};
 pub use phrase::{Rules, content_hash_of_audio};
@@ -26,6 +27,8 @@ pub(in crate::stages) use phrase::{read_beats, read_bvh, read_trajectory};
 const OUTPUT_VERSION: u32 = 1;
 /// Raised when ingest writes something else for a phrase with a beat list, and for no other.
 const BEATS_VERSION: u32 = 2;
+/// The name under which phrases are committed that were seen again with nothing new.
+const SEEN: &str = "ingest-seen";
 
 /// The stage.
 pub struct Ingest;
@@ -60,6 +63,8 @@ pub struct Params {
     #[arg(long, value_name = "GB", default_value_t = 20.0, help_heading = "Remote storage")]
     pub cache_size_gb: f64,
     #[command(flatten)]
+    pub links: LinkParams,
+    #[command(flatten)]
     pub client: ClientParams,
     /// Say what would be done, and do nothing.
     #[arg(long)]
@@ -83,7 +88,8 @@ impl Stage for Ingest {
         let started = Instant::now();
         let options = params.client.options();
         let shard = Shard::parse(&params.shard, |name| std::env::var(name).ok())?;
-        let source = Source::open(&params.source, &options, open_cache(&params)?)?;
+        let source = Source::open(&params.source, &options, open_cache(&params)?)?
+            .following_links(params.links.follow_links);
         let store = Location::open(&params.store, &options)?;
         let plan = plan(source.list()?, params.layout);
         if plan.phrases.is_empty() {
@@ -95,10 +101,11 @@ impl Stage for Ingest {
             );
         }
         if !params.dry_run {
-            store.sweep()?;
+            store.sweep();
         }
         let snapshot = StoreSnapshot::take(&store)?;
         let ledger = snapshot.ledger(Self::NAME)?;
+        let seen = Seen::read(&store, SEEN)?;
         let params_hash = params_hash(&params.rules);
 
         // With --force everything is done again anyway, also where old parts cannot be read.
@@ -110,7 +117,7 @@ impl Stage for Ingest {
             !params.force
                 && !params.verify
                 && !unidentified.contains(&p.id)
-                && is_settled(p, &ledger, &params_hash, origin)
+                && is_settled(p, &ledger, &seen, &params_hash, origin)
         };
         let (done, todo): (Vec<_>, Vec<_>) = mine.into_iter().partition(|p| is_done(p));
         tracing::info!(
@@ -146,6 +153,7 @@ impl Stage for Ingest {
                 source: &source,
                 store: &store,
                 ledger: &ledger,
+                seen: &seen,
                 rules: &params.rules,
                 params_hash: &params_hash,
                 progress,
@@ -153,7 +161,9 @@ impl Stage for Ingest {
                 force: params.force,
             };
             report.tally.add(job.run(&batches, params.workers.get())?);
-            job.forget_failures(&plan.phrases, shard)?;
+            if !report.tally.is_stopped {
+                job.forget_failures(&plan.phrases, shard)?;
+            }
             checkpoint(&store, &[Self::NAME]);
             progress.finish();
         }
@@ -164,7 +174,8 @@ impl Stage for Ingest {
 }
 
 fn open_cache(params: &Params) -> Result<Option<Cache>, StoreError> {
-    let Some(folder) = &params.cache else { return Ok(None) };
+    // A cache is made when it is opened.
+    let Some(folder) = params.cache.as_ref().filter(|_| !params.dry_run) else { return Ok(None) };
     Cache::open(folder, (params.cache_size_gb * 1e9) as u64).map(Some)
 }
 
@@ -177,15 +188,22 @@ fn params_hash(rules: &Rules) -> String {
 /// Returns whether the store has a phrase's rows for these files and rules.
 ///
 /// Size and time tell a file's versions apart, not the files of two sources.
-fn is_settled(planned: &Planned, ledger: &Ledger, params_hash: &str, origin: &str) -> bool {
+fn is_settled(
+    planned: &Planned,
+    ledger: &Ledger,
+    seen: &Seen,
+    params_hash: &str,
+    origin: &str,
+) -> bool {
+    let fingerprint = batch::fingerprint(planned);
     let refused = ledger.get(&batch::contested(&planned.id, origin));
     let is_refused = refused.is_some_and(|known| known.item.failure.is_some());
     !is_refused
         && ledger.get(&planned.id).is_some_and(|known| {
+            let is_same = known.origin == origin && known.item.fingerprint == fingerprint;
             known.params_hash == params_hash
-                && known.origin == origin
                 && known.item.succeeded()
-                && known.item.fingerprint == batch::fingerprint(planned)
+                && (is_same || seen.has(known, origin, &fingerprint))
         })
 }
 
@@ -221,6 +239,8 @@ struct Tally {
     n_frames: u64,
     duration_s: f64,
     failed: Vec<Refused>,
+    /// Whether batches are left because the user asked for an end.
+    is_stopped: bool,
 }
 
 /// A phrase that failed, for the summary.
@@ -237,6 +257,7 @@ impl Tally {
         self.n_frames += other.n_frames;
         self.duration_s += other.duration_s;
         self.failed.extend(other.failed);
+        self.is_stopped |= other.is_stopped;
     }
 }
 
@@ -275,6 +296,9 @@ impl Summary for Report {
                 *n_todo as f64 / took_s.max(1e-9)
             )?;
         }
+        if tally.is_stopped {
+            writeln!(out, "  stopped as asked; the same command goes on with what is missing")?;
+        }
         if let Some(first) = self.ignored.first() {
             let n = self.ignored.len();
             writeln!(out, "  {n} files belong to no phrase and were left alone, such as {first}")?;
@@ -286,5 +310,26 @@ impl Summary for Report {
 
     fn n_failed(&self) -> u64 {
         if self.dry_run { 0 } else { self.tally.failed.len() as u64 }
+    }
+
+    fn is_stopped(&self) -> bool {
+        self.tally.is_stopped
+    }
+
+    fn figures(&mut self) -> serde_json::Value {
+        let Report { tally, .. } = self;
+        serde_json::json!({
+            "source": self.source,
+            "store": self.store,
+            "dry_run": self.dry_run,
+            "n_todo": self.n_todo,
+            "n_done": tally.n_done,
+            "n_unchanged": tally.n_unchanged,
+            "n_frames": tally.n_frames,
+            "duration_s": tally.duration_s,
+            "n_ignored": self.ignored.len(),
+            "failures": failures_json(tally.failed.iter().map(|one| (&one.id, &one.failure))),
+            "took_s": self.took_s,
+        })
     }
 }

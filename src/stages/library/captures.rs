@@ -12,8 +12,8 @@ use crate::motion::{ChannelLimits, Trajectory};
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::ingest::{read_bvh, read_trajectory};
 use crate::store::{
-    ClientOptions, Content, Listing, Source, SourceFile, SourceProblemKind, StoreError,
-    StoreSnapshot, digest, tables,
+    Content, Listing, Source, SourceFile, SourceProblemKind, StoreError, StoreSnapshot, digest,
+    tables,
 };
 
 /// Endings of the files that are read.
@@ -70,8 +70,7 @@ impl Captures {
     ///
     /// # Errors
     /// [`StoreError`] when the folder cannot be listed.
-    pub fn of_folder(url: &str, options: &ClientOptions) -> Result<Self, StoreError> {
-        let source = Source::open(url, options, None)?;
+    pub fn of_folder(source: Source) -> Result<Self, StoreError> {
         let Listing { files, problems, .. } = source.list()?;
         let is_motion = |path: &str| {
             let name = path.rsplit('/').next().unwrap_or(path);
@@ -80,7 +79,12 @@ impl Captures {
                 && MOTION_EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension))
         };
         let files: Vec<_> = files.into_iter().filter(|file| is_motion(&file.path)).collect();
-        let problems = problems.into_iter().filter(|p| is_motion(&p.path)).map(|p| {
+        let problems = problems.into_iter();
+        let problems = problems.filter(|p| {
+            // Nobody can tell what lies behind a link that is not followed.
+            is_motion(&p.path) || p.kind == SourceProblemKind::Symlink
+        });
+        let problems = problems.map(|p| {
             let kind = match p.kind {
                 SourceProblemKind::Name => FailureKind::Name,
                 SourceProblemKind::NotAFile => FailureKind::NotAFile,

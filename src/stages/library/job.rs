@@ -18,6 +18,7 @@ use crate::stages::Progress;
 use crate::stages::extract::needed_bytes;
 use crate::stages::extract::pool::{self, Budget, lock};
 use crate::stages::failure::{guarded, query_of_failures};
+use crate::stages::seen::Seen;
 use crate::store::{Ledger, Location};
 
 /// Memory that songs under way may take while their audio is decoded.
@@ -27,6 +28,7 @@ const MEMORY_BYTES: u64 = 2_000_000_000;
 pub struct Job<'a> {
     pub store: &'a Location,
     pub ledger: Ledger,
+    pub seen: Seen,
     pub known: Known,
     pub band: Band,
     pub params: &'a Params,
@@ -55,7 +57,13 @@ impl Job<'_> {
             !force
                 && output.is_none()
                 && (compose_audio.is_none() || !song.is_made())
-                && is_settled(song, &self.ledger, (&songs.origin, &params_hash), rules, &print)
+                && is_settled(
+                    song,
+                    (&self.ledger, &self.seen),
+                    (&songs.origin, &params_hash),
+                    rules,
+                    &print,
+                )
         };
         let (sound, problems): (Vec<Song>, Vec<Song>) =
             songs.songs.iter().cloned().partition(|song| song.problem.is_none());
@@ -68,7 +76,7 @@ impl Job<'_> {
         if *dry_run {
             return Ok(());
         }
-        self.store.sweep()?;
+        self.store.sweep();
         let failed_before =
             |name: &String| self.ledger.get(name).is_some_and(|k| k.item.failure.is_some());
         // Captures are read where they are danced, or where one may have been mended.
@@ -98,6 +106,7 @@ impl Job<'_> {
             others: &self.known.others,
             output: folder.as_ref(),
             force: *force,
+            seen: &self.seen,
         };
         writer.captures(&captures_origin, &capture_names, &loaded.failed)?;
         for song in &problems {
@@ -118,6 +127,9 @@ impl Job<'_> {
             );
         }
         self.dance(songs, todo, &writer, report)?;
+        if report.tally.is_stopped {
+            return Ok(());
+        }
         warn_of_empty_splits(&songs.songs, report);
         self.forget(songs, &writer, &captures_origin, capture_names, report)?;
         if let Some(folder) = folder {
@@ -148,21 +160,29 @@ impl Job<'_> {
         self.progress.start("library", "songs", todo.len() as u64);
         let feeding = songs.feeding(todo);
         let (sender, receiver) = sync_channel::<(Song, Input)>(1);
-        let tally = Mutex::new(std::mem::take(&mut report.tally));
+        let all = Mutex::new(std::mem::take(&mut report.tally));
+        let tally = &all;
         let budget = Budget::new(MEMORY_BYTES);
         let outcome = std::thread::scope(|scope| {
             let reader = scope.spawn(move || feeding.run(&sender));
             let worked = pool::run(
                 self.params.workers,
                 // The receiver goes with the pool, and then the reader stops, too.
-                move || receiver.recv().ok(),
-                |(song, input)| self.song(&song, input, writer, &budget, &tally),
+                move || {
+                    let song = receiver.recv().ok()?;
+                    if self.progress.is_interrupted() {
+                        lock(tally).is_stopped = true;
+                        return None;
+                    }
+                    Some(song)
+                },
+                |(song, input)| self.song(&song, input, writer, &budget, tally),
             );
             let read = reader.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
             worked.and(read.map_err(anyhow::Error::from))
         });
         self.progress.finish();
-        report.tally = tally.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
+        report.tally = all.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
         outcome
     }
 

@@ -9,7 +9,7 @@ use crate::stages::beats::{self, BeatSource};
 use crate::stages::extract::Extract;
 use crate::stages::failure::{Failure, FailureKind};
 use crate::store::tables::{ExtractionRow, PhraseRow};
-use crate::store::{Row, StoreError, StoreSnapshot};
+use crate::store::{Location, Row, StoreError, StoreSnapshot, outdated_features};
 
 /// What a store knows.
 #[derive(Debug, Default)]
@@ -60,6 +60,7 @@ impl Known {
             let n_frames = usize::try_from(row.n_frames).unwrap_or(0);
             extracted.insert(row.phrase_id, n_frames);
         })?;
+        let outdated = outdated_features(store, with_audio.values())?;
         let mut beats = beats::of_phrases(store, |id| with_audio.contains_key(id))?;
         // Other features of the same file have another digest of parameters.
         let extract = store.ledger(Extract::NAME)?;
@@ -73,6 +74,11 @@ impl Known {
             let beat_source = known_beats.source().unwrap_or(BeatSource::Tracker);
             let unread_list =
                 row.beats_url.as_ref().filter(|_| beat_source != BeatSource::BeatsFile);
+            let is_outdated = outdated.contains(&id);
+            let problem = match unread_list {
+                Some(list) => Some(unread(&id, list)),
+                None => is_outdated.then(|| with_old_features(&id, store.store())),
+            };
             let params_hash = extract.get(&id).map_or("", |settled| &settled.params_hash);
             let slug = slug(&id);
             let song = Song {
@@ -81,7 +87,7 @@ impl Known {
                 url,
                 fingerprint: format!("store {} {params_hash}", row.content_hash),
                 split: TRAIN,
-                problem: unread_list.map(|list| unread(&id, list)),
+                problem,
                 files: Files::Store {
                     n_frames,
                     song_hash: row.song_hash.clone(),
@@ -104,6 +110,14 @@ fn unread(id: &str, list: &str) -> Failure {
          again, then extract and library"
     );
     Failure::new(FailureKind::Version, id, message)
+}
+
+/// Returns why a song is left alone whose file was replaced since its features were extracted.
+fn with_old_features(id: &str, store: &Location) -> Failure {
+    let message = format!(
+        "{id}: its features are of a file that was replaced since; run motiongen extract --store {store} first"
+    );
+    Failure::new(FailureKind::StaleFeatures, id, message)
 }
 
 /// Visits the rows of a table without holding all of them.

@@ -19,9 +19,7 @@ use crate::music::{self, Score, compose, synth, wav};
 #[cfg(feature = "soundfont")]
 use crate::stages::failure::guarded;
 use crate::stages::failure::{Failure, FailureKind};
-use crate::store::{
-    ClientOptions, Content, Listing, Source, SourceFile, StoreError, digest, write_file,
-};
+use crate::store::{Content, Listing, Source, SourceFile, StoreError, digest, write_file};
 
 /// Ending of the files that tunes are read from.
 const TUNE_EXTENSION: &str = "abc";
@@ -72,13 +70,7 @@ pub fn composed(n: u32, seed: u64, band: &Band) -> impl Iterator<Item = Song> {
 ///
 /// # Errors
 /// When the folder cannot be listed or has no such file.
-pub fn tunes(
-    url: &str,
-    options: &ClientOptions,
-    seed: u64,
-    band: &Band,
-) -> anyhow::Result<Vec<Song>> {
-    let source = Source::open(url, options, None)?;
+pub fn tunes(source: &Source, seed: u64, band: &Band) -> anyhow::Result<Vec<Song>> {
     let Listing { files, .. } = source.list()?;
     let is_tune = |file: &SourceFile| {
         file.path.rsplit_once('.').is_some_and(|(_, e)| e.eq_ignore_ascii_case(TUNE_EXTENSION))

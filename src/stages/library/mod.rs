@@ -18,8 +18,9 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use super::failure::{Failure, FailureKind};
-use super::{ClientParams, Contract, Progress, Stage, Summary, all_threads};
-use crate::store::{Location, StoreError, StoreSnapshot, checkpoint, digest};
+use super::seen::Seen;
+use super::{ClientParams, Contract, LinkParams, Progress, Stage, Summary, all_threads};
+use crate::store::{Location, Source, StoreError, StoreSnapshot, checkpoint, digest};
 use captures::Captures;
 use job::Job;
 use known::Known;
@@ -30,6 +31,8 @@ use split::Share;
 
 /// Raised when library writes something else for the same inputs and parameters.
 const OUTPUT_VERSION: u32 = 2;
+/// The name under which songs are committed that were seen again with nothing new.
+const SEEN: &str = "library-seen";
 /// Where items come from that the store itself has, as commits name it.
 const FROM_STORE: &str = "phrases";
 
@@ -81,6 +84,8 @@ pub struct Params {
     #[arg(long, value_name = "N", default_value_t = all_threads())]
     pub workers: NonZeroUsize,
     #[command(flatten)]
+    pub links: LinkParams,
+    #[command(flatten)]
     pub client: ClientParams,
     /// Say what would be done, and do nothing.
     #[arg(long)]
@@ -125,12 +130,17 @@ impl Stage for Library {
         let snapshot = StoreSnapshot::take(&store)?;
         let mut known = Known::read(&snapshot)?;
         let ledger = snapshot.ledger(Self::NAME)?;
+        let seen = Seen::read(&store, SEEN)?;
+        let open = |url: &str| {
+            Source::open(url, &options, None)
+                .map(|source| source.following_links(params.links.follow_links))
+        };
         let captures = match &params.captures {
-            Some(url) => Captures::of_folder(url, &options)?,
+            Some(url) => Captures::of_folder(open(url)?)?,
             None => Captures::of_store(&snapshot, &known),
         };
         let mut songs = match &params.songs {
-            Some(url) => Songs::of_folder(url, &options, &known)?,
+            Some(url) => Songs::of_folder(open(url)?, &known)?,
             None => {
                 let is_needed = params.compose == 0 && params.tunes.is_none();
                 Songs::of_store(&snapshot, &mut known, is_needed)?
@@ -142,10 +152,10 @@ impl Stage for Library {
         let band = Band::default();
         songs.songs.extend(made::composed(params.compose, params.rules.seed, &band));
         if let Some(url) = &params.tunes {
-            songs.songs.extend(made::tunes(url, &options, params.rules.seed, &band)?);
+            songs.songs.extend(made::tunes(&open(url)?, params.rules.seed, &band)?);
         }
         prepare(&mut songs, &params)?;
-        let job = Job { store: &store, ledger, known, band, params: &params, progress };
+        let job = Job { store: &store, ledger, seen, known, band, params: &params, progress };
         let mut report = Report {
             place: Place { store: store.to_string(), output: params.output.clone() },
             dry_run: params.dry_run,
@@ -175,9 +185,12 @@ fn prepare(songs: &mut Songs, params: &Params) -> anyhow::Result<()> {
             song.problem = Some(one::too_short(song, *n_frames, length));
         }
     }
-    // A song that cannot be danced to takes no place in a split.
+    // A song that cannot be danced to takes no place in a split, unless it only waits for its features.
+    let takes_place = |song: &&Song| {
+        song.problem.as_ref().is_none_or(|failure| failure.kind == FailureKind::StaleFeatures)
+    };
     // Music of our own is for training: a verdict rests on real songs.
-    let real = songs.songs.iter().filter(|song| song.problem.is_none() && !song.is_made());
+    let real = songs.songs.iter().filter(takes_place).filter(|song| !song.is_made());
     let names: Vec<String> = real.map(|song| song.id.clone()).collect();
     let of =
         split::assign(names.iter().map(String::as_str), params.validation_songs, params.test_songs)

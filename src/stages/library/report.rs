@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use super::songs::Song;
 use super::write::Written;
 use crate::stages::Summary;
-use crate::stages::failure::{Failure, write_failures};
+use crate::stages::failure::{Failure, failures_json, write_failures};
 
 /// What became of songs and captures.
 #[derive(Debug, Default)]
@@ -23,6 +23,8 @@ pub struct Tally {
     /// Phrases of songs that are gone.
     pub n_forgotten: usize,
     pub failed: Vec<(String, Failure)>,
+    /// Whether songs are left because the user asked for an end.
+    pub is_stopped: bool,
 }
 
 impl Tally {
@@ -89,6 +91,9 @@ impl Summary for Report {
                 tally.n_primitives, tally.n_captures
             )?;
         }
+        if tally.is_stopped {
+            writeln!(out, "  stopped as asked; the same command goes on with what is missing")?;
+        }
         if tally.n_forgotten > 0 {
             writeln!(out, "  {} phrases left with their songs", tally.n_forgotten)?;
         }
@@ -107,5 +112,28 @@ impl Summary for Report {
 
     fn n_failed(&self) -> u64 {
         if self.dry_run { 0 } else { self.tally.failed.len() as u64 }
+    }
+
+    fn is_stopped(&self) -> bool {
+        self.tally.is_stopped
+    }
+
+    fn figures(&mut self) -> serde_json::Value {
+        let Report { place, tally, .. } = self;
+        serde_json::json!({
+            "store": place.store,
+            "output": place.output,
+            "dry_run": self.dry_run,
+            "n_todo": tally.n_todo,
+            "n_done": tally.n_done,
+            "n_unchanged": tally.n_unchanged,
+            "n_phrases": tally.phrases.values().sum::<usize>(),
+            "n_captures": tally.n_captures,
+            "n_primitives": tally.n_primitives,
+            "n_forgotten": tally.n_forgotten,
+            "n_without_features": self.n_without_features,
+            "failures": failures_json(tally.failed.iter().map(|(name, why)| (name, why))),
+            "took_s": self.took_s,
+        })
     }
 }

@@ -12,9 +12,7 @@ use crate::motion::Beats;
 use crate::stages::beats::BeatSource;
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::ingest::{Layout, Role, plan};
-use crate::store::{
-    ClientOptions, Content, Source, SourceFile, StoreError, StoreSnapshot, digest, tables,
-};
+use crate::store::{Content, Source, SourceFile, StoreError, StoreSnapshot, digest, tables};
 
 /// Longest name of a song within the name of a phrase, in bytes; a folder's name may have 255.
 const MAX_SLUG_BYTES: usize = 180;
@@ -136,8 +134,7 @@ impl Songs {
     ///
     /// # Errors
     /// When the folder cannot be listed or has no audio.
-    pub fn of_folder(url: &str, options: &ClientOptions, known: &Known) -> anyhow::Result<Self> {
-        let source = Source::open(url, options, None)?;
+    pub fn of_folder(source: Source, known: &Known) -> anyhow::Result<Self> {
         let plan = plan(source.list()?, Layout::Library);
         if plan.phrases.is_empty() {
             bail!(

@@ -10,8 +10,11 @@ use super::{Library, Rules};
 use crate::motion::choreography::Repertoire;
 use crate::stages::Stage as _;
 use crate::stages::failure::{Failure, FailureKind};
+use crate::stages::seen::Seen;
 use crate::store::tables::{self, BeatRow, FailureRow, PhraseRow};
-use crate::store::{Commit, Item, Ledger, Location, Row as _, StoreError, TimestampUs, digest};
+use crate::store::{
+    Commit, Item, Ledger, Location, Row as _, Settled, StoreError, TimestampUs, digest,
+};
 
 /// Writes songs and failures.
 pub struct Writer<'a> {
@@ -32,6 +35,7 @@ pub struct Writer<'a> {
     pub others: &'a HashMap<String, String>,
     pub output: Option<&'a Output>,
     pub force: bool,
+    pub seen: &'a Seen,
 }
 
 /// What became of a song.
@@ -72,7 +76,7 @@ pub fn fingerprint(song: &Song, captures_fingerprint: &str) -> String {
 /// A song is committed whole, so its first phrase stands for all.
 pub fn is_settled(
     song: &Song,
-    ledger: &Ledger,
+    (ledger, seen): (&Ledger, &Seen),
     (origin, params_hash): (&str, &str),
     rules: &Rules,
     fingerprint: &str,
@@ -85,7 +89,7 @@ pub fn is_settled(
             known.params_hash == params_hash
                 && known.origin == origin
                 && known.item.succeeded()
-                && known.item.fingerprint == fingerprint
+                && (known.item.fingerprint == fingerprint || seen.has(known, origin, fingerprint))
         })
 }
 
@@ -112,6 +116,7 @@ impl Writer<'_> {
         if is_there {
             // A song that was out of reach for a while kept its phrases, and is not failed any more.
             self.settle(self.start(self.origin), self.recovered(song).into_iter().collect())?;
+            self.see(song, first)?;
             if self.output.is_none() {
                 return Ok(Written::Unchanged);
             }
@@ -155,15 +160,30 @@ impl Writer<'_> {
         Ok(Written::Phrases(n_phrases))
     }
 
+    /// Keeps the fingerprint of a song whose phrases the store has, and which is met under another: it or a capture
+    /// was touched.
+    fn see(&self, song: &Song, first: Option<&Settled>) -> Result<(), StoreError> {
+        let fingerprint = fingerprint(song, self.captures_fingerprint);
+        let Some(known) = first.filter(|known| known.item.fingerprint != fingerprint) else {
+            return Ok(());
+        };
+        let mut commit = self.seen.start(self.store, self.origin);
+        self.seen.settle(known, self.origin, &fingerprint, &mut commit);
+        if commit.is_empty() { Ok(()) } else { commit.publish().map(|_| ()) }
+    }
+
     /// Records a song that failed. Its phrases leave the store, except where its files are only out of
-    /// reach just now, or its rows too old.
+    /// reach just now, its rows too old, or its features not extracted anew yet.
     ///
     /// # Errors
     /// [`StoreError`] of the store.
     pub fn failed_song(&self, song: &Song, failure: &Failure) -> Result<(), StoreError> {
         let is_out_of_reach = matches!(
             failure.kind,
-            FailureKind::Unreadable | FailureKind::DuplicateId | FailureKind::Version
+            FailureKind::Unreadable
+                | FailureKind::DuplicateId
+                | FailureKind::Version
+                | FailureKind::StaleFeatures
         );
         let old = if is_out_of_reach { Vec::new() } else { self.former(song, &BTreeSet::new()) };
         self.failures(self.origin, &[(&song.id, &song.url, failure)], old)

@@ -166,4 +166,24 @@ impl Summary for Account {
     fn n_failed(&self) -> u64 {
         0
     }
+
+    fn figures(&mut self) -> serde_json::Value {
+        let Self { card, place, engine, load_s, timed } = self;
+        let timed = timed.iter().map(|(sampler, n_steps, n_frames, took_s)| {
+            serde_json::json!({
+                "sampler": sampler, "n_steps": n_steps, "n_frames": n_frames, "took_s": took_s,
+            })
+        });
+        serde_json::json!({
+            "model": card.name,
+            "place": place,
+            "run": card.provenance.run,
+            "n_parameters_unet": card.n_parameters.unet,
+            "n_parameters_decoder": card.n_parameters.decoder,
+            "precision": card.precision.name(),
+            "engine": engine,
+            "load_s": load_s,
+            "timed": timed.collect::<Vec<_>>(),
+        })
+    }
 }

@@ -6,7 +6,7 @@ use std::io::{self, Write};
 
 use anyhow::ensure;
 
-use super::model_files::EngineParams;
+use super::model_files::{EngineChoice, EngineParams};
 use super::{ClientParams, Contract, Progress, Stage, Summary};
 use crate::model::{
     DecoderConfig, Kept, Layer, MotionDecoder, Outline, Preset, UNet1D, UNetConfig, UNetInputs,
@@ -50,6 +50,9 @@ pub struct Params {
     pub engine: EngineParams,
     #[command(flatten)]
     pub client: ClientParams,
+    /// Keep no copy of the model for this machine's processor; nothing else is ever written.
+    #[arg(long)]
+    pub dry_run: bool,
 }
 
 impl Stage for Model {
@@ -64,7 +67,12 @@ impl Stage for Model {
         ensure!(params.frames > 0, "--frames is 0; a motion has at least one frame");
         if let (Some(store), Some(model)) = (&params.store, &params.model) {
             let store = Location::open(store, &params.client.options())?;
-            return exported::look(&store, model, params.frames, &params.engine, progress);
+            let mut engine = params.engine.clone();
+            if params.dry_run {
+                // The one engine that keeps no prepared copy of a model.
+                engine.engine = EngineChoice::Eager;
+            }
+            return exported::look(&store, model, params.frames, &engine, progress);
         }
         ensure!(params.batch_size > 0, "--batch-size is 0; a batch has at least one motion");
         let one = follow(&params, 1, false)?;
@@ -195,5 +203,16 @@ impl Summary for Account {
 
     fn n_failed(&self) -> u64 {
         0
+    }
+
+    fn figures(&mut self) -> serde_json::Value {
+        let Params { frames, batch_size, .. } = self.params;
+        serde_json::json!({
+            "network": self.name,
+            "n_parameters": self.one.n_parameters,
+            "n_frames": frames,
+            "batch_size": batch_size,
+            "flops": self.one.flops,
+        })
     }
 }

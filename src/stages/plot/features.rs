@@ -20,7 +20,7 @@ use crate::units::frames_to_s;
 
 use super::excerpt::ExcerptParams;
 use super::nearest::nearest;
-use super::output::{Drawn, WIDTHS_PX, format_of, write_picture};
+use super::output::{WIDTHS_PX, format_of, write_picture};
 
 /// What the user asks for.
 #[derive(Clone, Debug, clap::Args)]
@@ -54,6 +54,9 @@ pub struct Params {
     pub tuning: Option<Tuning>,
     #[command(flatten)]
     pub client: ClientParams,
+    /// Say what would be done, and do nothing.
+    #[arg(long)]
+    pub dry_run: bool,
 }
 
 /// Draws the plot.
@@ -90,10 +93,9 @@ pub fn run(params: &Params) -> anyhow::Result<Box<dyn Summary>> {
         start_s: frames_to_s(frames.start),
     };
     let picture = plot::features(&features, &params.panels, params.width, format)?;
-    write_picture(output, &picture)?;
     let unit = if frames.len() == 1 { "frame" } else { "frames" };
     let what = format!("{} {unit} ({:.2} s)", frames.len(), frames_to_s(frames.len()));
-    Ok(Box::new(Drawn::new(what, output, &picture)))
+    write_picture(what, output, &picture, params.dry_run)
 }
 
 /// What is drawn.

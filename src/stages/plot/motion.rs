@@ -13,7 +13,7 @@ use crate::training::TemporalConfig;
 use crate::units::frames_to_s;
 
 use super::excerpt::ExcerptParams;
-use super::output::{Drawn, WIDTHS_PX, format_of, write_picture};
+use super::output::{WIDTHS_PX, format_of, write_picture};
 
 /// What the user asks for.
 #[derive(Clone, Debug, clap::Args)]
@@ -37,6 +37,9 @@ pub struct Params {
     pub width: u32,
     #[command(flatten)]
     pub client: ClientParams,
+    /// Say what would be done, and do nothing.
+    #[arg(long)]
+    pub dry_run: bool,
 }
 
 /// Draws the plot.
@@ -59,8 +62,7 @@ pub fn run(params: &Params) -> anyhow::Result<Box<dyn Summary>> {
         jerk_limit_m_s3: TemporalConfig::default().target_jerk,
     };
     let picture = plot::motion(&plotted, &params.panels, params.width, format)?;
-    write_picture(output, &picture)?;
     let unit = if frames.len() == 1 { "frame" } else { "frames" };
     let what = format!("{} {unit} ({:.2} s)", frames.len(), frames_to_s(frames.len()));
-    Ok(Box::new(Drawn::new(what, output, &picture)))
+    write_picture(what, output, &picture, params.dry_run)
 }

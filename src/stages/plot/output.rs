@@ -12,11 +12,14 @@ use crate::store;
 /// Widths that a plot can have, as a flag takes them.
 pub const WIDTHS_PX: std::ops::RangeInclusive<i64> = MIN_WIDTH_PX as i64..=MAX_WIDTH_PX as i64;
 
-/// Returns the format that the name of the output asks for.
+/// Returns the format that the name of the output asks for; standard output is given PNG.
 ///
 /// # Errors
 /// When it is no format of plots.
 pub fn format_of(output: &Path) -> anyhow::Result<Format> {
+    if store::is_standard_output(output) {
+        return Ok(Format::Png);
+    }
     let extension = output.extension().map(|e| e.to_string_lossy()).unwrap_or_default();
     Format::of_path_extension(&extension).ok_or_else(|| {
         let found = match extension.as_ref() {
@@ -30,38 +33,52 @@ pub fn format_of(output: &Path) -> anyhow::Result<Format> {
     })
 }
 
-/// Writes the picture, whole or not at all.
+/// Writes a picture of `what`, whole or not at all; in a dry run not at all.
 ///
 /// # Errors
 /// What the file system says.
-pub fn write_picture(output: &Path, picture: &Picture) -> anyhow::Result<()> {
-    store::write_file(output, |out| out.write_all(&picture.bytes))
-        .with_context(|| format!("while writing {}", output.display()))
+pub fn write_picture(
+    what: String,
+    output: &Path,
+    picture: &Picture,
+    dry_run: bool,
+) -> anyhow::Result<Box<dyn Summary>> {
+    if !dry_run {
+        store::write_file(output, |out| out.write_all(&picture.bytes))
+            .with_context(|| format!("while writing {}", output.display()))?;
+    }
+    let (width_px, height_px) = (picture.width_px, picture.height_px);
+    Ok(Box::new(Drawn { what, output: output.to_owned(), width_px, height_px, dry_run }))
 }
 
 /// What was drawn.
-pub struct Drawn {
+struct Drawn {
     what: String,
     output: PathBuf,
     width_px: u32,
     height_px: u32,
-}
-
-impl Drawn {
-    /// Returns the account of a picture of `what`.
-    pub fn new(what: String, output: &Path, picture: &Picture) -> Self {
-        let (width_px, height_px) = (picture.width_px, picture.height_px);
-        Self { what, output: output.to_owned(), width_px, height_px }
-    }
+    dry_run: bool,
 }
 
 impl Summary for Drawn {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        let Drawn { what, output, width_px, height_px } = self;
-        writeln!(out, "{what} → {} ({width_px} × {height_px} px)", output.display())
+        let Drawn { what, output, width_px, height_px, dry_run } = self;
+        let would = if *dry_run { "would draw " } else { "" };
+        writeln!(out, "{would}{what} → {} ({width_px} × {height_px} px)", output.display())
     }
 
     fn n_failed(&self) -> u64 {
         0
+    }
+
+    fn figures(&mut self) -> serde_json::Value {
+        let Drawn { what, output, width_px, height_px, dry_run } = self;
+        serde_json::json!({
+            "to": output,
+            "dry_run": dry_run,
+            "drawn": what,
+            "width_px": width_px,
+            "height_px": height_px,
+        })
     }
 }

@@ -15,7 +15,7 @@ use crate::store::{Location, Row as _, Snapshot};
 use crate::training::RowKind;
 
 use super::nearest::nearest;
-use super::output::{Drawn, WIDTHS_PX, format_of, write_picture};
+use super::output::{WIDTHS_PX, format_of, write_picture};
 
 /// What the user asks for.
 #[derive(Clone, Debug, clap::Args)]
@@ -41,6 +41,9 @@ pub struct Params {
     pub width: u32,
     #[command(flatten)]
     pub client: ClientParams,
+    /// Say what would be done, and do nothing.
+    #[arg(long)]
+    pub dry_run: bool,
 }
 
 /// A panel by its name, or every panel of a stage.
@@ -98,8 +101,7 @@ pub fn run(params: &Params) -> anyhow::Result<Box<dyn Summary>> {
 
     let plot = TrainingPlot { title: &params.run, stages: &stages };
     let picture = plot::training(&plot, params.width, format)?;
-    write_picture(&params.output, &picture)?;
-    Ok(Box::new(Drawn::new(account(&stages), &params.output, &picture)))
+    write_picture(account(&stages), &params.output, &picture, params.dry_run)
 }
 
 /// Reads what was logged of a run, in order of steps.

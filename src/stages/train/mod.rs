@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use anyhow::{bail, ensure};
 
+use super::failure::quoted;
 use super::learned::{learned_path, remember};
 use super::trained::best;
 use super::{ClientParams, Contract, Progress, Stage, Summary};
@@ -24,7 +25,7 @@ use crate::training::{
 use session::{
     Looker, MachineParams, check_run_name, claim, claim_path, lease_of, read_phrases, scales,
 };
-pub use summary::{Account, StageAccount};
+pub use summary::{Account, DryRun, StageAccount};
 
 /// Share of a time budget that the decoder gets.
 const DECODER_SHARE: f64 = 0.1;
@@ -127,10 +128,7 @@ impl Stage for Train {
         if params.dry_run {
             return run.dry_run(progress);
         }
-        if params.force {
-            run.clear()?;
-        }
-        store.sweep()?;
+        store.sweep();
         run.train(progress)
     }
 }
@@ -227,7 +225,8 @@ impl<'a> Run<'a> {
 
     fn dry_run(&self, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
         let machine = &self.params.machine;
-        let phrases = read_phrases(self.store, Train::NAME, machine, None, progress, self.watch)?;
+        let phrases =
+            read_phrases(self.store, Train::NAME, machine, None, progress, self.watch, true)?;
         let n_frames = self.config.network.window_frames;
         let windows = Windows::new(
             phrases.dataset,
@@ -237,20 +236,21 @@ impl<'a> Run<'a> {
             0,
         );
         let (_, list) = UNet1D::new(&self.config.network.unet);
-        Ok(Box::new(summary::DryRun {
+        Ok(Box::new(DryRun {
             run: self.params.run.clone(),
+            what: format!("train a UNet of {} parameters", list.n_elements()),
             n_train: windows.n_train(),
             n_validation: windows.n_validation(),
             n_left_out: phrases.left_out.len(),
-            n_parameters: list.n_elements(),
             steps_per_epoch: windows.n_train().div_ceil(self.config.diffusion.batch_size),
         }))
     }
 
     fn train(&mut self, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
         let (params, config) = (self.params, self.config);
+        let machine = &params.machine;
         let phrases =
-            read_phrases(self.store, Train::NAME, &params.machine, None, progress, self.watch)?;
+            read_phrases(self.store, Train::NAME, machine, None, progress, self.watch, false)?;
         let threads = Arc::new(params.machine.start_threads()?);
         let n_frames = config.network.window_frames;
         let scales = scales(&phrases.dataset, n_frames, self.watch)?;
@@ -266,6 +266,9 @@ impl<'a> Run<'a> {
             DiffusionLearner::new(&config.network, &config.diffusion, &augmented, params.seed)?
                 .on(&threads);
         // Only now is it certain that there is something to train and to train on.
+        if params.force {
+            self.clear()?;
+        }
         let patience = params.machine.patience();
         claim(self.store, &params.run, Train::NAME, config, patience, self.watch)?;
         let end = self.stage(&mut learner, &augmented, &mut account)?;
@@ -441,13 +444,4 @@ fn resume_command(params: &Params) -> String {
         words.push("--resume".to_owned());
     }
     words.join(" ")
-}
-
-/// Quotes a word for the shell where it needs it.
-pub fn quoted(word: &str) -> String {
-    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./:=,@+%".contains(c);
-    if !word.is_empty() && word.chars().all(is_plain) {
-        return word.to_owned();
-    }
-    format!("'{}'", word.replace('\'', r"'\''"))
 }

@@ -133,7 +133,7 @@ pub struct Phrases {
     pub left_out: Vec<LeftOut>,
 }
 
-/// Reads the phrases of a store and records those that are left out.
+/// Reads the phrases of a store and records those that are left out, unless nothing may be written.
 ///
 /// # Errors
 /// When there are none, or too many are left out.
@@ -144,6 +144,7 @@ pub fn read_phrases(
     max_train_phrases: Option<usize>,
     progress: &dyn Progress,
     watch: &Looker,
+    is_dry_run: bool,
 ) -> anyhow::Result<Phrases> {
     let reading = Reading {
         in_memory: machine.in_memory,
@@ -163,7 +164,9 @@ pub fn read_phrases(
     let read = Dataset::read(store, &reading, &notice, &count);
     progress.finish();
     let (dataset, left_out) = read?;
-    record(store, command, &left_out)?;
+    if !is_dry_run {
+        record(store, command, &left_out)?;
+    }
     let n_all = dataset.phrases().len() + left_out.len();
     let share = left_out.len() as f64 / n_all.max(1) as f64;
     if share > machine.max_failed {

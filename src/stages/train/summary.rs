@@ -2,6 +2,8 @@
 
 use std::io::{self, Write};
 
+use serde_json::json;
+
 use crate::stages::Summary;
 use crate::store::Location;
 use crate::training::{Baselines, End, LeftOut, Progress};
@@ -78,13 +80,11 @@ impl Summary for Account {
             if let Some(best) = progress.best {
                 write!(out, ", best validation loss {:.4} at step {}", best.loss, best.step)?;
                 if let Some(Baselines { constant, untrained }) = baselines {
-                    let below = |loss: f64| 100.0 * (1.0 - best.loss / loss);
                     write!(
                         out,
-                        " ({:.0} % below the best constant's {constant:.4}, {:.0} % below an untrained \
-                         network's {untrained:.4})",
-                        below(*constant),
-                        below(*untrained)
+                        " ({} the best constant's {constant:.4}, {} an untrained network's {untrained:.4})",
+                        beside(best.loss, *constant),
+                        beside(best.loss, *untrained)
                     )?;
                 }
             }
@@ -106,34 +106,101 @@ impl Summary for Account {
     }
 
     fn n_failed(&self) -> u64 {
-        // Who interrupts wants to hear that all is well; the next call tells of phrases again.
-        if self.resume.is_some() { 0 } else { self.left_out.len() as u64 }
+        self.left_out.len() as u64
     }
+
+    fn is_stopped(&self) -> bool {
+        self.resume.is_some()
+    }
+
+    fn figures(&mut self) -> serde_json::Value {
+        let stages = self.stages.iter().map(|stage| {
+            let StageAccount { stage, started_at, progress, end, baselines } = stage;
+            let end = match end {
+                End::Done => "complete",
+                End::OutOfTime => "out_of_time",
+                End::Stale => "stale",
+                End::Interrupted => "interrupted",
+            };
+            json!({
+                "stage": stage,
+                "end": end,
+                "n_steps": progress.step,
+                "n_new_steps": progress.step - started_at,
+                "n_skipped": progress.n_skipped,
+                "elapsed_s": progress.elapsed_s,
+                "best_step": progress.best.map(|best| best.step),
+                "best_validation_loss": progress.best.map(|best| best.loss),
+                "loss_of_best_constant": baselines.as_ref().map(|known| known.constant),
+                "loss_of_untrained_network": baselines.as_ref().map(|known| known.untrained),
+            })
+        });
+        let left_out =
+            self.left_out.iter().take(N_SHOWN).map(
+                |one| json!({ "item": one.phrase_id, "kind": one.kind, "message": one.message }),
+            );
+        json!({
+            "run": self.run,
+            "store": self.store,
+            "stages": stages.collect::<Vec<_>>(),
+            "failures": left_out.collect::<Vec<_>>(),
+            "resume": self.resume,
+        })
+    }
+}
+
+/// Says how far a loss is below another, or above it.
+fn beside(loss: f64, other: f64) -> String {
+    let percent = 100.0 * (1.0 - loss / other);
+    if percent < 0.0 { format!("{:.0} % above", -percent) } else { format!("{percent:.0} % below") }
 }
 
 /// What would be done.
 #[derive(Clone, Debug)]
 pub struct DryRun {
     pub run: String,
+    /// What the run would do.
+    pub what: String,
     pub n_train: usize,
     pub n_validation: usize,
     pub n_left_out: usize,
-    pub n_parameters: usize,
     pub steps_per_epoch: usize,
 }
 
 impl Summary for DryRun {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        let Self { run, n_train, n_validation, n_left_out, n_parameters, steps_per_epoch } = self;
+        let Self { run, what, n_train, n_validation, n_left_out, steps_per_epoch } = self;
         writeln!(
             out,
-            "run {run} would train a UNet of {n_parameters} parameters on {n_train} windows, \
-             {steps_per_epoch} steps an epoch, and validate on {n_validation}; {n_left_out} phrases are \
-             left out"
+            "run {run} would {what} on {n_train} windows, {steps_per_epoch} steps an epoch, and validate on \
+             {n_validation}; {n_left_out} phrases are left out"
         )
     }
 
     fn n_failed(&self) -> u64 {
         0
+    }
+
+    fn figures(&mut self) -> serde_json::Value {
+        json!({
+            "run": self.run,
+            "dry_run": true,
+            "n_train_windows": self.n_train,
+            "n_validation_windows": self.n_validation,
+            "n_left_out": self.n_left_out,
+            "steps_per_epoch": self.steps_per_epoch,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_loss_is_above_or_below_another_and_never_minus_so_much_below() {
+        assert_eq!(beside(0.3, 0.4), "25 % below");
+        assert_eq!(beside(0.96, 0.4192), "129 % above");
+        assert_eq!(beside(0.4, 0.4), "0 % below");
     }
 }

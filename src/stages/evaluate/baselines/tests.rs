@@ -8,8 +8,8 @@ use crate::audio::FeatureScale;
 use crate::autodiff::{Parameters, Stream};
 use crate::diffusion::{DiffusionConfig, Prediction};
 use crate::generation::{
-    Engine as _, FileEntry, Inputs, MODEL_FORMAT, Networks, Provenance, file_names, own_channels,
-    own_features,
+    Engine as _, FileEntry, Inputs, MODEL_FORMAT, ModelFileName, Networks, Provenance, file_names,
+    own_channels, own_features,
 };
 use crate::model::{DecoderConfig, MotionDecoder, ParameterList, UNet1D, UNetConfig};
 use crate::motion::Normalizer;
@@ -51,17 +51,17 @@ fn model_in(folder: &Path, config: UNetConfig) -> OpenModel {
     let of_decoder = |id| decoder_parameters.unpacked(id);
     let storage = Storage::Fp32;
     let graphs = [
-        (unet(&config, &of_unet, &scale, Form::default(), storage), file_names::UNET),
-        (decoder(&decoder_config, &of_decoder, storage), file_names::DECODER),
+        (unet(&config, &of_unet, &scale, Form::default(), storage), ModelFileName::Unet),
+        (decoder(&decoder_config, &of_decoder, storage), ModelFileName::Decoder),
     ];
     let mut files = Vec::new();
     for (graph, name) in graphs {
         let graph = graph.expect("a graph");
         let file = ModelFile { graph, metadata: BTreeMap::new(), description: String::new() };
         let bytes = file.encode("weights", EMBEDDED_BYTES).model;
-        std::fs::write(folder.join(name), &bytes).expect("written");
+        std::fs::write(folder.join(name.name()), &bytes).expect("written");
         let (n_bytes, sha256) = (bytes.len() as u64, sha256(&bytes));
-        files.push(FileEntry { name: name.to_owned(), n_bytes, sha256 });
+        files.push(FileEntry { name, n_bytes, sha256 });
     }
     let mut normalizer = Normalizer::identity();
     normalizer.centre[1] = 0.9;
@@ -151,6 +151,7 @@ fn row(settings: Option<String>) -> GenerationRow {
         generate_s: 0.0,
         real_time_factor: 0.0,
         settings,
+        content_hash: None,
         time: TimestampUs(0),
     }
 }

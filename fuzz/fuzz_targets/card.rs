@@ -1,0 +1,66 @@
+//! Arbitrary bytes through the reader of models' cards: no panic, and in a card that is taken sizes of which
+//! networks can be made and files of which there is one each.
+#![no_main]
+
+use libfuzzer_sys::fuzz_target;
+
+#[path = "../../src/audio/mod.rs"]
+#[allow(dead_code, unused_imports, reason = "this target reaches a part of the modules")]
+mod audio;
+#[path = "../../src/chance.rs"]
+#[allow(dead_code, reason = "this target reaches a part of the module")]
+mod chance;
+#[path = "../../src/diffusion/mod.rs"]
+#[allow(dead_code, unused_imports, reason = "this target reaches a part of the modules")]
+mod diffusion;
+#[path = "../../src/model/mod.rs"]
+#[allow(dead_code, unused_imports, reason = "this target reaches a part of the modules")]
+mod model;
+#[path = "../../src/motion/mod.rs"]
+#[allow(dead_code, unused_imports, reason = "this target reaches a part of the modules")]
+mod motion;
+#[path = "../../src/units.rs"]
+#[allow(dead_code, reason = "this target reaches a part of the module")]
+mod units;
+#[path = "../../src/generation"]
+#[allow(dead_code, unused_imports, reason = "this target reaches a part of the modules")]
+mod generation {
+    mod card;
+    mod learned;
+    pub use card::*;
+    pub use learned::*;
+}
+#[path = "../../src/onnx"]
+#[allow(dead_code, reason = "this target reaches a part of the modules")]
+mod onnx {
+    mod storage;
+    pub use storage::Storage;
+}
+
+use generation::ModelCard;
+
+/// A card that is taken, whose parts the input replaces.
+const SOUND: &str = include_str!("../../models/pretrained/model.json");
+
+fn check(bytes: &[u8]) {
+    match ModelCard::read(bytes, "m") {
+        Ok(card) => {
+            assert!(card.files.len() <= generation::ModelFileName::ALL.len());
+            let _ = model::UNet1D::new(&card.unet);
+            let _ = model::MotionDecoder::new(&card.decoder);
+            let text = serde_json::to_vec(&card).expect("JSON");
+            assert_eq!(ModelCard::read(&text, "m").expect("written by us"), card);
+        }
+        Err(error) => assert!(!error.to_string().is_empty()),
+    }
+}
+
+fuzz_target!(|bytes: &[u8]| {
+    check(bytes);
+    // What follows the first two bytes takes the place of a stretch of the settings, which are in front.
+    let [at, n, patch @ ..] = bytes else { return };
+    let settings = SOUND.find("\"alphas_cumprod\"").unwrap_or(SOUND.len());
+    let at = usize::from(*at) * settings / 256;
+    let end = (at + usize::from(*n)).min(settings);
+    check(&[&SOUND.as_bytes()[..at], patch, &SOUND.as_bytes()[end..]].concat());
+});
