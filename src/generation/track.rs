@@ -91,7 +91,7 @@ impl Generator<'_> {
     ) -> Result<(), E> {
         let windows = self.windows(track.condition.nrows());
         let start = track.constraints.map(|c| c.constraints.placement()).unwrap_or_default();
-        let mut last: Option<Quaternion> = None;
+        let (mut last, mut n_given): (Option<Quaternion>, usize) = (None, 0);
         let mut give = |mut frames: Array2<f32>,
                         emit: &mut dyn FnMut(Array2<f32>) -> Result<(), E>| {
             if frames.nrows() == 0 {
@@ -99,6 +99,12 @@ impl Generator<'_> {
             }
             start.restore(&mut frames);
             last = continue_signs(&mut frames, last);
+            if let Some(phase) = track.phase {
+                // What is asked of a track exactly is no matter of the decoder's rounding.
+                let column = frames.column_mut(Channel::Phase.range().start);
+                column.into_iter().zip(&phase[n_given..]).for_each(|(x, phase)| *x = *phase as f32);
+            }
+            n_given += frames.nrows();
             emit(frames)
         };
         let mut joiner = Joiner::new();

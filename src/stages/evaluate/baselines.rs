@@ -160,6 +160,7 @@ fn of_columns(row: &GenerationRow, card: &ModelCard) -> anyhow::Result<MotionSet
         soft: false,
         no_clock: false,
         decoder_derives: card.decoder.fusion.is_some(),
+        phase_given: false,
     })
 }
 

@@ -52,6 +52,8 @@ pub struct Evaluand {
     postprocess: PostProcessConfig,
     /// Whether decoded motion agrees with itself by construction.
     decoder_derives: bool,
+    /// Whether decoded motion has the phase of its music by construction.
+    phase_given: bool,
     /// Files of motions of another program.
     files: Option<ForeignMotions>,
     /// Whether motions say a phase.
@@ -108,6 +110,7 @@ impl Evaluand {
                 .map(|row| usize::try_from(row.n_frames).unwrap_or(0))
                 .collect(),
             decoder_derives: settings.iter().any(|settings| settings.decoder_derives),
+            phase_given: settings.iter().any(|settings| settings.phase_given),
             postprocess: settings.into_iter().next().map(|s| s.postprocess).unwrap_or_default(),
             generations,
             files: None,
@@ -190,6 +193,7 @@ impl Evaluand {
             n_frames,
             postprocess: PostProcessConfig::nothing(),
             decoder_derives: false,
+            phase_given: false,
             files: Some(files),
             has_phase,
             snapshot,
@@ -292,7 +296,11 @@ impl Evaluand {
         for (motion, found) in self.motions.iter().zip(&evaluated) {
             let (id, sample) = (motion.phrase_id.as_str(), motion.sample);
             if let Some(decoded) = &found.decoded {
-                let derived = |check: &str| self.decoder_derives && holds_by_derivation(check);
+                let has_phase = self.phase_given && has_music;
+                let derived = |check: &str| match check {
+                    "phase" | "phase_monotonic" => has_phase,
+                    check => self.decoder_derives && holds_by_derivation(check),
+                };
                 let raw = rows::checks(name, id, sample, MadeAt::Raw, &decoded.checks, &derived);
                 rows.checks.extend(raw);
             }

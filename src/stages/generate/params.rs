@@ -256,6 +256,7 @@ pub struct Settings {
     pub soft: bool,
     pub no_clock: bool,
     pub decoder_derives: bool,
+    pub phase_given: bool,
 }
 
 impl Settings {
@@ -308,6 +309,7 @@ impl Settings {
             soft: params.soft,
             no_clock: params.no_clock,
             decoder_derives: card.decoder.fusion.is_some(),
+            phase_given: card.unet.clock && !params.no_clock,
         })
     }
 
@@ -366,6 +368,7 @@ impl Settings {
             soft: self.soft,
             no_clock: self.no_clock,
             decoder_derives: self.decoder_derives,
+            phase_given: self.phase_given,
         }
     }
 

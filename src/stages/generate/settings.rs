@@ -51,6 +51,9 @@ pub struct MotionSettings {
     /// construction.
     #[serde(default, skip_serializing_if = "is_false")]
     pub decoder_derives: bool,
+    /// Whether motion is sampled with the phase of its music, where that is known.
+    #[serde(default, skip_serializing_if = "is_false")]
+    pub phase_given: bool,
 }
 
 /// As release 0.1 wrote settings, what it did not know is left out where it says nothing new.
@@ -97,6 +100,7 @@ mod tests {
             soft: false,
             no_clock: false,
             decoder_derives: false,
+            phase_given: false,
         }
     }
 
