@@ -6,7 +6,6 @@
 //! write otherwise is read, and told by [`Bvh::notes`]. Format: Meredith and Maddock, Motion Capture File
 //! Formats Explained, University of Sheffield, 2001, section 3.
 
-mod encoding;
 mod frame_time;
 mod note;
 mod words;
@@ -14,9 +13,10 @@ mod words;
 use ndarray::{Array2, ArrayView2};
 use thiserror::Error;
 
+use super::text::text_of;
+
 pub use note::BvhNote;
 
-use encoding::text_of;
 use frame_time::frame_time_of;
 use words::Words;
 
@@ -109,9 +109,9 @@ impl Bvh {
             let (what, count) = ("bytes", text.len());
             return Err(BvhError::Limit { line: 1, what, count, limit: MAX_TEXT_BYTES });
         }
-        let (text, encoded) = text_of(text);
+        let (text, was_utf16) = text_of(text);
         let mut words = Words::new(&text);
-        words.notes.extend(encoded);
+        words.notes.extend(was_utf16.then_some(BvhNote::Utf16));
         let joints = parse_hierarchy(&mut words)?;
         let (frame_time_s, frames) = parse_motion(&mut words, &joints)?;
         Ok(Self { joints, frame_time_s, frames, notes: words.notes })

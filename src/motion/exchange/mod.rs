@@ -13,6 +13,7 @@ use std::io::{self, Write};
 use ndarray::ArrayView2;
 
 pub use bvh::write_bvh;
+pub(in crate::motion) use bvh::{END_SITE_CM, ROOT_NAME};
 pub use csv::{CsvError, csv_header, read_csv, write_csv, write_csv_rows};
 pub use glb::write_glb;
 

@@ -2,6 +2,7 @@
 
 mod batch;
 mod layout;
+mod motion;
 mod phrase;
 
 use std::collections::BTreeSet;
@@ -16,16 +17,19 @@ use crate::store::{
     Cache, Ledger, Location, Row as _, Shard, Snapshot, Source, StoreError, digest,
 };
 
-use super::failure::{Failure, write_failures};
+use super::failure::{Failure, write_failures, write_notes};
 pub(in crate::stages) use layout::is_audio;
 pub use layout::{Layout, Plan, Planned, Role, plan};
+pub(in crate::stages) use motion::{notes_of, read_bvh, read_trajectory};
+pub(in crate::stages) use phrase::read_beats;
 pub use phrase::{Rules, content_hash_of_audio};
-pub(in crate::stages) use phrase::{read_beats, read_bvh, read_trajectory};
 
 /// Raised when ingest writes something else for the same input and rules.
 const OUTPUT_VERSION: u32 = 1;
 /// Raised when ingest writes something else for a phrase with a beat list, and for no other.
 const BEATS_VERSION: u32 = 2;
+/// Raised when ingest writes something else for a motion capture, and for no other phrase.
+const CAPTURE_VERSION: u32 = 2;
 
 /// The stage.
 pub struct Ingest;
@@ -155,6 +159,7 @@ impl Stage for Ingest {
             progress.finish();
         }
         report.tally.failed.sort_by(|a, b| a.id.cmp(&b.id));
+        report.tally.noted.sort();
         report.took_s = started.elapsed().as_secs_f64();
         Ok(Box::new(report))
     }
@@ -218,6 +223,8 @@ struct Tally {
     n_frames: u64,
     duration_s: f64,
     failed: Vec<Refused>,
+    /// Captures of which a reader should know something, and what.
+    noted: Vec<(String, String)>,
 }
 
 /// A phrase that failed, for the summary.
@@ -234,6 +241,7 @@ impl Tally {
         self.n_frames += other.n_frames;
         self.duration_s += other.duration_s;
         self.failed.extend(other.failed);
+        self.noted.extend(other.noted);
     }
 }
 
@@ -276,6 +284,13 @@ impl Summary for Report {
             let n = self.ignored.len();
             writeln!(out, "  {n} files belong to no phrase and were left alone, such as {first}")?;
         }
+        let all = format!(
+            "motiongen query --store {} \"select phrase_id, motion_notes from phrases where motion_notes is \
+             not null\"",
+            self.store
+        );
+        let noted = tally.noted.iter().map(|(id, note)| (format!("phrase {id}"), note.as_str()));
+        write_notes(out, noted, Some(&all))?;
         let failed =
             tally.failed.iter().map(|refused| (format!("phrase {}", refused.id), &refused.failure));
         write_failures(out, failed, (!self.dry_run).then_some(&self.store))

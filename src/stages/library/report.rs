@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use super::songs::Song;
 use super::write::Written;
 use crate::stages::Summary;
-use crate::stages::failure::{Failure, write_failures};
+use crate::stages::failure::{Failure, write_failures, write_notes};
 
 /// What became of songs and captures.
 #[derive(Debug, Default)]
@@ -23,6 +23,8 @@ pub struct Tally {
     /// Phrases of songs that are gone.
     pub n_forgotten: usize,
     pub failed: Vec<(String, Failure)>,
+    /// What a reader should know of captures, with their names.
+    pub noted: Vec<(String, String)>,
 }
 
 impl Tally {
@@ -102,6 +104,8 @@ impl Summary for Report {
         if let Some(output) = output {
             writeln!(out, "  files: {}", output.display())?;
         }
+        let noted = tally.noted.iter().map(|(name, note)| (name, note.as_str()));
+        write_notes(out, noted, None)?;
         write_failures(out, tally.failed.iter().map(|(name, why)| (name, why)), Some(store))
     }
 
