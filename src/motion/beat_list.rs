@@ -70,7 +70,10 @@ impl Beats {
             if times_s.last().is_some_and(|&previous_s| time_s <= previous_s) {
                 return Err(refuse("a time later than the beat before"));
             }
-            let mark = format.mark(time_s, &fields).map_err(refuse)?;
+            let mark = format.mark(time_s, &fields).map_err(|expected| {
+                let is_alone = matches!((marks.last(), fields.len()), (Some(Mark::Nothing), 2));
+                refuse(if is_alone { "no beat number, like the beats before" } else { expected })
+            })?;
             match (marks.last(), mark) {
                 (Some(Mark::Number(_)), Mark::Number(_)) | (None, _) => {}
                 (Some(_), Mark::Number(_)) => {

@@ -94,7 +94,7 @@ fn short_flat_and_oversized_takes_are_refused() {
          check the joint offsets"
     );
     let slow = format!(
-        "HIERARCHY ROOT a\n{{ CHANNELS 1 Yposition }}\nMOTION Frames: 7300 Frame Time: 1\n{}",
+        "HIERARCHY ROOT a\n{{ CHANNELS 1 Yposition End Site {{ OFFSET 0 2 0 }} }}\nMOTION Frames: 7300 Frame Time: 1\n{}",
         "0 ".repeat(7300)
     );
     assert_eq!(

@@ -109,12 +109,13 @@ def angvel(q):
 
 
 def frame_time(text):
-    """The interval of the only whole rate that is written so, rounded or cut; else the number."""
+    """The interval of the only usual rate that is written so, rounded or cut; else the number."""
     value = float(text)
     last = 10.0 ** -len(text.partition(".")[2])
     if abs(round(1 / value) * value - 1) < 1e-12:
         return value
-    rates = [r for r in range(1, 10001) if value - 0.5 * last <= 1 / r <= value + last]
+    usual = (r for r in range(1, 10001) if r % 5 == 0 or r % 12 == 0)
+    rates = [r for r in usual if value - 0.5 * last <= 1 / r <= value + last]
     return 1 / rates[0] if len(rates) == 1 else value
 
 
