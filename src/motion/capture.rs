@@ -168,4 +168,8 @@ fn check_size(what: &'static str, count: usize, limit: usize) -> Result<(), Capt
 }
 
 #[cfg(test)]
+mod people;
+#[cfg(test)]
+mod person;
+#[cfg(test)]
 mod tests;

@@ -80,7 +80,9 @@ mod tests {
 
     #[test]
     fn other_frame_times_stay_as_they_are() {
-        for written in ["0.0333667", "0.033367", "0.0417083", "0.0127", "0.0123456", "0.03", "0.007", "1e-4"] {
+        for written in
+            ["0.0333667", "0.033367", "0.0417083", "0.0127", "0.0123456", "0.03", "0.007", "1e-4"]
+        {
             let exact: f64 = written.parse().unwrap();
             assert_eq!(read(written), exact, "{written}");
         }

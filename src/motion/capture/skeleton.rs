@@ -331,7 +331,7 @@ fn next_towards_body(
     let turns = channels.rotation_range_deg[node] > TURNS_DEG;
     if let &[child] = children.as_slice() {
         let goes_on = if turns {
-            channels.travels(child, size)
+            below(child).any(|i| channels.travels(i, size))
         } else {
             below(child).any(|i| channels.changes(i, size))
         };
@@ -339,7 +339,7 @@ fn next_towards_body(
     }
     let is_body = |&child: &usize| {
         let share = below(child).len() as f64 / below(node).len().max(1) as f64;
-        share >= BODY_SHARE && channels.travels(child, size)
+        share >= BODY_SHARE && below(child).any(|i| channels.travels(i, size))
     };
     children.into_iter().find(is_body)
 }

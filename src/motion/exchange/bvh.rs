@@ -66,7 +66,7 @@ pub fn write_bvh(frames: ArrayView2<'_, f32>, out: &mut dyn Write) -> io::Result
 ///
 /// With R = (r_ij): `sin β = r₂₁`, `γ = atan2(-r₀₁, r₁₁)`, `α = atan2(-r₂₀, r₂₂)`. Where cos β = 0 only
 /// `γ ± α` is defined, `atan2(r₁₀, r₀₀)`, and α stays as it was.
-fn euler_zxy(q: Quaternion, before: [f64; 3]) -> [f64; 3] {
+pub fn euler_zxy(q: Quaternion, before: [f64; 3]) -> [f64; 3] {
     // The columns of R.
     let x = rotate(q, [1.0, 0.0, 0.0]);
     let y = rotate(q, [0.0, 1.0, 0.0]);
