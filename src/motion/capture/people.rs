@@ -5,6 +5,7 @@ use super::super::quaternion::from_axis_angle;
 use super::person::{Does, Person};
 use super::*;
 use ndarray::Array2;
+use proptest::prelude::*;
 
 const Y: [f64; 3] = [0.0, 1.0, 0.0];
 
@@ -204,4 +205,24 @@ fn a_root_alone_keeps_its_height() {
     let trajectory = convert_bvh(&Bvh::parse(text.as_bytes()).unwrap(), None).unwrap();
     assert_eq!(trajectory.n_frames(), 58);
     assert!((trajectory.view()[[30, 1]] - 0.95).abs() < 1e-4);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+    #[test]
+    fn damaged_takes_never_panic(
+        at in 0.0..1.0f64, n in 0..40usize, patch in "[{}a-zA-Z0-9 .:\\n\\-]{0,9}",
+        named: bool, prop: bool, z_up: bool
+    ) {
+        let up = if z_up { Axis::Z } else { Axis::Y };
+        let above = if prop { vec![([0.0; 3], [1.0, 0.0, 0.0, 0.0])] } else { Vec::new() };
+        let person = Person { n_frames: 23, named, prop, up, above, ..Person::default() };
+        let mut bytes = person.bvh().into_bytes();
+        let start = (at * bytes.len() as f64) as usize;
+        let end = (start + n).min(bytes.len());
+        bytes.splice(start..end, patch.into_bytes());
+        if let Ok(bvh) = Bvh::parse(&bytes) {
+            let _ = convert_capture(&bvh, None, None);
+        }
+    }
 }
