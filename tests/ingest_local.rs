@@ -1,6 +1,7 @@
 //! Ingest from local folders into local stores, through the executables.
 
 mod again;
+mod captures;
 mod configuration;
 mod library;
 mod messages;

@@ -148,7 +148,7 @@ fn phase_is_zero_without_beats_and_advances_by_thirds_in_a_waltz() {
     let waltz = convert("mocapbank", Some("waltz"));
     let phase: Vec<f32> = waltz.channel(Channel::Phase).iter().copied().collect();
     let bars = phase.windows(2).filter(|w| w[1] < w[0]).count();
-    // 238 frames are 7.9 s, a bar lasts about 1.83 s, and the first beat in the file is number 2.
+    // 239 frames are 7.9 s, a bar lasts about 1.83 s, and the first beat in the file is number 2.
     assert_eq!(bars, 4);
     // Beat 2 of the bar at 1.7 s, that is phase 1/3, within the drawn jitter of some 15 ms.
     assert!((phase[51] - 1.0 / 3.0).abs() < 0.03, "{}", phase[51]);

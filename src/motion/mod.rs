@@ -13,6 +13,7 @@
 //! Everything here is pure: text and numbers in, numbers or a named error out.
 
 pub mod augment;
+mod beat_list;
 pub mod bvh;
 pub mod capture;
 pub mod channels;
@@ -33,10 +34,13 @@ pub mod quaternion;
 pub mod rates;
 pub mod spline;
 pub mod style;
+pub mod text;
 pub mod trajectory;
 
-pub use bvh::{Bvh, BvhError};
-pub use capture::{CaptureError, convert_bvh};
+pub use bvh::{Bvh, BvhError, BvhNote};
+pub use capture::{
+    Axis, Capture, CaptureAccount, CaptureError, CaptureNote, convert_bvh, convert_capture,
+};
 pub use channels::{CHANNEL_NAMES, Channel, MOTION_DIM, channel_unit};
 pub use clock::{CLOCK_DIM, CLOCK_NAMES, clock};
 pub use kinematics::Poses;

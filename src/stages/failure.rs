@@ -181,6 +181,26 @@ pub(in crate::stages) fn failures_json<'a, N: fmt::Display>(
     told.collect()
 }
 
+/// Writes what readers should know of items that were done, the first of them, and the command that shows all.
+pub(in crate::stages) fn write_notes<'a, N: fmt::Display>(
+    out: &mut dyn Write,
+    noted: impl ExactSizeIterator<Item = (N, &'a str)>,
+    query: Option<&str>,
+) -> io::Result<()> {
+    let n_noted = noted.len();
+    for (name, note) in noted.take(N_SHOWN) {
+        writeln!(out, "  note {name}: {note}")?;
+    }
+    if n_noted <= N_SHOWN {
+        return Ok(());
+    }
+    writeln!(out, "  … and {} more", n_noted - N_SHOWN)?;
+    match query {
+        Some(query) => writeln!(out, "  all of them: {query}"),
+        None => Ok(()),
+    }
+}
+
 /// Returns the command that shows the failures of a store.
 pub(in crate::stages) fn query_of_failures(store: &str) -> String {
     let store = quoted(store);

@@ -11,7 +11,7 @@ const ITEM_COLUMN: &str = "phrase_id";
 
 rows! {
     "One row per phrase that ingest accepted or library constructed."
-    PhraseRow in "phrases" version 3 reads 2 sorted by [phrase_id]
+    PhraseRow in "phrases" version 4 reads 2 sorted by [phrase_id]
     {
         phrase_id: String, "", "Name of the phrase: its folder in a phrase layout, its relative path in a music library; of a constructed one `SONG.tTAKE.NUMBER`.";
         source: String, "URL", "The source it came from; of a constructed phrase, the song.";
@@ -30,6 +30,11 @@ rows! {
         has_audio: bool, "", "Whether the phrase has audio.";
         has_beats: bool, "", "Whether the phrase has beat times (beat list, feature file, or those of its song).";
         motion_format: Option<String>, "", "`npy` (25 channels as they were), `bvh` (converted) or `constructed` (by library).";
+        motion_root: Option<String>, "", "Of a capture: the joint whose motion it is, the first that moves or branches. This and the columns to `motion_notes` are none for other motion, and in rows of release 0.1.";
+        motion_up: Option<String>, "", "Of a capture: the axis that is up in the file, found or given by --up: `y`, `z`, `x`, `-y`, `-z` or `-x`.";
+        motion_unit_m: Option<f64>, "m", "Of a capture: length of one file unit, guessed from the lengths of bones.";
+        motion_cut_s: Option<f64>, "s", "Of a capture: what was cut off at the start, a pose that the body jumps out of.";
+        motion_notes: Option<String>, "", "Of a capture: what a reader should know, such as a root that stands still or a guessed unit, with semicolons between; none where there is nothing.";
         audio_codec: Option<String>, "", "Codec named by the audio header.";
         sample_rate_hz: Option<i32>, "Hz", "Sample rate named by the audio header.";
         n_channels: Option<i32>, "channels", "Channels named by the audio header.";

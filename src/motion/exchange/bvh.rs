@@ -2,8 +2,8 @@
 //!
 //! BVH has no place for a unit or a comment, so this is where they are told: positions are
 //! centimetres, the usual unit of the format, angles are degrees, and the axes are those of the
-//! motion, +Y up and +Z forward. The End Site lies a person's height above the root, since
-//! [`crate::motion::convert_bvh`] knows a length unit by the height of a body.
+//! motion, +Y up and +Z forward. The End Site lies a person's height above the root, since others know a
+//! length unit by the height of a body; [`crate::motion::convert_bvh`] knows such a take by its skeleton.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 use std::io::{self, Write};
@@ -16,7 +16,9 @@ use crate::units::FPS;
 
 const CM_PER_M: f64 = 100.0;
 /// Height of the End Site over the root, cm.
-const END_SITE_CM: f64 = 170.0;
+pub const END_SITE_CM: f64 = 170.0;
+/// Name of the only joint.
+pub const ROOT_NAME: &str = "body";
 /// Cosines of the middle angle below this leave of the outer two only their sum or difference: both
 /// what is left out then and what rounding does above are of this size.
 const GIMBAL_COSINE: f64 = 1e-8;
@@ -34,7 +36,7 @@ pub fn write_bvh(frames: ArrayView2<'_, f32>, out: &mut dyn Write) -> io::Result
     write!(
         out,
         "HIERARCHY\n\
-         ROOT body\n\
+         ROOT {ROOT_NAME}\n\
          {{\n\
          \tOFFSET 0.0 0.0 0.0\n\
          \tCHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation\n\
@@ -64,7 +66,7 @@ pub fn write_bvh(frames: ArrayView2<'_, f32>, out: &mut dyn Write) -> io::Result
 ///
 /// With R = (r_ij): `sin β = r₂₁`, `γ = atan2(-r₀₁, r₁₁)`, `α = atan2(-r₂₀, r₂₂)`. Where cos β = 0 only
 /// `γ ± α` is defined, `atan2(r₁₀, r₀₀)`, and α stays as it was.
-fn euler_zxy(q: Quaternion, before: [f64; 3]) -> [f64; 3] {
+pub fn euler_zxy(q: Quaternion, before: [f64; 3]) -> [f64; 3] {
     // The columns of R.
     let x = rotate(q, [1.0, 0.0, 0.0]);
     let y = rotate(q, [0.0, 1.0, 0.0]);

@@ -12,7 +12,10 @@ use std::io::{self, Write};
 
 use ndarray::ArrayView2;
 
+#[cfg(test)]
+pub(in crate::motion) use bvh::euler_zxy;
 pub use bvh::write_bvh;
+pub(in crate::motion) use bvh::{END_SITE_CM, ROOT_NAME};
 pub use csv::{CsvError, csv_header, read_csv, write_csv, write_csv_rows};
 pub use glb::write_glb;
 

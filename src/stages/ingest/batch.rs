@@ -9,7 +9,7 @@ use std::sync::{Mutex, PoisonError};
 
 use super::layout::{Planned, Role};
 use super::phrase::{Files, Phrase, Rules};
-use super::{BEATS_VERSION, Ingest, Refused, Tally};
+use super::{BEATS_VERSION, CAPTURE_VERSION, Ingest, Refused, Tally, notes_of};
 use crate::stages::beats::{self, BeatSource};
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::seen::Seen;
@@ -240,6 +240,8 @@ impl Job<'_> {
                 tally.n_done += 1;
                 tally.n_frames += phrase.motion.as_ref().map_or(0, |m| m.n_frames() as u64);
                 tally.duration_s += phrase.duration_s();
+                let notes = phrase.capture.as_ref().and_then(notes_of);
+                tally.noted.extend(notes.map(|notes| (id.clone(), notes)));
             }
             Err(failure) => {
                 tally.failed.push(Refused { id: id.clone(), failure: failure.clone() });
@@ -316,6 +318,7 @@ impl Job<'_> {
         let bytes = |name| file(name).map(|(_, f)| f.size_bytes as i64);
         let duration_s = phrase.duration_s();
         let tempo = phrase.tempo;
+        let capture = phrase.capture.as_ref();
         let beats_per_bar = tempo.and_then(|t| t.beats_per_bar);
         PhraseRow {
             phrase_id: planned.id.clone(),
@@ -335,6 +338,11 @@ impl Job<'_> {
             has_audio: phrase.audio.is_some(),
             has_beats: phrase.has_beats,
             motion_format: phrase.motion_format.map(str::to_owned),
+            motion_root: capture.map(|found| found.root.clone()),
+            motion_up: capture.map(|found| found.up.name().to_owned()),
+            motion_unit_m: capture.map(|found| found.unit_m),
+            motion_cut_s: capture.map(|found| found.cut_s),
+            motion_notes: capture.and_then(notes_of),
             audio_codec: phrase.audio.as_ref().map(|a| a.codec.clone()),
             sample_rate_hz: phrase.audio.as_ref().map(|a| a.sample_rate_hz as i32),
             n_channels: phrase.audio.as_ref().map(|a| i32::from(a.n_channels)),
@@ -375,19 +383,26 @@ struct Rows {
     failures: Vec<FailureRow>,
 }
 
-/// Returns what a phrase's rows are made from, as its item names it: its content, and the version of what is
-/// written for a beat list.
+/// Returns what a phrase's rows are made from, as its item names it: its content, and the versions of what is
+/// written for a beat list and a motion capture.
 fn input_hash(planned: &Planned, content_hash: &str) -> String {
-    match beats_line(planned) {
-        Some(line) => digest(format!("{content_hash}\n{line}").as_bytes()),
-        None => content_hash.to_owned(),
+    match version_lines(planned) {
+        lines if lines.is_empty() => content_hash.to_owned(),
+        lines => digest(format!("{content_hash}\n{lines}").as_bytes()),
     }
 }
 
-/// Returns a line that only phrases with a beat list have.
-fn beats_line(planned: &Planned) -> Option<String> {
-    let has_list = planned.files.iter().any(|(role, _)| *role == Role::Beats);
-    has_list.then(|| format!("beats version {BEATS_VERSION}\n"))
+/// Returns lines that only phrases with a beat list or a motion capture have.
+fn version_lines(planned: &Planned) -> String {
+    let has = |wanted| planned.files.iter().any(|(role, _)| *role == wanted);
+    let mut lines = String::new();
+    if has(Role::Beats) {
+        lines += &format!("beats version {BEATS_VERSION}\n");
+    }
+    if has(Role::MotionBvh) {
+        lines += &format!("capture version {CAPTURE_VERSION}\n");
+    }
+    lines
 }
 
 /// Returns what the storage says of a phrase's files, without reading them.
@@ -398,8 +413,8 @@ pub fn fingerprint(planned: &Planned) -> String {
         .map(|(role, file)| format!("{} {} {}\n", role.name(), file.path, file.fingerprint))
         .collect();
     let problem = planned.problem.as_ref().map_or("", |p| p.message.as_str());
-    let beats = beats_line(planned).unwrap_or_default();
-    digest(format!("{lines}{beats}{problem}").as_bytes())[..32].to_owned()
+    let versions = version_lines(planned);
+    digest(format!("{lines}{versions}{problem}").as_bytes())[..32].to_owned()
 }
 
 fn gone(file: &SourceFile) -> Result<Content, StoreError> {

@@ -2,6 +2,7 @@
 
 mod batch;
 mod layout;
+mod motion;
 mod phrase;
 
 use std::collections::BTreeSet;
@@ -16,12 +17,13 @@ use crate::store::{
     Cache, Ledger, Location, Row as _, Shard, Source, StoreError, StoreSnapshot, checkpoint, digest,
 };
 
-use super::failure::{Failure, failures_json, write_failures};
+use super::failure::{Failure, failures_json, write_failures, write_notes};
 use super::seen::Seen;
 pub(in crate::stages) use layout::is_audio;
 pub use layout::{Layout, Plan, Planned, Role, plan};
+pub(in crate::stages) use motion::{notes_of, read_bvh, read_trajectory};
+pub(in crate::stages) use phrase::read_beats;
 pub use phrase::{Rules, content_hash_of_audio};
-pub(in crate::stages) use phrase::{read_beats, read_bvh, read_trajectory};
 
 /// Raised when ingest writes something else for the same input and rules.
 const OUTPUT_VERSION: u32 = 1;
@@ -29,6 +31,8 @@ const OUTPUT_VERSION: u32 = 1;
 const BEATS_VERSION: u32 = 2;
 /// The name under which phrases are committed that were seen again with nothing new.
 const SEEN: &str = "ingest-seen";
+/// Raised when ingest writes something else for a motion capture, and for no other phrase.
+const CAPTURE_VERSION: u32 = 2;
 
 /// The stage.
 pub struct Ingest;
@@ -168,6 +172,7 @@ impl Stage for Ingest {
             progress.finish();
         }
         report.tally.failed.sort_by(|a, b| a.id.cmp(&b.id));
+        report.tally.noted.sort();
         report.took_s = started.elapsed().as_secs_f64();
         Ok(Box::new(report))
     }
@@ -241,6 +246,8 @@ struct Tally {
     failed: Vec<Refused>,
     /// Whether batches are left because the user asked for an end.
     is_stopped: bool,
+    /// Captures of which a reader should know something, and what.
+    noted: Vec<(String, String)>,
 }
 
 /// A phrase that failed, for the summary.
@@ -258,6 +265,7 @@ impl Tally {
         self.duration_s += other.duration_s;
         self.failed.extend(other.failed);
         self.is_stopped |= other.is_stopped;
+        self.noted.extend(other.noted);
     }
 }
 
@@ -303,6 +311,13 @@ impl Summary for Report {
             let n = self.ignored.len();
             writeln!(out, "  {n} files belong to no phrase and were left alone, such as {first}")?;
         }
+        let all = format!(
+            "motiongen query --store {} \"select phrase_id, motion_notes from phrases where motion_notes is \
+             not null\"",
+            self.store
+        );
+        let noted = tally.noted.iter().map(|(id, note)| (format!("phrase {id}"), note.as_str()));
+        write_notes(out, noted, Some(&all))?;
         let failed =
             tally.failed.iter().map(|refused| (format!("phrase {}", refused.id), &refused.failure));
         write_failures(out, failed, (!self.dry_run).then_some(&self.store))

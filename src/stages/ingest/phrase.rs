@@ -2,15 +2,11 @@
 
 use std::io::{Read as _, Seek as _};
 
-use ndarray::Array2;
-
 use super::layout::Role;
+use super::motion::{read_bvh, read_trajectory};
 use crate::audio::header::{AudioHeader, AudioHeaderError, read_header, read_header_from};
-use crate::motion::npy::{self, NpyError};
-use crate::motion::{
-    Beats, BeatsPerBarSource, Bvh, BvhError, CaptureError, ChannelLimits, Trajectory,
-    TrajectoryError, convert_bvh,
-};
+use crate::motion::text::text_of;
+use crate::motion::{Axis, Beats, BeatsPerBarSource, CaptureAccount, ChannelLimits, Trajectory};
 use crate::stages::beats::{self, BeatSource};
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::feature_file::read_features;
@@ -30,6 +26,11 @@ pub struct Rules {
     /// Frames by which the lengths of motion, features and audio may differ.
     #[arg(long, value_name = "FRAMES", default_value_t = 1)]
     pub length_tolerance_frames: u32,
+    /// The axis that is up in motion captures [default: found, by the skeleton and its poses].
+    #[arg(long, value_enum, value_name = "AXIS", allow_hyphen_values = true)]
+    // Without it the rules are those of before: nothing is read again for it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub up: Option<Axis>,
 }
 
 /// A phrase that passed every check.
@@ -40,6 +41,8 @@ pub struct Phrase {
     pub song_hash: Option<String>,
     pub motion: Option<Trajectory>,
     pub motion_format: Option<&'static str>,
+    /// Of a motion capture, what was found out about it.
+    pub capture: Option<CaptureAccount>,
     pub n_feature_frames: Option<usize>,
     pub audio: Option<AudioHeader>,
     pub tempo: Option<Tempo>,
@@ -122,6 +125,7 @@ impl Files {
             song_hash: self.song_hash,
             motion: None,
             motion_format: None,
+            capture: None,
             n_feature_frames: None,
             audio: None,
             tempo: None,
@@ -155,7 +159,9 @@ impl Files {
                     let (format, motion) = if role == Role::MotionNpy {
                         ("npy", read_trajectory(path, &bytes)?)
                     } else {
-                        ("bvh", read_bvh(path, &bytes, phrase.beats.as_ref())?)
+                        let capture = read_bvh(path, &bytes, phrase.beats.as_ref(), rules.up)?;
+                        phrase.capture = Some(capture.account);
+                        ("bvh", capture.trajectory)
                     };
                     motion.check(&rules.limits).map_err(|e| Failure::of(path, e.kind(), &e))?;
                     phrase.motion = Some(motion);
@@ -251,7 +257,8 @@ pub(in crate::stages) fn read_beats(path: &str, bytes: &[u8]) -> Result<Beats, F
         let message = format!("{path} is empty; write one beat time in seconds per line");
         return Err(Failure::new(FailureKind::EmptyFile, path, message));
     }
-    let text = std::str::from_utf8(bytes)
+    let (text, _) = text_of(bytes);
+    let text = std::str::from_utf8(&text)
         .map_err(|_| refuse(&"is not UTF-8 text; write one beat time in seconds per line"))?;
     Beats::parse(text).map_err(|e| refuse(&e))
 }
@@ -263,42 +270,4 @@ fn tempo_of(list: &Beats) -> Tempo {
     };
     let beats_per_bar = Some((list.beats_per_bar(), source));
     Tempo { bpm: list.tempo_bpm(), source: BeatSource::BeatsFile.name(), beats_per_bar }
-}
-
-/// Reads a `trajectory.npy`; its values are not looked at.
-///
-/// # Errors
-/// A [`Failure`] that names the file.
-pub(in crate::stages) fn read_trajectory(path: &str, bytes: &[u8]) -> Result<Trajectory, Failure> {
-    let array = npy::read_f32(bytes).map_err(|e: NpyError| Failure::of(path, e.kind(), &e))?;
-    let shape_failure = || {
-        let hint =
-            if array.shape.len() == 2 && array.shape[0] == 25 { "; transpose it" } else { "" };
-        let message = format!("{path} has shape {:?}, expected [frames, 25]{hint}", array.shape);
-        Failure::new(FailureKind::Shape, path, message)
-    };
-    let &[n_frames, n_channels] = array.shape.as_slice() else { return Err(shape_failure()) };
-    if n_frames == 0 || n_channels != crate::motion::MOTION_DIM {
-        return Err(shape_failure());
-    }
-    let frames = Array2::from_shape_vec((n_frames, n_channels), array.values)
-        .map_err(|e| Failure::new(FailureKind::Shape, path, e))?;
-    Trajectory::new(frames).map_err(|e: TrajectoryError| Failure::of(path, e.kind(), &e))
-}
-
-/// Reads a motion capture; beat times give the phase.
-///
-/// # Errors
-/// A [`Failure`] that names the file.
-pub(in crate::stages) fn read_bvh(
-    path: &str,
-    bytes: &[u8],
-    beats: Option<&Beats>,
-) -> Result<Trajectory, Failure> {
-    if bytes.is_empty() {
-        let message = format!("{path} is empty; export the capture again");
-        return Err(Failure::new(FailureKind::EmptyFile, path, message));
-    }
-    let bvh = Bvh::parse(bytes).map_err(|e: BvhError| Failure::of(path, "bvh_format", &e))?;
-    convert_bvh(&bvh, beats).map_err(|e: CaptureError| Failure::of(path, "bvh_format", &e))
 }

@@ -8,9 +8,9 @@ use ndarray::Array2;
 
 use super::Known;
 use crate::motion::choreography::{PrimitiveError, Repertoire};
-use crate::motion::{ChannelLimits, Trajectory};
+use crate::motion::{Axis, ChannelLimits, Trajectory};
 use crate::stages::failure::{Failure, FailureKind, guarded};
-use crate::stages::ingest::{read_bvh, read_trajectory};
+use crate::stages::ingest::{notes_of, read_bvh, read_trajectory};
 use crate::store::{
     Content, Listing, Source, SourceFile, SourceProblemKind, StoreError, StoreSnapshot, digest,
     tables,
@@ -20,6 +20,8 @@ use crate::store::{
 const MOTION_EXTENSIONS: [&str; 2] = ["bvh", "npy"];
 /// Largest motion file that is read, in bytes.
 const MAX_FILE_BYTES: u64 = 1 << 30;
+/// Raised when a capture is read in another way.
+const READING_VERSION: u32 = 2;
 
 /// Captures that were found, not yet read.
 pub struct Captures {
@@ -32,14 +34,12 @@ pub struct Captures {
 
 enum Place {
     /// Phrases of the store, with the digests of their files.
-    Store {
-        place: StoreSnapshot,
-        ids: BTreeMap<String, String>,
-    },
+    Store { place: StoreSnapshot, ids: BTreeMap<String, String> },
     Folder {
         source: Source,
         files: Vec<SourceFile>,
         problems: Vec<(String, Failure)>,
+        up: Option<Axis>,
     },
 }
 
@@ -51,6 +51,8 @@ pub struct Loaded {
     pub content_hash: String,
     /// Those that failed, with their URLs.
     pub failed: Vec<(String, String, Failure)>,
+    /// What a reader should know of captures, with their names.
+    pub noted: Vec<(String, String)>,
 }
 
 impl Captures {
@@ -66,11 +68,12 @@ impl Captures {
         }
     }
 
-    /// Finds every `.bvh` and `.npy` file below a folder.
+    /// Finds every `.bvh` and `.npy` file below a folder. `up` is the axis that is up in captures, none to
+    /// find it.
     ///
     /// # Errors
     /// [`StoreError`] when the folder cannot be listed.
-    pub fn of_folder(source: Source) -> Result<Self, StoreError> {
+    pub fn of_folder(source: Source, up: Option<Axis>) -> Result<Self, StoreError> {
         let Listing { files, problems, .. } = source.list()?;
         let is_motion = |path: &str| {
             let name = path.rsplit('/').next().unwrap_or(path);
@@ -94,12 +97,13 @@ impl Captures {
             let message = format!("{} {}", p.path, p.message);
             (p.path.clone(), Failure::new(kind, &p.path, message))
         });
-        let lines: String =
+        let mut lines: String =
             files.iter().map(|f| format!("{} {}\n", f.fingerprint, f.path)).collect();
+        lines += &reading_line(&files, up);
         Ok(Self {
             origin: source.location().url().to_owned(),
             fingerprint: digest(lines.as_bytes()),
-            place: Place::Folder { problems: problems.collect(), files, source },
+            place: Place::Folder { problems: problems.collect(), files, source, up },
         })
     }
 
@@ -144,7 +148,7 @@ impl Captures {
                 }
                 Ok(reading.finish(self.fingerprint))
             }
-            Place::Folder { source, files, problems } => {
+            Place::Folder { source, files, problems, up } => {
                 if files.is_empty() && problems.is_empty() {
                     bail!(
                         "captures folder {}: no .bvh or .npy file anywhere below it; name the folder \
@@ -153,15 +157,17 @@ impl Captures {
                     );
                 }
                 let mut reading = Reading::default();
-                let mut hashes = String::new();
+                let mut hashes = reading_line(&files, up);
                 let contents = source.read_in_order(files.clone());
                 for (file, (content, _permit)) in files.iter().zip(contents) {
                     let path = file.path.as_str();
                     let added = bytes_of(file, content).and_then(|bytes| {
                         hashes += &format!("{} {path}\n", digest(&bytes));
                         guarded(path, || {
-                            let motion = read(path, &bytes)?;
-                            reading.add(path, motion)
+                            let (motion, notes) = read(path, &bytes, up)?;
+                            reading.add(path, motion)?;
+                            reading.noted.extend(notes.map(|notes| (path.to_owned(), notes)));
+                            Ok(())
                         })
                     });
                     reading.settle(path, &source.location().url_of(path), added);
@@ -180,6 +186,7 @@ impl Captures {
 struct Reading {
     repertoire: Repertoire,
     failed: Vec<(String, String, Failure)>,
+    noted: Vec<(String, String)>,
 }
 
 impl Reading {
@@ -202,7 +209,8 @@ impl Reading {
     }
 
     fn finish(self, content_hash: String) -> Loaded {
-        Loaded { repertoire: self.repertoire, content_hash, failed: self.failed }
+        let Self { repertoire, failed, noted } = self;
+        Loaded { repertoire, content_hash, failed, noted }
     }
 }
 
@@ -229,7 +237,28 @@ fn bytes_of(
     }
 }
 
-fn read(path: &str, bytes: &[u8]) -> Result<Trajectory, Failure> {
-    let is_bvh = path.rsplit_once('.').is_some_and(|(_, e)| e.eq_ignore_ascii_case("bvh"));
-    if is_bvh { read_bvh(path, bytes, None) } else { read_trajectory(path, bytes) }
+/// One line of what the digest of captures is made from; none where all are trajectories.
+fn reading_line(files: &[SourceFile], up: Option<Axis>) -> String {
+    if !files.iter().any(|file| is_bvh(&file.path)) {
+        return String::new();
+    }
+    format!("reading version {READING_VERSION}, up {}\n", up.map_or("found", Axis::name))
+}
+
+fn is_bvh(path: &str) -> bool {
+    path.rsplit_once('.').is_some_and(|(_, extension)| extension.eq_ignore_ascii_case("bvh"))
+}
+
+/// Reads a capture, and what a reader should know of it.
+fn read(
+    path: &str,
+    bytes: &[u8],
+    up: Option<Axis>,
+) -> Result<(Trajectory, Option<String>), Failure> {
+    if !is_bvh(path) {
+        return Ok((read_trajectory(path, bytes)?, None));
+    }
+    let capture = read_bvh(path, bytes, None, up)?;
+    let notes = notes_of(&capture.account);
+    Ok((capture.trajectory, notes))
 }

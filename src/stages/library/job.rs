@@ -116,6 +116,7 @@ impl Job<'_> {
         }
         let failed = loaded.failed.iter().map(|(name, _, f)| (name.clone(), f.clone()));
         report.tally.failed.extend(failed);
+        report.tally.noted.clone_from(&loaded.noted);
         report.tally.n_captures = loaded.repertoire.n_captures();
         report.tally.n_primitives = loaded.repertoire.primitives().len();
         if !todo.is_empty() && loaded.repertoire.primitives().is_empty() {

@@ -20,6 +20,7 @@ use std::time::Instant;
 use super::failure::{Failure, FailureKind};
 use super::seen::Seen;
 use super::{ClientParams, Contract, LinkParams, Progress, Stage, Summary, all_threads};
+use crate::motion::Axis;
 use crate::store::{Location, Source, StoreError, StoreSnapshot, checkpoint, digest};
 use captures::Captures;
 use job::Job;
@@ -52,6 +53,9 @@ pub struct Params {
     /// Folder or bucket of motion captures: any tree of .bvh and .npy ([frames, 25]) files.
     #[arg(long, value_name = "DIR")]
     pub captures: Option<String>,
+    /// The axis that is up in motion captures of --captures [default: found, by skeletons and poses].
+    #[arg(long, value_enum, value_name = "AXIS", allow_hyphen_values = true)]
+    pub up: Option<Axis>,
     /// Compose so many songs, play them, and dance to them, too: 22 styles of 70 to 180 bpm, in bars of
     /// three and four, whose beats are known. They are all for training. --seed chooses others.
     #[arg(long, value_name = "N", default_value_t = 0)]
@@ -136,7 +140,7 @@ impl Stage for Library {
                 .map(|source| source.following_links(params.links.follow_links))
         };
         let captures = match &params.captures {
-            Some(url) => Captures::of_folder(open(url)?)?,
+            Some(url) => Captures::of_folder(open(url)?, params.up)?,
             None => Captures::of_store(&snapshot, &known),
         };
         let mut songs = match &params.songs {

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use super::songs::Song;
 use super::write::Written;
 use crate::stages::Summary;
-use crate::stages::failure::{Failure, failures_json, write_failures};
+use crate::stages::failure::{Failure, failures_json, write_failures, write_notes};
 
 /// What became of songs and captures.
 #[derive(Debug, Default)]
@@ -25,6 +25,8 @@ pub struct Tally {
     pub failed: Vec<(String, Failure)>,
     /// Whether songs are left because the user asked for an end.
     pub is_stopped: bool,
+    /// What a reader should know of captures, with their names.
+    pub noted: Vec<(String, String)>,
 }
 
 impl Tally {
@@ -107,6 +109,8 @@ impl Summary for Report {
         if let Some(output) = output {
             writeln!(out, "  files: {}", output.display())?;
         }
+        let noted = tally.noted.iter().map(|(name, note)| (name, note.as_str()));
+        write_notes(out, noted, None)?;
         write_failures(out, tally.failed.iter().map(|(name, why)| (name, why)), Some(store))
     }
 

@@ -19,7 +19,7 @@ Written:
   mocapbank_15fps.bvh                  the first 121 frames of mocapbank.bvh declared as 15 fps
   six_channels.bvh                     drawn: 60 fps, six channels on every joint in odd orders,
                                        a calibration pop after frame 3
-  short.bvh                            drawn: 13 frames at 16 fps, 5 units high, a root that keeps
+  short.bvh                            drawn: 13 frames at 16 fps, 5 units high (feet), a root that keeps
                                        its offset on the axes it has no channel for
   <case>.expected.npy                  [T, 25] float64, before rounding to single precision
   lowpass.npy                          [2, cases, n]: inputs and outputs of the low-pass
@@ -105,16 +105,49 @@ def angvel(q):
     return d[:, 1:] * np.where(s > 1e-9, a / np.maximum(s, 1e-12), 2.0)[:, None] * FPS
 
 
-# Reading: times [N], nodes [N, J, 3] in file units, root orientation [N, 4].
+# Reading: times [N], nodes [N, J, 3] in file units, root orientation [N, 4], body height in file units.
+
+
+def frame_time(text):
+    """The interval of the only usual rate that is written so, rounded or cut; else the number."""
+    value = float(text)
+    last = 10.0 ** -len(text.partition(".")[2])
+    if abs(round(1 / value) * value - 1) < 1e-12:
+        return value
+    usual = (r for r in range(1, 10001) if r % 5 == 0 or r % 12 == 0)
+    rates = [r for r in usual if value - 0.5 * last <= 1 / r <= value + last]
+    return 1 / rates[0] if len(rates) == 1 else value
+
+
+def body_height(names, parents, P):
+    """Along bones from ankles over the pelvis to the top of the head; else the greatest extent."""
+    bone = [0.0 if p < 0 else np.median(np.linalg.norm(P[:, j] - P[:, p], axis=1)) for j, p in enumerate(parents)]
+
+    def above(j):
+        return [] if j < 0 else [j] + above(parents[j])
+
+    heads = [j for j, n in enumerate(names) if "head" in n]
+    feet = [j for j, n in enumerate(names) if "foot" in n]
+    feet = [j for j in feet if not set(above(parents[j])) & set(feet)]
+    if heads and feet:
+        head = heads[0]
+        ways = [sum(bone[j] for j in set(above(head)) ^ set(above(foot))) for foot in feet]
+        top = max(sum(bone[k] for k in above(j) if k not in above(head)) for j in range(len(names)) if head in above(j))
+        return float(np.mean(ways)) + top
+    extents = np.percentile((P.max(1) - P.min(1)).max(1), 90)
+    ends = [j for j in range(len(names)) if j not in parents] + [0]
+    longest = max(sum(bone[k] for k in set(above(a)) ^ set(above(b))) for a in ends for b in ends)
+    return float(max(extents, 0.62 * longest))
 
 
 def read_bvh(path):
     tok = path.read_text(errors="replace").split()
-    parents, offs, chans, stack = [], [], [], []
+    names, parents, offs, chans, stack = [], [], [], [], []
     i = 0
     while tok[i] != "MOTION":
         t = tok[i]
         if t in ("ROOT", "JOINT", "End"):
+            names.append("" if t == "End" else tok[i + 1].lower())
             parents.append(stack[-1] if stack else -1)
             offs.append([0, 0, 0])
             chans.append([])
@@ -137,7 +170,7 @@ def read_bvh(path):
             i += 1
     assert tok[i + 1] == "Frames:"
     n = int(tok[i + 2])
-    dt = float(tok[i + 5])
+    dt = frame_time(tok[i + 5])
     i += 6
     nch = sum(map(len, chans))
     data = np.array(tok[i : i + n * nch], float).reshape(n, nch)
@@ -160,22 +193,23 @@ def read_bvh(path):
         else:
             P[:, j] = P[:, parent] + qrot(Q[:, parent], pos)
             Q[:, j] = qmul(Q[:, parent], q)
+    height = body_height(names, parents, P)
     start = 0
     if n > 20:
         jump = np.linalg.norm(np.diff(P, axis=0), axis=2).max(1)
         k = max(2, int(min(1.0 / dt, n * 0.1)))
-        big = np.nonzero(jump[:k] > 15 * np.median(jump) + 1e-9)[0]
+        near = np.maximum(np.r_[0, jump[:-1]], np.r_[jump[1:], 0])
+        is_pop = (jump > max(15 * np.median(jump), 6 * height * dt)) & (jump > 3 * near)
+        big = np.nonzero(is_pop[:k])[0]
         if len(big):
             start = int(big[-1]) + 1
-    return np.arange(start, n) * dt - start * dt, P[start:], Q[start:, 0], start
+    return np.arange(start, n) * dt - start * dt, P[start:], Q[start:, 0], start, height
 
 
-def unit_scale(J):
-    h = float(np.percentile(J[..., 1], 99) - np.percentile(J[..., 1], 1))
-    for s in (1.0, 0.0254 / 0.45, 0.0254, 0.01, 0.001):
-        if 1.2 <= h * s <= 2.6:
-            return s
-    return 1.7 / h
+def unit_scale(height):
+    units = [(0.01, 0.15), (1.0, 0.15), (0.0254, 0), (0.001, 0), (0.3048, 0), (0.0254 / 0.45, 0)]
+    found = [(abs(np.log(height * u / 1.65)) - bonus, u) for u, bonus in units if 0.9 <= height * u <= 2.4]
+    return min(found)[1] if found else 1.7 / height
 
 
 # Filtering, resampling, style, phase.
@@ -258,8 +292,9 @@ def bar_phase(tt, beats, beats_per_bar):
 
 
 def convert(path, beats=None, beats_per_bar=4, root_only=False):
-    t, J, q, start = read_bvh(path)
-    J = J * unit_scale(J)
+    t, J, q, start, height = read_bvh(path)
+    scale = unit_scale(height)
+    J = J * scale
     fs = 1 / np.median(np.diff(t))
     q = qcont(qnorm(q))
     cut = 8.0 if fs > FPS * 1.05 else min(8.0, 0.4 * fs)
@@ -279,7 +314,7 @@ def convert(path, beats=None, beats_per_bar=4, root_only=False):
     JJ = resample(t, J.reshape(len(J), -1), tk).reshape(T, J.shape[1], 3)
     S = style8(P, V, A, Q, None if root_only else JJ)
     phase = np.zeros(T) if beats is None else bar_phase(tk, beats, beats_per_bar)
-    print(f"{path.name}: {len(t)} at {fs:.3f} fps, {start} dropped, cutoff {cut:g} Hz -> {T}")
+    print(f"{path.name}: {len(t)} at {fs:.3f} fps, {start} dropped, {height * scale:.2f} m in {scale:g} m, cutoff {cut:g} Hz -> {T}")
     return np.hstack([P, V, A, Q, W, phase[:, None], S])
 
 

@@ -51,7 +51,9 @@ pub fn read(path: &Path) -> Result<(Array2<f32>, FileContent), Failure> {
     let (frames, content) = match Format::of(path) {
         Some(Format::Npy) => of_npy(&place, &bytes)?,
         Some(Format::Csv) => (of_csv(&place, bytes)?, FileContent::Channels),
-        Some(Format::Bvh) => (read_bvh(&place, &bytes, None)?.into_array(), FileContent::Capture),
+        Some(Format::Bvh) => {
+            (read_bvh(&place, &bytes, None, None)?.trajectory.into_array(), FileContent::Capture)
+        }
         Some(Format::Parquet) => of_parquet(&place, bytes)?,
         None => {
             let message =

@@ -191,7 +191,8 @@ fn a_capture_is_read_as_ingest_reads_it() {
     exchange::write_bvh(frames.view(), &mut bytes).expect("memory");
     bench.put("a.bvh", &bytes);
     let motion = bench.only().expect("a motion");
-    let ingested = crate::stages::ingest::read_bvh("a.bvh", &bytes, None).expect("a capture");
+    let ingested =
+        crate::stages::ingest::read_bvh("a.bvh", &bytes, None, None).expect("a capture").trajectory;
     assert_eq!(motion.frames, ingested.into_array());
     assert_eq!((motion.content, motion.has_phase), (FileContent::Capture, false));
     assert!(motion.frames.column(16).iter().all(|phase| *phase == 0.0));
