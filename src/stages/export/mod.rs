@@ -239,7 +239,7 @@ fn record(store: &Location, params: &Params, files: &Files, held: &Held) -> Resu
 #[cfg(all(test, feature = "pretrained"))]
 mod tests {
     use super::*;
-    use crate::generation::ModelCard;
+    use crate::generation::{ModelCard, ModelFileName};
     use crate::stages::pretrained;
     use crate::store::ClientOptions;
 
@@ -250,7 +250,11 @@ mod tests {
         let card = pretrained::file(file_names::CARD).expect("the model that ships");
         let card = ModelCard::read(&card, "card").expect("a card");
         let text = |name: &str| format!("{name} of {version}").into();
-        let bytes = NAMES.iter().map(|name| ((*name).to_owned(), text(name))).collect();
+        let named = |name: &&str| {
+            let file = ModelFileName::of_name(name).expect("a file of a model");
+            (file, text(name))
+        };
+        let bytes = NAMES.iter().map(named).collect();
         Files { card, card_text: text(file_names::CARD), bytes }
     }
 
