@@ -341,7 +341,11 @@ fn a_store_that_refuses_ends_the_run_with_its_place_and_what_to_set() {
         assert!(output.stderr.contains(&end), "{}", output.stderr);
 
         let output = job.query("tables", &["select count(*) from phrases"]);
-        assert_eq!(output.code, 0, "reading is not refused: {output:?}");
+        // Reading is not refused, but nothing was ever committed.
+        let expected = format!(
+            "error: {url}: holds no store (it has no commits); check --store, or fill it with motiongen ingest\n"
+        );
+        assert_eq!((output.code, output.stderr), (2, expected));
     }
 }
 

@@ -269,7 +269,7 @@ fn a_phrase_without_features_is_told_why() {
 fn values_come_from_the_environment_and_from_tables_for_the_stage_and_the_kind() {
     let dir = Dir::new();
     let picture = text(&dir.at("a.png"));
-    let config = "width = 900\nquiet = true\nmax-workers = 3\n[ingest]\nlimits = 3\n[plot]\n\
+    let config = "width = 900\nquiet = true\nmax-retries = 3\n[ingest]\nlimits = 3\n[plot]\n\
                   panel = [\"rms\", \"mfcc\"]\nstart = 1\n[plot.features]\nwidth = 400\n";
     let config = text(&dir.write("all.toml", config));
     let command = |flags: &[&str]| {

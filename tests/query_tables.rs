@@ -205,8 +205,9 @@ fn tables_counts_rows_bytes_and_parts_of_what_is_live() {
             let live = live_files(&store, name);
             let n_bytes: u64 = live.iter().sum();
             let version = match name {
-                "phrases" => 3,
-                "beats" | "generations" | "sanity_checks" => 2,
+                "phrases" => 4,
+                "generations" => 3,
+                "beats" | "extractions" | "sanity_checks" => 2,
                 _ => 1,
             };
             let n_parts = live.len();
@@ -325,15 +326,15 @@ fn an_empty_store_has_every_table_without_rows() {
     assert_eq!((output.code, output.stdout.as_str()), (0, "[]\n"), "{}", output.stderr);
     let expected = "\
 table                    rows          bytes   parts  version
-phrases                     0              0       0        3
+phrases                     0              0       0        4
 motion                      0              0       0        1
 features                    0              0       0        1
-extractions                 0              0       0        1
+extractions                 0              0       0        2
 beats                       0              0       0        2
 failures                    0              0       0        1
 training_log                0              0       0        1
 onnx_checks                 0              0       0        1
-generations                 0              0       0        2
+generations                 0              0       0        3
 generated                   0              0       0        1
 decoded                     0              0       0        1
 sanity_checks               0              0       0        2
@@ -460,7 +461,7 @@ fn a_statement_that_would_change_a_table_is_refused() {
         (" DROP table phrases", "drop"),
         ("create table x as select * from phrases", "create"),
         ("/* x */ drop table phrases", "drop"),
-        ("-- x\ntruncate phrases", "truncate"),
+        (" -- x\ntruncate phrases", "truncate"),
         ("copy phrases to 'x'", "copy"),
         ("merge into phrases using beats on true", "merge"),
     ] {
@@ -559,8 +560,7 @@ fn computed_columns_have_the_names_that_they_are_asked_by() {
     let expected = "has_audio,count(*),max(n_frames) + 1,s\nfalse,3,60,129\ntrue,2,32,48\n";
     assert_eq!(csv(&store, sql), expected);
     let sql = "select lower(phrase_id), power(2, 10), sqrt(4) from phrases order by lower(phrase_id) limit 1";
-    let expected =
-        "lower(phrase_id),\"power(2, 10)\",sqrt(4)\n\"a/ü, \"\"quoted\"\"\",1024.0,2.0\n";
+    let expected = "lower(phrase_id),\"power(2, 10)\",sqrt(4)\n\"a/ü, \"\"quoted\"\"\",1024,2.0\n";
     assert_eq!(csv(&store, sql), expected);
     // Whoever asks for one column twice is told what to do.
     let sql = "select phrase_id, n_frames as phrase_id from phrases";
@@ -621,7 +621,7 @@ fn tables_and_columns_can_be_asked_for() {
     let text = csv(&store, "describe failures");
     let mut lines = text.lines();
     assert_eq!(lines.next(), Some("name,type,nullable,unit,description"));
-    assert!(lines.next().is_some_and(|line| line.starts_with("stage,utf8,false,,")), "{text}");
+    assert!(lines.next().is_some_and(|line| line.starts_with("stage,utf8,false,\"\",")), "{text}");
     assert_eq!(lines.count(), 5);
     assert_eq!(csv(&store, "show columns from Failures"), text);
     assert_eq!(csv(&store, "desc failures;"), text);
@@ -667,7 +667,10 @@ fn rows_are_written_while_they_are_read() {
         let answer = query(&store, sql, &options).expect("a plan");
         let mut out = Until { n_left, n_written: 0 };
         let error = answer.write(format, &mut out).expect_err("the reader has gone");
-        assert_eq!(error.kind(), std::io::ErrorKind::BrokenPipe, "{error}");
+        // The writer of Parquet wraps what its output says.
+        let is_broken = error.kind() == std::io::ErrorKind::BrokenPipe
+            || (format == DataFormat::Parquet && error.to_string().contains("broken pipe"));
+        assert!(is_broken, "{format:?}: {error}");
         assert!(out.n_written > n_left / 3, "{format:?}: {}", out.n_written);
     }
     let answer = query(&store, "select frame from motion", &options).expect("a plan");
