@@ -11,7 +11,7 @@ const RATES_HZ: [u32; 2] = [5, 12];
 /// interval; else the number as it is. `0.0333667` (29.97 Hz) and `0.01` stay what they are.
 pub fn frame_time_of(written: &str, value_s: f64) -> f64 {
     let half_unit_s = half_of_last_place(written);
-    if !(value_s > half_unit_s) || is_whole_rate(value_s) {
+    if value_s <= half_unit_s || is_whole_rate(value_s) {
         return value_s;
     }
     let lowest = (1.0 / (value_s + 2.0 * half_unit_s)).ceil().max(1.0) as u32;

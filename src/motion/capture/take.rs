@@ -221,10 +221,9 @@ fn turned(body: &Body, world: &Positions, up: Axis, unit_m: f64) -> Vec<Vec<f64>
     let columns = AXES.map(|axis| rotate(to_y, axis).map(f64::round));
     let mut nodes = Vec::with_capacity(3 * body.nodes.len());
     for &node in &body.nodes {
-        for axis in 0..3 {
-            let n_frames = world[3 * node].len();
-            let of =
-                |t: usize| (0..3).map(|c| columns[c][axis] * world[3 * node + c][t]).sum::<f64>();
+        let n_frames = world[3 * node].len();
+        for weights in (0..3).map(|axis| columns.map(|column| column[axis])) {
+            let of = |t: usize| (0..3).map(|c| weights[c] * world[3 * node + c][t]).sum::<f64>();
             nodes.push((0..n_frames).map(|t| of(t) * unit_m).collect());
         }
     }
