@@ -31,7 +31,7 @@ impl FilterFrames {
                     let tap = if is_transposed { taps - 1 - j } else { j };
                     for c in 0..channels {
                         let h = kernel[c * taps + tap];
-                        y[t * channels + c] = y[t * channels + c] + h * x[from * channels + c];
+                        y[t * channels + c] += h * x[from * channels + c];
                     }
                 }
             }
