@@ -11,7 +11,7 @@ CONFIG  ?= pipelines/demo.toml
 RUN     := pretrained
 LICENCE := MIT OR Apache-2.0; learned from the music and captures listed in LICENSES.md
 # A model is chosen on its validation songs, so that more steps than it needs do no harm.
-TRAIN   := --steps 4000 --decoder-steps 2000
+TRAIN   := --steps 6000 --decoder-steps 2000
 INTO    ?= models/pretrained
 
 .DEFAULT_GOAL := pretrained
@@ -30,6 +30,7 @@ pretrained:
 	$(MOTIONGEN) generate --store $(STORE) --model $(RUN) --samples 8 --overlap 30
 	$(MOTIONGEN) evaluate --store $(STORE) --run $(RUN) --report $(OUT)/report.html
 	mkdir -p $(INTO)
-	cp $(STORE)/models/$(RUN)/* $(INTO)/
+	folder=$(STORE)/models/$(RUN); version=$$(sed -n "s/.*\"folder\": *\"\([0-9a-f]*\)\".*/\1/p" $$folder/current.json 2> /dev/null || true); \
+	  cp $$folder/$$version/unet.onnx $$folder/$$version/decoder.onnx $$folder/$$version/model.json $(INTO)/
 	@echo "model   $(INTO)"
 	@echo "report  $(OUT)/report.html"
