@@ -384,7 +384,7 @@ fn an_unknown_column_comes_with_the_nearest_ones() {
     let store = dir.at("store");
     let of_phrases = columns_of(&PhraseRow::schema());
     let tempo = format!(
-        "column \"tempo_bmp\" not found; nearest: tempo_bpm, tempo_source, motion_bytes; {of_phrases}"
+        "column \"tempo_bmp\" not found; nearest: tempo_bpm, tempo_source, motion_up; {of_phrases}"
     );
     let wherever = [
         "select tempo_bmp from phrases",
