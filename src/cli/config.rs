@@ -177,7 +177,8 @@ impl File<'_> {
 
     /// Makes values the defaults of `command` and of the kind of it that was chosen.
     ///
-    /// `shared` are values for whoever knows them; those of the command's own table win over them.
+    /// `shared` are values of the file that any command may use if it has such a flag; values of the command's own
+    /// table take precedence.
     fn configure(
         &self,
         mut command: Command,

@@ -134,7 +134,7 @@ pub struct ModelCard {
 pub struct SamplingDefaults {
     /// With which the motion that is locked to the bar is as large as that of real motion.
     pub guidance: f64,
-    /// Of the errors that the decoder leaves, by which post-processing weighs its channels.
+    /// Of the errors that the decoder's heads leave, by which its last layer and post-processing weigh its channels.
     pub fusion_variances: FusionVariances,
 }
 

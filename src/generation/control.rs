@@ -2,7 +2,7 @@
 
 use ndarray::{Array2, ArrayView2};
 
-use crate::motion::postprocess::Held;
+use crate::motion::postprocess::HeldPoses;
 use crate::motion::quaternion::{
     Quaternion, angular_velocity, dot, from_axis_angle, from_rotation_vector, make_sign_continuous,
     mul, normalize,
@@ -217,9 +217,9 @@ impl Constraints {
 
     /// Returns the poses that are asked for, which post-processing may leave as they are once motion is bent
     /// to them.
-    pub fn held(&self, n_frames: usize) -> Held {
+    pub fn held(&self, n_frames: usize) -> HeldPoses {
         let mut held =
-            Held { position: vec![[false; 3]; n_frames], orientation: vec![false; n_frames] };
+            HeldPoses { position: vec![[false; 3]; n_frames], orientation: vec![false; n_frames] };
         for (t, wanted) in self.in_range(0, n_frames) {
             match wanted {
                 Wanted::Value { channel, .. } if Channel::Position.range().contains(&channel) => {

@@ -26,7 +26,7 @@ use ndarray::{Array2, s};
 pub use config::{
     Coherence, Hemisphere, MAX_WINDOW_FRAMES, PostProcessConfig, PostProcessError, SavitzkyGolay,
 };
-pub use fusion::{Displacement, FusionFilters, Held};
+pub use fusion::{Displacement, FusionFilters, HeldPoses};
 pub use variances::{AxisVariances, FusionVariances};
 
 use super::channels::{Channel, MOTION_DIM};
@@ -53,7 +53,7 @@ const DERIVED: [Channel; 3] = [Channel::Velocity, Channel::Acceleration, Channel
 /// When there are other than 25 channels, another number of phases than frames, or the
 /// configuration does not pass [`PostProcessConfig::check`].
 pub fn process(config: &PostProcessConfig, frames: &mut Array2<f32>, phase: Option<&[f64]>) {
-    process_holding(config, frames, phase, &Held::default());
+    process_holding(config, frames, phase, &HeldPoses::default());
 }
 
 /// Processes motion as [`process`] does, with some poses held where [`Coherence::Fuse`] moves others;
@@ -68,7 +68,7 @@ pub fn process_holding(
     config: &PostProcessConfig,
     frames: &mut Array2<f32>,
     phase: Option<&[f64]>,
-    held: &Held,
+    held: &HeldPoses,
 ) -> Option<Displacement> {
     assert_eq!(frames.ncols(), MOTION_DIM, "channels of motion");
     if config.clamp_values {
@@ -107,7 +107,7 @@ pub fn process_holding(
 }
 
 /// Puts the poses that agree best with all that was decoded in the place of the decoded ones.
-fn fuse(config: &PostProcessConfig, frames: &mut Array2<f32>, held: &Held) -> Displacement {
+fn fuse(config: &PostProcessConfig, frames: &mut Array2<f32>, held: &HeldPoses) -> Displacement {
     let variances = config.fusion_variances.unwrap_or_default();
     let measured = Measured::of(frames.view());
     let shifts_m = measured.shifts(&variances, held);

@@ -48,12 +48,12 @@ struct Holder {
 /// The right to write something, until it is dropped.
 #[derive(Debug)]
 pub struct Lease {
-    held: Arc<Held>,
+    held: Arc<HeldLease>,
     thread: Option<std::thread::JoinHandle<()>>,
 }
 
 #[derive(Debug)]
-struct Held {
+struct HeldLease {
     store: Location,
     name: String,
     holder: Holder,
@@ -132,7 +132,7 @@ impl Lease {
         let state = Mutex::new(State { number, is_lost: false, is_ended: false });
         let (store, name) = (store.clone(), name.to_owned());
         let changed = Condvar::new();
-        let held = Arc::new(Held { store, name, holder, lifetime, state, changed });
+        let held = Arc::new(HeldLease { store, name, holder, lifetime, state, changed });
         held.forget_old(number);
         let renewing = Arc::clone(&held);
         let thread = std::thread::Builder::new()
@@ -181,7 +181,7 @@ impl Drop for Lease {
     }
 }
 
-impl Held {
+impl HeldLease {
     fn lock(&self) -> std::sync::MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }

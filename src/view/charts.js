@@ -279,7 +279,8 @@ function drawDial(canvas, colors, phase, flash) {
   pen.fillText('bar', x, y + 12);
   pen.fillStyle = colors.ink;
   pen.font = '16px system-ui, sans-serif';
-  pen.fillText(Number.isFinite(phase) ? phase.toFixed(2) : '–', x, y - 5);
+  // Rounded down: a bar that is not over is not 1.00.
+  pen.fillText(Number.isFinite(phase) ? (Math.floor(phase * 100) / 100).toFixed(2) : '–', x, y - 5);
   if (Number.isFinite(phase)) {
     const angle = 2 * Math.PI * phase - Math.PI / 2;
     pen.strokeStyle = colors.trail;

@@ -3,7 +3,7 @@
 //!
 //! The heads of a decoder say each for itself where the body is, how fast it moves and how its speed changes. Here
 //! they are brought together as post-processing does it ([`crate::motion::postprocess`]), as filters over frames, so
-//! that whoever runs the network gets motion whose velocities are those of its positions.
+//! that the network's output has velocities that are the derivatives of its positions.
 
 use std::sync::Arc;
 

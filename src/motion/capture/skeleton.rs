@@ -284,11 +284,11 @@ impl Channels {
                 let x = bvh.frames();
                 let x = x.column(column).to_vec();
                 column += 1;
-                let of = match channel {
+                let greatest = match channel {
                     JointChannel::Position(_) => &mut found.position_range[i],
                     JointChannel::Rotation(_) => &mut found.rotation_range_deg[i],
                 };
-                *of = of.max(range(&[x]));
+                *greatest = greatest.max(range(&[x]));
             }
         }
         found
@@ -361,10 +361,10 @@ fn distance(a: Vector, b: Vector) -> f64 {
 
 /// Greatest range of any of the signals.
 fn range(signals: &[Vec<f64>]) -> f64 {
-    let of = |x: &Vec<f64>| {
+    let range_of_signal = |x: &Vec<f64>| {
         let (low, high) =
             x.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), &x| (l.min(x), h.max(x)));
         high - low
     };
-    signals.iter().map(of).fold(0.0, f64::max)
+    signals.iter().map(range_of_signal).fold(0.0, f64::max)
 }

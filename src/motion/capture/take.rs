@@ -223,8 +223,9 @@ fn turned(body: &Body, world: &Positions, up: Axis, unit_m: f64) -> Vec<Vec<f64>
     for &node in &body.nodes {
         let n_frames = world[3 * node].len();
         for weights in (0..3).map(|axis| columns.map(|column| column[axis])) {
-            let of = |t: usize| (0..3).map(|c| weights[c] * world[3 * node + c][t]).sum::<f64>();
-            nodes.push((0..n_frames).map(|t| of(t) * unit_m).collect());
+            let coordinate =
+                |t: usize| (0..3).map(|c| weights[c] * world[3 * node + c][t]).sum::<f64>();
+            nodes.push((0..n_frames).map(|t| coordinate(t) * unit_m).collect());
         }
     }
     nodes

@@ -29,7 +29,7 @@ use crate::units::FPS;
 
 /// Poses that fusion leaves as they are, such as those that constraints ask for.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Held {
+pub struct HeldPoses {
     /// Axes x, y, z by frame; frames past the last are free.
     pub position: Vec<[bool; 3]>,
     /// By frame; frames past the last are free.
@@ -86,14 +86,19 @@ pub(super) struct Measured {
 
 impl Measured {
     /// Returns how far fusion moves each position, m; 0 where it is held or not finite.
-    pub fn shifts(&self, variances: &FusionVariances, held: &Held) -> Vec<[f64; 3]> {
+    pub fn shifts(&self, variances: &FusionVariances, held: &HeldPoses) -> Vec<[f64; 3]> {
         let axes: [Vec<f64>; 3] =
             std::array::from_fn(|axis| self.position_solution(axis, variances, held).x);
         (0..self.position.len()).map(|t| std::array::from_fn(|axis| axes[axis][t])).collect()
     }
 
     /// Solves for the shifts of an axis; groups are position, velocity, acceleration.
-    fn position_solution(&self, axis: usize, variances: &FusionVariances, held: &Held) -> Solution {
+    fn position_solution(
+        &self,
+        axis: usize,
+        variances: &FusionVariances,
+        held: &HeldPoses,
+    ) -> Solution {
         let n = self.position.len();
         let p = |t: usize| self.position[t][axis];
         let mut equations = Vec::with_capacity(3 * n);
@@ -127,7 +132,7 @@ impl Measured {
     }
 
     /// Returns the orientations that fusion arrives at, on the side of what was decoded.
-    pub fn orientations(&self, variances: &FusionVariances, held: &Held) -> Vec<Quaternion> {
+    pub fn orientations(&self, variances: &FusionVariances, held: &HeldPoses) -> Vec<Quaternion> {
         let turning = Turning::new(self, held);
         let mut q = turning.q_hat.clone();
         turning.settle(&mut q, variances);
@@ -176,7 +181,7 @@ impl FusionFilters {
                 orientation: Vec::new(),
                 angular_velocity: Vec::new(),
             };
-            let shifts = measured.shifts(variances, &Held::default());
+            let shifts = measured.shifts(variances, &HeldPoses::default());
             Array2::from_shape_fn((3, 2 * m + 1), |(axis, j)| shifts[middle + m - j][axis])
         };
         // Rotation vectors are to angular velocities what positions are to velocities; nothing is known of their

@@ -2,7 +2,7 @@
 
 use ndarray::Array2;
 
-use super::fusion::{Displacement, Held, Measured};
+use super::fusion::{Displacement, HeldPoses, Measured};
 use super::variances::{AxisVariances, FusionVariances};
 use crate::motion::channels::MOTION_DIM;
 use crate::motion::kinematics::Poses;
@@ -11,7 +11,7 @@ use crate::motion::quaternion::{
 };
 use crate::units::FPS;
 
-pub const NONE: Held = Held { position: Vec::new(), orientation: Vec::new() };
+pub const NONE: HeldPoses = HeldPoses { position: Vec::new(), orientation: Vec::new() };
 
 /// Different on every group and axis.
 pub const VARIANCES: FusionVariances = FusionVariances {
@@ -116,7 +116,7 @@ pub fn frames(measured: &Measured) -> Array2<f32> {
     frames
 }
 
-pub fn fused(measured: &Measured, variances: &FusionVariances, held: &Held) -> Vec<[f64; 3]> {
+pub fn fused(measured: &Measured, variances: &FusionVariances, held: &HeldPoses) -> Vec<[f64; 3]> {
     let shifts = measured.shifts(variances, held);
     let sum = |(p, d): (&[f64; 3], &[f64; 3])| std::array::from_fn(|i| p[i] + d[i]);
     measured.position.iter().zip(&shifts).map(sum).collect()

@@ -98,13 +98,13 @@ impl FusionVariances {
     }
 
     fn from_groups(x: [f64; N_GROUPS]) -> Self {
-        let of = |i: usize| AxisVariances { horizontal: x[2 * i], vertical: x[2 * i + 1] };
+        let group = |i: usize| AxisVariances { horizontal: x[2 * i], vertical: x[2 * i + 1] };
         Self {
-            position_m2: of(0),
-            velocity_m2_s2: of(1),
-            acceleration_m2_s4: of(2),
-            orientation_rad2: of(3),
-            angular_velocity_rad2_s2: of(4),
+            position_m2: group(0),
+            velocity_m2_s2: group(1),
+            acceleration_m2_s4: group(2),
+            orientation_rad2: group(3),
+            angular_velocity_rad2_s2: group(4),
         }
     }
 }

@@ -281,9 +281,11 @@ impl Reader {
             self.altered.push((letter, alteration));
         }
         let tied = self.tied.iter().find(|(l, o, _)| (*l, *o) == (letter, octave));
-        let of = |list: &[(char, i32)]| list.iter().find(|(of, _)| *of == letter).map(|(_, a)| *a);
-        let alteration = of(&self.altered)
-            .or_else(|| of(&self.header.extra))
+        let alteration_in = |list: &[(char, i32)]| {
+            list.iter().find(|(altered, _)| *altered == letter).map(|(_, alteration)| *alteration)
+        };
+        let alteration = alteration_in(&self.altered)
+            .or_else(|| alteration_in(&self.header.extra))
             .unwrap_or_else(|| self.header.key.alteration(letter));
         let plain = 12 * (octave + 1) + class;
         let pitch = match tied {

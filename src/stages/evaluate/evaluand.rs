@@ -299,6 +299,8 @@ impl Evaluand {
                 let has_phase = self.phase_given && has_music;
                 let derived = |check: &str| match check {
                     "phase" | "phase_monotonic" => has_phase,
+                    // The decoder's turn rates are exact below a quarter turn a frame alone.
+                    "angular_velocity" => false,
                     check => self.decoder_derives && holds_by_derivation(check),
                 };
                 let raw = rows::checks(name, id, sample, MadeAt::Raw, &decoded.checks, &derived);

@@ -49,7 +49,7 @@ pub struct Checking<'a> {
 }
 
 /// What came of it.
-pub struct Held {
+pub struct CheckResults {
     pub rows: Vec<OnnxCheckRow>,
     pub runtime: String,
 }
@@ -83,7 +83,7 @@ impl Checking<'_> {
     ///
     /// # Errors
     /// When onnxruntime refuses a file, or there is no music to check with.
-    pub fn run(&self, runtime: &Runtime, progress: &dyn Progress) -> anyhow::Result<Held> {
+    pub fn run(&self, runtime: &Runtime, progress: &dyn Progress) -> anyhow::Result<CheckResults> {
         let machine = &self.params.machine;
         let folder = tempfile::tempdir().context("while making a temporary folder")?;
         for (name, bytes) in &self.files.bytes {
@@ -155,7 +155,7 @@ impl Checking<'_> {
         for row in &mut rows {
             row.runtime.clone_from(&build);
         }
-        Ok(Held { rows, runtime: build })
+        Ok(CheckResults { rows, runtime: build })
     }
 
     /// Reads weights out of the files, as the eager engine does.

@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use anyhow::{bail, ensure};
 
-use self::checks::{Checking, Held, eager};
+use self::checks::{CheckResults, Checking, eager};
 use self::files::Files;
 use self::report::{Planned, Report};
 use super::learned;
@@ -141,12 +141,12 @@ impl Stage for Export {
             trained: &trained,
             files: &files,
         };
-        let held = checking.run(&runtime, progress)?;
+        let results = checking.run(&runtime, progress)?;
         // From here on a signal is left until the model is whole.
         progress.is_interrupted();
-        record(&store, &params, &files, &held)?;
+        record(&store, &params, &files, &results)?;
         checkpoint(&store, &[Self::NAME]);
-        if let Some(failed) = held.rows.iter().find(|row| !row.passed) {
+        if let Some(failed) = results.rows.iter().find(|row| !row.passed) {
             bail!(
                 "model {} was not written: check {} on {} × {} frames differs by {:.2e}, {:.0e} is allowed; \
                  all checks are in the table onnx_checks",
@@ -160,7 +160,7 @@ impl Stage for Export {
         }
         lease.check()?;
         publish(&store, &params.model, &files)?;
-        Ok(Box::new(Report::written(&params, &store, &files, held)))
+        Ok(Box::new(Report::written(&params, &store, &files, results)))
     }
 }
 
@@ -222,14 +222,19 @@ fn publish(store: &Location, model: &str, files: &Files) -> Result<(), StoreErro
 }
 
 /// Writes the checks of a model into their table, in place of those of an earlier export.
-fn record(store: &Location, params: &Params, files: &Files, held: &Held) -> Result<(), StoreError> {
+fn record(
+    store: &Location,
+    params: &Params,
+    files: &Files,
+    results: &CheckResults,
+) -> Result<(), StoreError> {
     let ledger = Ledger::read(store, Export::NAME)?;
     let mut commit = Commit::new(store, Export::NAME, "", &params.run);
     let time = TimestampUs::now();
     let rows: Vec<OnnxCheckRow> =
-        held.rows.iter().map(|row| OnnxCheckRow { time, ..row.clone() }).collect();
+        results.rows.iter().map(|row| OnnxCheckRow { time, ..row.clone() }).collect();
     commit.part(OnnxCheckRow::schema().name, OnnxCheckRow::schema)?.write_rows(&rows)?;
-    let known = format!("{}\n{}", sha256(&files.card_text), held.runtime);
+    let known = format!("{}\n{}", sha256(&files.card_text), results.runtime);
     let input_hash = digest(known.as_bytes())[..32].to_owned();
     let id = params.model.clone();
     commit.settle(Item { id, fingerprint: input_hash.clone(), input_hash, failure: None }, &ledger);

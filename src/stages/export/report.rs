@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use serde_json::json;
 
 use super::Params;
-use super::checks::{Held, ROUNDING};
+use super::checks::{CheckResults, ROUNDING};
 use super::files::Files;
 use crate::generation::ModelCard;
 use crate::stages::Summary;
@@ -22,8 +22,17 @@ pub struct Report {
 }
 
 impl Report {
-    pub fn written(params: &Params, store: &Location, files: &Files, held: Held) -> Self {
-        Self { checks: held.rows, is_up_to_date: false, ..Self::up_to_date(params, store, files) }
+    pub fn written(
+        params: &Params,
+        store: &Location,
+        files: &Files,
+        results: CheckResults,
+    ) -> Self {
+        Self {
+            checks: results.rows,
+            is_up_to_date: false,
+            ..Self::up_to_date(params, store, files)
+        }
     }
 
     /// A model that is there already, made of the same weights in the same way.

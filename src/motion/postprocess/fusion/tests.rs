@@ -73,7 +73,7 @@ fn positions_are_those_of_the_definition_with_whole_matrices() {
     for (n, seed) in [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (17, 6), (90, 7)] {
         let measured = noisy(&truth(n), &VARIANCES, seed);
         let position: Vec<[bool; 3]> = (0..n).map(|t| [t % 7 == 2, t == 0, t + 1 == n]).collect();
-        for held in [NONE, Held { position, orientation: Vec::new() }] {
+        for held in [NONE, HeldPoses { position, orientation: Vec::new() }] {
             let found = fused(&measured, &VARIANCES, &held);
             assert_eq!(found.len(), n);
             for axis in 0..3 {
@@ -284,7 +284,7 @@ fn motion_falls_apart_where_it_is_not_finite() {
 fn held_poses_keep_their_bits_and_others_go_along() {
     let n = 61;
     let measured = noisy(&truth(n), &VARIANCES, 81);
-    let held = Held {
+    let held = HeldPoses {
         position: (0..31).map(|t| [t == 30, false, t == 30]).collect(),
         orientation: (0..n).map(|t| t == 0 || t == 30 || t == 31).collect(),
     };
@@ -318,7 +318,7 @@ fn held_poses_keep_their_bits_and_others_go_along() {
     // Held near another value, the path bends towards it.
     let mut pulled = noisy(&truth(n), &VARIANCES, 81);
     pulled.position[30][0] += 0.5;
-    let only = Held { position: held.position, orientation: Vec::new() };
+    let only = HeldPoses { position: held.position, orientation: Vec::new() };
     let a = fused(&measured, &VARIANCES, &only);
     let b = fused(&pulled, &VARIANCES, &only);
     let change: Vec<f64> = a.iter().zip(&b).map(|(a, b)| b[0] - a[0]).collect();
