@@ -269,7 +269,7 @@ fn a_decoder_that_fuses_does_in_the_middle_what_post_processing_does() {
         )
     };
     for (channel, tolerance) in [
-        // The filters are cut off after two seconds.
+        // Of the ends, 70 frames away, filters do not know.
         (Channel::Position, 1e-4),
         (Channel::Velocity, 1e-3),
         // Turns of a hundredth of a radian, to first order.

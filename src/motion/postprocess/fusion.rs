@@ -144,8 +144,11 @@ impl Measured {
     }
 }
 
-/// Frames on either side that the filters of fusion see: two seconds.
-const FILTER_HALF_FRAMES: usize = 60;
+/// Frames on either side that the filters of fusion see whole: all of a window of four seconds.
+const FILTER_WHOLE_FRAMES: usize = 120;
+/// Frames on either side that they see at all. In between they fade: a filter that ends in a step of a hundredth of a
+/// second moves every pose by the noise of one frame, a millimetre, and jerk becomes three times as large.
+const FILTER_HALF_FRAMES: usize = 240;
 
 /// Fusion far from the ends of a motion, where the solution of its equations is a filter.
 ///
@@ -182,7 +185,14 @@ impl FusionFilters {
                 angular_velocity: Vec::new(),
             };
             let shifts = measured.shifts(variances, &HeldPoses::default());
-            Array2::from_shape_fn((3, 2 * m + 1), |(axis, j)| shifts[middle + m - j][axis])
+            let fade = |lag: usize| {
+                let past = lag.saturating_sub(FILTER_WHOLE_FRAMES) as f64;
+                let length = (FILTER_HALF_FRAMES - FILTER_WHOLE_FRAMES) as f64;
+                0.5 * (1.0 + (std::f64::consts::PI * past / length).cos())
+            };
+            Array2::from_shape_fn((3, 2 * m + 1), |(axis, j)| {
+                fade(j.abs_diff(m)) * shifts[middle + m - j][axis]
+            })
         };
         // Rotation vectors are to angular velocities what positions are to velocities; nothing is known of their
         // second differences.

@@ -384,3 +384,45 @@ fn a_capture_comes_out_of_noise_better_than_by_smoothing() {
     assert!(fused[1] < 0.5 * smoothed[1], "{fused:?} against {smoothed:?}");
     assert!(fused[2] < 0.85 * smoothed[2], "{fused:?} against {smoothed:?}");
 }
+
+#[test]
+fn filters_with_a_long_memory_are_as_smooth_as_the_solution() {
+    // Positions that are worth little beside velocities: each residual is felt for seconds.
+    let start = FusionVariances::default();
+    let variances = FusionVariances { position_m2: start.position_m2.times(128.0), ..start };
+    let filters = FusionFilters::new(&variances);
+    let n = 120;
+    let mut noise = Noise(5);
+    let still = vec![[0.0; 3]; n];
+    let velocity: Vec<[f64; 3]> =
+        (0..n).map(|_| std::array::from_fn(|_| 0.2 * noise.normal())).collect();
+    let acceleration: Vec<[f64; 3]> =
+        (0..n).map(|_| std::array::from_fn(|_| 2.0 * noise.normal())).collect();
+    let filtered = |axis: usize, t: usize| -> f64 {
+        let sum = |h: &Array2<f64>, r: &[[f64; 3]]| -> f64 {
+            let m = h.ncols() / 2;
+            let taps = (0..h.ncols()).filter_map(|j| Some((j, r.get((t + j).checked_sub(m)?)?)));
+            taps.map(|(j, r)| h[[axis, j]] * r[axis]).sum()
+        };
+        sum(&filters.velocity, &velocity) + sum(&filters.acceleration, &acceleration)
+    };
+    let measured = Measured {
+        position: still.clone(),
+        velocity: velocity.clone(),
+        acceleration: acceleration.clone(),
+        orientation: Vec::new(),
+        angular_velocity: Vec::new(),
+    };
+    let exact = measured.shifts(&variances, &NONE);
+    for axis in 0..3 {
+        let jerk = |path: &[f64]| {
+            let third = path.windows(4).map(|x| x[3] - 3.0 * x[2] + 3.0 * x[1] - x[0]);
+            third.map(f64::abs).sum::<f64>()
+        };
+        // Away from the ends, of which filters do not know.
+        let path: Vec<f64> = (20..n - 20).map(|t| filtered(axis, t)).collect();
+        let solved: Vec<f64> = (20..n - 20).map(|t| exact[t][axis]).collect();
+        let ratio = jerk(&path) / jerk(&solved);
+        assert!((0.95..1.05).contains(&ratio), "axis {axis}: {ratio}");
+    }
+}
