@@ -265,7 +265,9 @@ proptest! {
         let kernel = std::sync::Arc::new(ndarray::Array2::from_shape_fn((channels, 5), |(c, j)| {
             0.3 * c as f64 - 0.2 * j as f64 + 0.1
         }));
-        check(&[x()], &none(), |g, x| g.filter_frames(&x[0], &kernel));
+        for spare in [0, 2] {
+            check(&[x()], &none(), |g, x| g.filter_frames(&x[0], &kernel, spare));
+        }
         check(&[x(), fixed(&[batch, 1, 2], vec![0.0; 2 * batch])], &none(), |g, x| {
             g.crop_frames(&x[0], &x[1])
         });

@@ -190,8 +190,9 @@ impl<I: Interpreter> Graph for I {
         &mut self,
         x: &Self::Tensor,
         kernel: &Arc<Array2<f64>>,
+        spare: usize,
     ) -> Result<Self::Tensor> {
-        self.apply(FilterFrames(Arc::clone(kernel)), &[x])
+        self.apply(FilterFrames { kernel: Arc::clone(kernel), spare }, &[x])
     }
 
     fn frame_mask(

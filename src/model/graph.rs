@@ -233,13 +233,15 @@ pub trait Graph: Sized {
         spare: usize,
     ) -> Result<Self::Tensor>;
 
-    /// y\[t, c\] = Σ_j h\[c, j\] x\[t + j − ⌊taps / 2⌋, c\], zero beyond either end: a fixed filter for each channel.
+    /// y\[t, c\] = Σ_j h\[c, j\] x\[t + j − ⌊taps / 2⌋, c\], a fixed filter for each channel; x counts as zero beyond
+    /// either end and in its last `spare` frames.
     ///
     /// `kernel`: h, \[channels, taps\], an odd number of taps. \[batch, frames, channels\] → the same
     fn filter_frames(
         &mut self,
         x: &Self::Tensor,
         kernel: &Arc<Array2<f64>>,
+        spare: usize,
     ) -> Result<Self::Tensor>;
 
     /// Says which frames of [`Graph::hold_frames`] count: 1 where `mask`, or all of x, has one, else 0.

@@ -293,7 +293,12 @@ impl Graph for Outline<'_> {
         Ok(self.result(x.clone()))
     }
 
-    fn filter_frames(&mut self, x: &Vec<usize>, kernel: &Arc<Array2<f64>>) -> Result<Vec<usize>> {
+    fn filter_frames(
+        &mut self,
+        x: &Vec<usize>,
+        kernel: &Arc<Array2<f64>>,
+        _spare: usize,
+    ) -> Result<Vec<usize>> {
         let [batch, frames, channels] = three("filter_frames", x)?;
         let flops = 2 * (batch * frames * channels * kernel.ncols()) as u64;
         self.layer("filter_frames", &[], x, flops);

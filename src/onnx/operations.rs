@@ -356,7 +356,12 @@ impl Graph for Builder<'_> {
         })
     }
 
-    fn filter_frames(&mut self, x: &Value, kernel: &Arc<Array2<f64>>) -> Result<Value> {
+    fn filter_frames(
+        &mut self,
+        x: &Value,
+        kernel: &Arc<Array2<f64>>,
+        spare: usize,
+    ) -> Result<Value> {
         self.begin("filter_frames", None);
         let (channels, taps) = kernel.dim();
         if x.channels != channels || taps % 2 == 0 {
@@ -366,7 +371,16 @@ impl Graph for Builder<'_> {
             );
             return Err(GraphError::shape("filter_frames", problem));
         }
-        let name = self.first("filter_frames", *x)?;
+        let mut name = self.first("filter_frames", *x)?;
+        if spare > 0 {
+            // Frames are the last axis in either form.
+            let frames = self.n_frames(*x)?;
+            let (places, spare) = (self.places(&frames), self.integers(&[spare as i64]));
+            let end = self.node("Sub", &[&frames, &spare], vec![]);
+            let counts = self.node("Less", &[&places, &end], vec![]);
+            let counts = self.cast(&counts, DataType::Float);
+            name = self.node("Mul", &[&name, &counts], vec![]);
+        }
         let numbers: Vec<f32> = kernel.iter().map(|&h| h as f32).collect();
         let half = (taps / 2) as i64;
         let (dims, shape, pads) = match self.form {

@@ -230,23 +230,7 @@ fn a_decoder_that_fuses_does_in_the_middle_what_post_processing_does() {
     let latent = slow_waves(n, frames);
     let decoded = |config: &DecoderConfig| {
         let (network, list) = MotionDecoder::new(config);
-        let drawn = random(list.clone(), 9);
-        let ids = list.by_name();
-        // A body that turns slowly, of which turn rates are said that are off by some tenths of a rad/s: what is
-        // exact to first order alone, in the turn and in its rate, is held against what is exact.
-        let parameters = Parameters::from_fn(list.clone(), |parameter: &Parameter| {
-            let mut values = drawn.unpacked(ids[parameter.name.as_str()]);
-            let factor = match parameter.name.split('.').next() {
-                Some("angular_velocity_head") => 0.03,
-                Some("quaternion_head") => 0.1,
-                _ => 1.0,
-            };
-            values.iter_mut().for_each(|x| *x *= factor);
-            if parameter.name == "quaternion_head.bias" {
-                values[0] = 1.0;
-            }
-            values
-        });
+        let parameters = slow_body(list);
         let arena = Arena::default();
         let mut g = Eager::new(&parameters, &arena);
         let x = g.input(&[n, frames, MOTION_DIM], &latent);
@@ -290,6 +274,26 @@ fn a_decoder_that_fuses_does_in_the_middle_what_post_processing_does() {
         let (fused, apart) = (check(&found), check(&before));
         assert!(fused.passed && !apart.passed, "{}; {}", fused.message, apart.message);
     }
+}
+
+/// Weights with which a body turns slowly and turn rates are off by some tenths of a rad/s, as motion is: what is exact to
+/// first order alone, in the turn and in its rate, can be held against what is exact.
+fn slow_body(list: ParameterList) -> Parameters<f32> {
+    let drawn = random(list.clone(), 9);
+    let ids = list.by_name();
+    Parameters::from_fn(list.clone(), |parameter: &Parameter| {
+        let mut values = drawn.unpacked(ids[parameter.name.as_str()]);
+        let factor = match parameter.name.split('.').next() {
+            Some("angular_velocity_head") => 0.03,
+            Some("quaternion_head") => 0.1,
+            _ => 1.0,
+        };
+        values.iter_mut().for_each(|x| *x *= factor);
+        if parameter.name == "quaternion_head.bias" {
+            values[0] = 1.0;
+        }
+        values
+    })
 }
 
 /// Latents of slow waves, of which no two channels are alike.

@@ -41,7 +41,7 @@ enum Call {
     HoldAndCrop,
     LaterFrames { shift: usize, spare: usize },
     LaterFramesOfConvolution,
-    FilterFrames { taps: usize },
+    FilterFrames { taps: usize, spare: usize },
     HeldMask,
     StridedMask,
 }
@@ -175,11 +175,11 @@ fn run<G: Graph>(call: Call, g: &mut G, x: &Given<G::Tensor>, ids: &Ids) -> Resu
             let h = convolved(g)?;
             g.later_frames(&h, 1, 2)
         }
-        Call::FilterFrames { taps } => {
+        Call::FilterFrames { taps, spare } => {
             let kernel = Array2::from_shape_fn((WIDTH, taps), |(c, j)| {
                 0.1 * c as f64 - 0.07 * j as f64 + 0.02
             });
-            g.filter_frames(&x.x, &Arc::new(kernel))
+            g.filter_frames(&x.x, &Arc::new(kernel), spare)
         }
         Call::HoldAndCrop => {
             let h = g.hold_frames(&x.x, 4)?;
@@ -318,8 +318,10 @@ fn every_operation_gives_what_the_interpreter_gives() {
         // More than there are frames.
         Call::LaterFrames { shift: 3, spare: FRAMES + 1 },
         Call::LaterFramesOfConvolution,
-        Call::FilterFrames { taps: 5 },
-        Call::FilterFrames { taps: 2 * FRAMES + 3 },
+        Call::FilterFrames { taps: 5, spare: 0 },
+        Call::FilterFrames { taps: 5, spare: 2 },
+        Call::FilterFrames { taps: 3, spare: FRAMES + 1 },
+        Call::FilterFrames { taps: 2 * FRAMES + 3, spare: 1 },
         Call::HeldMask,
         Call::StridedMask,
     ];

@@ -9,23 +9,31 @@ use crate::autodiff::operation::{Backward, Operation, Run, expect_axes};
 use crate::autodiff::tensor::Tensor;
 use crate::model::{GraphError, Result};
 
-/// y\[t, c\] = Σ_j h\[c, j\] x\[t + j − m\], m = ⌊taps / 2⌋, zero beyond either end.
+/// y\[t, c\] = Σ_j h\[c, j\] x\[t + j − m\], m = ⌊taps / 2⌋; x counts as zero beyond either end and in its last
+/// `spare` frames.
 ///
-/// h, \[channels, taps\], is no parameter and learns nothing. \[batch, frames, channels\] → the same
-pub struct FilterFrames(pub Arc<Array2<f64>>);
+/// \[batch, frames, channels\] → the same
+pub struct FilterFrames {
+    /// h, \[channels, taps\], which is no parameter and learns nothing.
+    pub kernel: Arc<Array2<f64>>,
+    pub spare: usize,
+}
 
 impl FilterFrames {
     /// Filters, or for the gradient applies the transpose, which is the filter with its taps in reverse.
     fn apply<E: Element>(&self, shape: &[usize], x: &[E], y: &mut [E], is_transposed: bool) {
-        let (frames, channels, taps) = (shape[1], shape[2], self.0.ncols());
-        let kernel: Vec<E> = self.0.iter().map(|&h| E::from_f64(h)).collect();
+        let (frames, channels, taps) = (shape[1], shape[2], self.kernel.ncols());
+        let kernel: Vec<E> = self.kernel.iter().map(|&h| E::from_f64(h)).collect();
         let half = taps / 2;
         y.fill(E::ZERO);
+        let counted = frames.saturating_sub(self.spare);
+        // The frames that are filtered, and those that are filled.
+        let (n_from, n_to) = if is_transposed { (frames, counted) } else { (counted, frames) };
         let sample = (frames * channels).max(1);
         for (y, x) in y.chunks_exact_mut(sample).zip(x.chunks_exact(sample)) {
-            for t in 0..frames {
+            for t in 0..n_to {
                 for j in 0..taps {
-                    let Some(from) = (t + j).checked_sub(half).filter(|&s| s < frames) else {
+                    let Some(from) = (t + j).checked_sub(half).filter(|&s| s < n_from) else {
                         continue;
                     };
                     let tap = if is_transposed { taps - 1 - j } else { j };
@@ -47,7 +55,7 @@ impl<E: Element> Operation<E> for FilterFrames {
     fn forward(&mut self, x: &[&Tensor<E>], run: &Run<E>) -> Result<Tensor<E>> {
         let x = x[0];
         expect_axes("filter_frames", "input", x, 3, "[batch, frames, channels]")?;
-        let (channels, taps) = self.0.dim();
+        let (channels, taps) = self.kernel.dim();
         if x.channels() != channels || taps % 2 == 0 {
             let problem = format!(
                 "input has {} channels, the filter has {channels} with {taps} taps, of which an odd number is asked",

@@ -53,7 +53,7 @@ impl PoseFusion {
     /// q' = (1, θ/2) q / |…| with θ = h_ω ∗ (ω − ω(q)), ω' = ω(q').
     ///
     /// D is the forward difference times 30 Hz; the last difference, and the last two second ones, repeat those
-    /// before them.
+    /// before them and are no measurements, so that their residuals count for nothing.
     pub fn forward<G: Graph>(
         &self,
         g: &mut G,
@@ -62,15 +62,15 @@ impl PoseFusion {
         let [slope, curvature] = derivatives(g, &x.position)?;
         let r_v = subtract(g, &x.velocity, &slope)?;
         let r_a = subtract(g, &x.acceleration, &curvature)?;
-        let by_velocity = g.filter_frames(&r_v, &self.velocity)?;
-        let by_acceleration = g.filter_frames(&r_a, &self.acceleration)?;
+        let by_velocity = g.filter_frames(&r_v, &self.velocity, 1)?;
+        let by_acceleration = g.filter_frames(&r_a, &self.acceleration, 2)?;
         let shift = g.add(&by_velocity, &by_acceleration)?;
         let position = g.add(&x.position, &shift)?;
         let [velocity, acceleration] = derivatives(g, &position)?;
 
         let turn_rate = turn_rate(g, &x.quaternion)?;
         let r_omega = subtract(g, &x.angular_velocity, &turn_rate)?;
-        let turn = g.filter_frames(&r_omega, &self.angular_velocity)?;
+        let turn = g.filter_frames(&r_omega, &self.angular_velocity, 1)?;
         let quaternion = turned(g, &x.quaternion, &turn)?;
         let angular_velocity = self::turn_rate(g, &quaternion)?;
         Ok(Kinematics { position, velocity, acceleration, quaternion, angular_velocity })

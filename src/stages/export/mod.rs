@@ -55,6 +55,11 @@ pub struct Params {
     /// Licence of the model, as people will read it in its files.
     #[arg(long, value_name = "TEXT", default_value = "not stated")]
     pub licence: String,
+    /// End the decoder with fusion, as filters over frames, for programs that run its file without post-processing:
+    /// decoded velocities are then those of decoded poses, less exactly at the ends of a window, where generate's own
+    /// fusion is exact.
+    #[arg(long)]
+    pub fuse_decoder: bool,
     /// Largest weights that lie within the .onnx file itself, in MB; larger ones lie beside it.
     #[arg(long, value_name = "MB", default_value_t = 1000)]
     pub embed_mb: usize,
@@ -106,9 +111,11 @@ impl Stage for Export {
         let engine = eager(&trained, (unet.clone(), decoder.clone()), machine.threads)?;
         let sampling = tuning::sampling_defaults(&engine, network, &phrases.dataset, progress)?;
         drop(engine);
-        // The model's decoder fuses by what it was measured to leave; in training its heads speak for themselves.
-        trained.state.config.network.decoder.fusion =
-            sampling.as_ref().map(|sampling| sampling.fusion_variances);
+        // In training its heads speak for themselves, and by what they were measured to leave they are fused.
+        trained.state.config.network.decoder.fusion = sampling
+            .as_ref()
+            .filter(|_| params.fuse_decoder)
+            .map(|sampling| sampling.fusion_variances);
         let measured = (motion_range(&phrases.dataset)?, sampling);
         let files = Files::make(&trained, &params, measured, learned_from)?;
         if params.dry_run {

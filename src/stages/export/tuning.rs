@@ -34,6 +34,9 @@ const GUIDANCES: [f64; 5] = [1.0, 1.5, 2.0, 3.0, 4.0];
 /// Powers of two by which variances are multiplied.
 const MULTIPLES: [f64; 17] =
     [-8., -7., -6., -5., -4., -3., -2., -1., 0., 1., 2., 3., 4., 5., 6., 7., 8.];
+/// Greatest of them for orientations: σ_q of 6°. Beyond, a body leans as far as errors of its turn rates add up to, which
+/// the moments of turning do not see: with 2^8 17 of 160 motions were not upright.
+const MAX_ORIENTATION_MULTIPLE: f64 = 5.0;
 /// Seed of the noise.
 const SEED: u64 = 17;
 
@@ -88,7 +91,7 @@ pub fn sampling_defaults(
 /// Returns the variances with which fused motion is as fast and as smooth as real motion of the same music.
 ///
 /// How much a decoder's positions and orientations are worth beside its velocities: the multiples 2^k, k = -8 …
-/// 8, of σ_p² and of σ_q² at which `Σ ln²(m̂ / m)` is least, with m the root mean square velocity along each axis
+/// 8 (for σ_q² up to 5), of σ_p² and of σ_q² at which `Σ ln²(m̂ / m)` is least, with m the root mean square velocity along each axis
 /// and the mean jerk; the mean turn rate and the mean change of it. Of errors that are not independent from frame
 /// to frame, as those of networks are not, the likelihood's variances gave motion of half the speed.
 fn variances_of(windows: &[Window], decoded: &[Array2<f32>]) -> FusionVariances {
@@ -99,16 +102,16 @@ fn variances_of(windows: &[Window], decoded: &[Array2<f32>]) -> FusionVariances 
         (0..width).map(|i| moments.iter().map(|m| m[i]).sum::<f64>() / n).collect::<Vec<f64>>()
     };
     let real: Vec<Array2<f32>> = windows.iter().map(|window| window.motion.clone()).collect();
-    let least = |of: Moments, with: &dyn Fn(f64) -> FusionVariances| {
+    let least = |of: Moments, greatest: f64, with: &dyn Fn(f64) -> FusionVariances| {
         let wanted = mean(&real, of);
         let miss = |multiple: f64| -> f64 {
             let found = mean(&fused(decoded, with(multiple)), of);
             found.iter().zip(&wanted).map(|(found, wanted)| (found / wanted).ln().powi(2)).sum()
         };
-        let multiples = MULTIPLES.map(f64::exp2);
+        let multiples = MULTIPLES.iter().filter(|power| **power <= greatest).map(|x| x.exp2());
         let misses = multiples.map(|multiple| (miss(multiple), multiple));
-        let finite = misses.iter().filter(|(miss, _)| miss.is_finite());
-        finite.min_by(|a, b| a.0.total_cmp(&b.0)).map_or(1.0, |(_, multiple)| *multiple)
+        let finite = misses.filter(|(miss, _)| miss.is_finite());
+        finite.min_by(|a, b| a.0.total_cmp(&b.0)).map_or(1.0, |(_, multiple)| multiple)
     };
     let scaled = |position: f64, orientation: f64| {
         let FusionVariances { position_m2, orientation_rad2, .. } = FusionVariances::default();
@@ -118,8 +121,9 @@ fn variances_of(windows: &[Window], decoded: &[Array2<f32>]) -> FusionVariances 
             ..FusionVariances::default()
         }
     };
-    let position = least(path_moments, &|multiple| scaled(multiple, 1.0));
-    let orientation = least(turn_moments, &|multiple| scaled(position, multiple));
+    let position = least(path_moments, f64::INFINITY, &|multiple| scaled(multiple, 1.0));
+    let orientation =
+        least(turn_moments, MAX_ORIENTATION_MULTIPLE, &|multiple| scaled(position, multiple));
     scaled(position, orientation)
 }
 
