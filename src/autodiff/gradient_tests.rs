@@ -21,8 +21,8 @@ use super::op::shape::{Reshape, Transpose};
 use super::op::softmax::{CrossEntropy, Softmax};
 use super::*;
 use crate::model::{
-    Activation, Attention, Channels, Convolution, Graph, GroupNormalization, Init, ParameterId,
-    ParameterList, Result, Role, Scope,
+    Activation, Attention, Channels, Convolution, Graph, GroupNormalization, Init, Mirror,
+    ParameterId, ParameterList, Result, Role, Scope,
 };
 
 const STEP: f64 = 1e-5;
@@ -259,14 +259,16 @@ proptest! {
             g.mul(&head, &tail)
         });
         check(&[x()], &none(), |g, x| g.hold_frames(&x[0], 4));
-        for (shift, spare) in [(0, 1), (1, 0), (2, 3)] {
-            check(&[x()], &none(), |g, x| g.later_frames(&x[0], shift, spare));
+        for (shift, spare) in [(0, 1), (1, 0), (-2, 0), (2, 3)] {
+            check(&[x()], &none(), |g, x| g.shift_frames(&x[0], shift, spare));
         }
+        let other = |seed| input(&[batch, frames, channels], seed);
+        check(&[x(), other(2), other(3)], &none(), |g, x| g.replace_ends(&x[0], &x[1], &x[2]));
         let kernel = std::sync::Arc::new(ndarray::Array2::from_shape_fn((channels, 5), |(c, j)| {
             0.3 * c as f64 - 0.2 * j as f64 + 0.1
         }));
-        for spare in [0, 2] {
-            check(&[x()], &none(), |g, x| g.filter_frames(&x[0], &kernel, spare));
+        for mirror in [Mirror::Even, Mirror::Odd] {
+            check(&[x()], &none(), |g, x| g.filter_frames(&x[0], &kernel, mirror));
         }
         check(&[x(), fixed(&[batch, 1, 2], vec![0.0; 2 * batch])], &none(), |g, x| {
             g.crop_frames(&x[0], &x[1])

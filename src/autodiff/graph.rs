@@ -6,7 +6,7 @@ use std::sync::Arc;
 use ndarray::Array2;
 
 use crate::model::{
-    Activation, Attention, Convolution, Graph, GroupNormalization, ParameterId, Result,
+    Activation, Attention, Convolution, Graph, GroupNormalization, Mirror, ParameterId, Result,
 };
 
 use super::op::activation::Activate;
@@ -17,7 +17,7 @@ use super::op::conv::Product;
 use super::op::dropout::Dropout;
 use super::op::elementwise::{Function, Map};
 use super::op::filter::FilterFrames;
-use super::op::frames::{FrameMask, StrideMask, TakeFrames};
+use super::op::frames::{FrameMask, ReplaceEnds, StrideMask, TakeFrames};
 use super::op::group_norm::NormFilmActivate;
 use super::op::layer_norm::LayerNormalize;
 use super::op::lookup::{Embed, Gather};
@@ -177,22 +177,31 @@ impl<I: Interpreter> Graph for I {
         if alike { Ok(x.clone()) } else { self.apply(TakeFrames::crop(), &[x, like]) }
     }
 
-    fn later_frames(
+    fn shift_frames(
         &mut self,
         x: &Self::Tensor,
-        shift: usize,
+        shift: isize,
         spare: usize,
     ) -> Result<Self::Tensor> {
-        self.apply(TakeFrames::later(shift, spare), &[x])
+        self.apply(TakeFrames::shifted(shift, spare), &[x])
+    }
+
+    fn replace_ends(
+        &mut self,
+        x: &Self::Tensor,
+        first: &Self::Tensor,
+        last: &Self::Tensor,
+    ) -> Result<Self::Tensor> {
+        self.apply(ReplaceEnds, &[x, first, last])
     }
 
     fn filter_frames(
         &mut self,
         x: &Self::Tensor,
         kernel: &Arc<Array2<f64>>,
-        spare: usize,
+        mirror: Mirror,
     ) -> Result<Self::Tensor> {
-        self.apply(FilterFrames { kernel: Arc::clone(kernel), spare }, &[x])
+        self.apply(FilterFrames { kernel: Arc::clone(kernel), mirror }, &[x])
     }
 
     fn frame_mask(

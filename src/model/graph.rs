@@ -105,6 +105,30 @@ pub struct Attention<'a, T> {
     pub causal: bool,
 }
 
+/// How frames go on beyond the ends of a signal of N frames, with a period of 2N.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Mirror {
+    /// x\[−1 − t\] = x\[t\], x\[N + t\] = x\[N − 1 − t\]: what second differences do where a signal is mirrored.
+    Even,
+    /// x\[−1\] = 0, x\[−2 − t\] = −x\[t\]; x\[N − 1\] counts as 0, x\[N + t\] = −x\[N − 2 − t\]: what forward
+    /// differences do where a signal is mirrored.
+    Odd,
+}
+
+impl Mirror {
+    /// Returns the frame that stands at place t of a mirrored signal, and its sign; none where the signal is 0.
+    pub fn frame(self, t: isize, n_frames: usize) -> Option<(usize, f64)> {
+        let n = n_frames;
+        let t = t.rem_euclid(2 * n.max(1) as isize) as usize;
+        match self {
+            Self::Even => Some((t.min(2 * n - 1 - t), 1.0)),
+            Self::Odd if t + 1 == n || t + 1 == 2 * n => None,
+            Self::Odd if t < n => Some((t, 1.0)),
+            Self::Odd => Some((2 * n - 2 - t, -1.0)),
+        }
+    }
+}
+
 /// The operations that a network may use.
 ///
 /// Every operation fails if the sizes of its inputs do not fit.
@@ -222,26 +246,36 @@ pub trait Graph: Sized {
     /// Drops frames beyond those that `like` has.
     fn crop_frames(&mut self, x: &Self::Tensor, like: &Self::Tensor) -> Result<Self::Tensor>;
 
-    /// y\[t\] = x\[clamp(t + shift, 0, frames − 1 − spare)\]: frames that come later, the last of those that are
-    /// not spared held.
+    /// y\[t\] = x\[clamp(t + shift, 0, frames − 1 − spare)\]: frames that come later, or earlier; the first, and the
+    /// last of those that are not spared, are held.
     ///
     /// \[batch, frames, channels\] → the same
-    fn later_frames(
+    fn shift_frames(
         &mut self,
         x: &Self::Tensor,
-        shift: usize,
+        shift: isize,
         spare: usize,
     ) -> Result<Self::Tensor>;
 
-    /// y\[t, c\] = Σ_j h\[c, j\] x\[t + j − ⌊taps / 2⌋, c\], a fixed filter for each channel; x counts as zero beyond
-    /// either end and in its last `spare` frames.
+    /// Replaces the first frame by that of `first`, then the last by that of `last`.
+    ///
+    /// All \[batch, frames, channels\] → the same
+    fn replace_ends(
+        &mut self,
+        x: &Self::Tensor,
+        first: &Self::Tensor,
+        last: &Self::Tensor,
+    ) -> Result<Self::Tensor>;
+
+    /// y\[t, c\] = Σ_j h\[c, j\] x\[t + j − ⌊taps / 2⌋, c\], a fixed filter for each channel; beyond its ends x is
+    /// mirrored.
     ///
     /// `kernel`: h, \[channels, taps\], an odd number of taps. \[batch, frames, channels\] → the same
     fn filter_frames(
         &mut self,
         x: &Self::Tensor,
         kernel: &Arc<Array2<f64>>,
-        spare: usize,
+        mirror: Mirror,
     ) -> Result<Self::Tensor>;
 
     /// Says which frames of [`Graph::hold_frames`] count: 1 where `mask`, or all of x, has one, else 0.

@@ -15,7 +15,8 @@ mod unet;
 pub use condition::{condition, condition_scale};
 pub use decoder::{DecoderConfig, MotionDecoder};
 pub use graph::{
-    Activation, Attention, Channels, Convolution, Graph, GraphError, GroupNormalization, Result,
+    Activation, Attention, Channels, Convolution, Graph, GraphError, GroupNormalization, Mirror,
+    Result,
 };
 pub use layers::{AttentionBlock, Conv1d, GroupNorm, LayerNorm, Linear, ResBlock};
 pub use outline::{Kept, Layer, Outline};

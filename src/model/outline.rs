@@ -6,7 +6,7 @@ use std::sync::Arc;
 use ndarray::Array2;
 
 use super::graph::{
-    Activation, Attention, Convolution, Graph, GraphError, GroupNormalization, Result,
+    Activation, Attention, Convolution, Graph, GraphError, GroupNormalization, Mirror, Result,
 };
 use super::parameter::{ParameterId, ParameterList};
 
@@ -289,7 +289,16 @@ impl Graph for Outline<'_> {
         Ok(vec![batch, frames, channels])
     }
 
-    fn later_frames(&mut self, x: &Vec<usize>, _shift: usize, _spare: usize) -> Result<Vec<usize>> {
+    fn shift_frames(&mut self, x: &Vec<usize>, _shift: isize, _spare: usize) -> Result<Vec<usize>> {
+        Ok(self.result(x.clone()))
+    }
+
+    fn replace_ends(
+        &mut self,
+        x: &Vec<usize>,
+        _first: &Vec<usize>,
+        _last: &Vec<usize>,
+    ) -> Result<Vec<usize>> {
         Ok(self.result(x.clone()))
     }
 
@@ -297,7 +306,7 @@ impl Graph for Outline<'_> {
         &mut self,
         x: &Vec<usize>,
         kernel: &Arc<Array2<f64>>,
-        _spare: usize,
+        _mirror: Mirror,
     ) -> Result<Vec<usize>> {
         let [batch, frames, channels] = three("filter_frames", x)?;
         let flops = 2 * (batch * frames * channels * kernel.ncols()) as u64;

@@ -13,7 +13,7 @@ use super::proto::{AttributeType, DataType, Graph, Model, Node, Tensor};
 /// The operators that are written: name, fewest and most inputs, attributes.
 ///
 /// Versions: the newest of each up to opset 21 (<https://onnx.ai/onnx/operators>).
-const OPERATORS: [(&str, usize, usize, &[&str]); 39] = [
+const OPERATORS: [(&str, usize, usize, &[&str]); 40] = [
     ("Add", 2, 2, &[]),
     ("Cast", 1, 1, &["to"]),
     ("Concat", 1, usize::MAX, &["axis"]),
@@ -21,6 +21,7 @@ const OPERATORS: [(&str, usize, usize, &[&str]); 39] = [
     ("Cos", 1, 1, &[]),
     ("DequantizeLinear", 2, 3, &["axis"]),
     ("Div", 2, 2, &[]),
+    ("Equal", 2, 2, &[]),
     ("Gather", 2, 2, &["axis"]),
     ("Gelu", 1, 1, &["approximate"]),
     ("Greater", 2, 2, &[]),

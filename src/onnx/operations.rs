@@ -10,7 +10,8 @@ use std::sync::Arc;
 use ndarray::Array2;
 
 use crate::model::{
-    Activation, Attention, Convolution, Graph, GraphError, GroupNormalization, ParameterId, Result,
+    Activation, Attention, Convolution, Graph, GraphError, GroupNormalization, Mirror, ParameterId,
+    Result,
 };
 
 use super::builder::{Axes, Builder, Form, Use, Value, expect};
@@ -340,15 +341,16 @@ impl Graph for Builder<'_> {
         self.map(*x, x.channels, |g, x| g.node("Slice", &[x, &starts, &ends, &axes], vec![]))
     }
 
-    fn later_frames(&mut self, x: &Value, shift: usize, spare: usize) -> Result<Value> {
-        self.begin("later_frames", None);
-        expect("later_frames", *x, Axes::Frames)?;
+    fn shift_frames(&mut self, x: &Value, shift: isize, spare: usize) -> Result<Value> {
+        self.begin("shift_frames", None);
+        expect("shift_frames", *x, Axes::Frames)?;
         let frames = self.n_frames(*x)?;
         let places = self.places(&frames);
-        let [shift, spare, zero] = [shift, spare + 1, 0].map(|n| self.integers(&[n as i64]));
+        let [shift, spare, zero] = [shift as i64, spare as i64 + 1, 0].map(|n| self.integers(&[n]));
         let last = self.node("Sub", &[&frames, &spare], vec![]);
         let last = self.node("Max", &[&last, &zero], vec![]);
         let places = self.node("Add", &[&places, &shift], vec![]);
+        let places = self.node("Max", &[&places, &zero], vec![]);
         let places = self.node("Min", &[&places, &last], vec![]);
         let axis = if self.has_last(*x) { 1 } else { self.frames_axis() };
         self.map(*x, x.channels, |g, x| {
@@ -356,11 +358,30 @@ impl Graph for Builder<'_> {
         })
     }
 
+    fn replace_ends(&mut self, x: &Value, first: &Value, last: &Value) -> Result<Value> {
+        self.begin("replace_ends", None);
+        let frames = self.n_frames(*x)?;
+        let places = self.places(&frames);
+        let [zero, one] = [0, 1].map(|n| self.integers(&[n]));
+        let end = self.node("Sub", &[&frames, &one], vec![]);
+        let is_first = self.node("Equal", &[&places, &zero], vec![]);
+        let is_last = self.node("Equal", &[&places, &end], vec![]);
+        // Frames are the last axis in either form.
+        let [x_name, first, last] = [
+            self.first("replace_ends", *x)?,
+            self.first("replace_ends", *first)?,
+            self.first("replace_ends", *last)?,
+        ];
+        let y = self.node("Where", &[&is_first, &first, &x_name], vec![]);
+        let y = self.node("Where", &[&is_last, &last, &y], vec![]);
+        Ok(self.new_first(x.channels, y))
+    }
+
     fn filter_frames(
         &mut self,
         x: &Value,
         kernel: &Arc<Array2<f64>>,
-        spare: usize,
+        mirror: Mirror,
     ) -> Result<Value> {
         self.begin("filter_frames", None);
         let (channels, taps) = kernel.dim();
@@ -371,30 +392,16 @@ impl Graph for Builder<'_> {
             );
             return Err(GraphError::shape("filter_frames", problem));
         }
-        let mut name = self.first("filter_frames", *x)?;
-        if spare > 0 {
-            // Frames are the last axis in either form.
-            let frames = self.n_frames(*x)?;
-            let (places, spare) = (self.places(&frames), self.integers(&[spare as i64]));
-            let end = self.node("Sub", &[&frames, &spare], vec![]);
-            let counts = self.node("Less", &[&places, &end], vec![]);
-            let counts = self.cast(&counts, DataType::Float);
-            name = self.node("Mul", &[&name, &counts], vec![]);
-        }
+        let name = self.first("filter_frames", *x)?;
+        let frames = self.n_frames(*x)?;
+        let name = self.mirrored(&name, &frames, (taps / 2) as i64, mirror);
         let numbers: Vec<f32> = kernel.iter().map(|&h| h as f32).collect();
-        let half = (taps / 2) as i64;
-        let (dims, shape, pads) = match self.form {
-            Form::Line => (vec![channels, 1, taps], vec![taps as i64], vec![half, half]),
-            Form::Image => {
-                (vec![channels, 1, 1, taps], vec![1, taps as i64], vec![0, half, 0, half])
-            }
+        let (dims, shape) = match self.form {
+            Form::Line => (vec![channels, 1, taps], vec![taps as i64]),
+            Form::Image => (vec![channels, 1, 1, taps], vec![1, taps as i64]),
         };
         let kernel = self.table(&dims, &numbers);
-        let attributes = vec![
-            integers("kernel_shape", &shape),
-            integers("pads", &pads),
-            integer("group", channels as i64),
-        ];
+        let attributes = vec![integers("kernel_shape", &shape), integer("group", channels as i64)];
         let y = self.node("Conv", &[&name, &kernel], attributes);
         Ok(self.new_first(channels, y))
     }

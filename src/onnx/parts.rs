@@ -1,6 +1,6 @@
 //! What the operations of a network have in common in ONNX.
 
-use crate::model::{Activation, Channels, Convolution, GraphError, ParameterId, Result};
+use crate::model::{Activation, Channels, Convolution, GraphError, Mirror, ParameterId, Result};
 
 use super::builder::{Axes, Builder, Form, Use, Value};
 use super::literals::{float, integer, integers, word};
@@ -142,6 +142,49 @@ impl Builder<'_> {
         let end = self.node("Squeeze", &[frames, &axes], vec![]);
         let (start, step) = (self.integer(0), self.integer(1));
         self.node("Range", &[&start, &end, &step], vec![])
+    }
+
+    /// A signal whose frames are its last axis, with as many mirrored frames at either end as `margin` says.
+    pub(super) fn mirrored(
+        &mut self,
+        x: &str,
+        frames: &str,
+        margin: i64,
+        mirror: Mirror,
+    ) -> String {
+        let [one, two, twice, margin] = [1, 2, 2 * margin, margin].map(|n| self.integers(&[n]));
+        let length = self.node("Add", &[frames, &twice], vec![]);
+        let places = self.places(&length);
+        let places = self.node("Sub", &[&places, &margin], vec![]);
+        let period = self.node("Mul", &[frames, &two], vec![]);
+        // Of a negative number, too, the remainder has the sign of the period.
+        let t = self.node("Mod", &[&places, &period], vec![]);
+        // The mirror image of t is 2N − 1 − t, or 2N − 2 − t.
+        let back = match mirror {
+            Mirror::Even => &one,
+            Mirror::Odd => &two,
+        };
+        let image = self.node("Sub", &[&period, back], vec![]);
+        let image = self.node("Sub", &[&image, &t], vec![]);
+        let is_forward = self.node("Less", &[&t, frames], vec![]);
+        let taken = self.node("Where", &[&is_forward, &t, &image], vec![]);
+        let zero = self.integers(&[0]);
+        let taken = self.node("Max", &[&taken, &zero], vec![]);
+        let frames_axis = self.frames_axis();
+        let y = self.node("Gather", &[x, &taken], vec![integer("axis", frames_axis)]);
+        if mirror == Mirror::Even {
+            return y;
+        }
+        // t = N − 1 and t = 2N − 1 are 0; past N the sign is another.
+        let next = self.node("Add", &[&t, &one], vec![]);
+        let rest = self.node("Mod", &[&next, frames], vec![]);
+        let counts = self.node("Greater", &[&rest, &zero], vec![]);
+        let [counts, is_forward] = [counts, is_forward].map(|x| self.cast(&x, DataType::Float));
+        let (double, minus_one) = (self.table(&[1], &[2.0]), self.table(&[1], &[-1.0]));
+        let sign = self.node("Mul", &[&is_forward, &double], vec![]);
+        let sign = self.node("Add", &[&sign, &minus_one], vec![]);
+        let factor = self.node("Mul", &[&counts, &sign], vec![]);
+        self.node("Mul", &[&y, &factor], vec![])
     }
 
     /// Subtracts a centre from each channel and divides by a scale.

@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use motiongen::autodiff::{Arena, Eager, Parameters};
 use motiongen::model::{
-    Activation, Attention, Channels, Convolution, Graph, GroupNormalization, Init, Parameter,
-    ParameterId, ParameterList, Result, Role,
+    Activation, Attention, Channels, Convolution, Graph, GroupNormalization, Init, Mirror,
+    Parameter, ParameterId, ParameterList, Result, Role,
 };
 use motiongen::onnx::{Axes, Builder, Form, ModelFile, Storage, Tensor};
 use ndarray::Array2;
@@ -39,9 +39,11 @@ enum Call {
     Normalize,
     Rotary,
     HoldAndCrop,
-    LaterFrames { shift: usize, spare: usize },
-    LaterFramesOfConvolution,
-    FilterFrames { taps: usize, spare: usize },
+    ShiftFrames { shift: isize, spare: usize },
+    ShiftFramesOfConvolution,
+    ReplaceEnds,
+    FilterFrames { taps: usize, mirror: Mirror },
+    FilterFramesOfConvolution,
     HeldMask,
     StridedMask,
 }
@@ -94,6 +96,11 @@ fn parameters() -> (ParameterList, Ids) {
 }
 
 const SAME: Convolution = Convolution { taps: 3, stride: 1, padding: 1, dilation: 1 };
+
+fn filter(taps: usize) -> Arc<Array2<f64>> {
+    let tap = |(c, j)| (0.1 * c as f64 - 0.07 * j as f64 + 0.02) / taps as f64;
+    Arc::new(Array2::from_shape_fn((WIDTH, taps), tap))
+}
 
 fn run<G: Graph>(call: Call, g: &mut G, x: &Given<G::Tensor>, ids: &Ids) -> Result<G::Tensor> {
     let convolved = |g: &mut G| g.conv1d(&x.x, ids.taps, Some(ids.gain), SAME);
@@ -170,16 +177,19 @@ fn run<G: Graph>(call: Call, g: &mut G, x: &Given<G::Tensor>, ids: &Ids) -> Resu
         }
         Call::Normalize => g.normalize(&x.x, 1e-12),
         Call::Rotary => g.rotary(&x.x, HEADS),
-        Call::LaterFrames { shift, spare } => g.later_frames(&x.x, shift, spare),
-        Call::LaterFramesOfConvolution => {
+        Call::ShiftFrames { shift, spare } => g.shift_frames(&x.x, shift, spare),
+        Call::ShiftFramesOfConvolution => {
             let h = convolved(g)?;
-            g.later_frames(&h, 1, 2)
+            g.shift_frames(&h, 1, 2)
         }
-        Call::FilterFrames { taps, spare } => {
-            let kernel = Array2::from_shape_fn((WIDTH, taps), |(c, j)| {
-                0.1 * c as f64 - 0.07 * j as f64 + 0.02
-            });
-            g.filter_frames(&x.x, &Arc::new(kernel), spare)
+        Call::ReplaceEnds => {
+            let h = convolved(g)?;
+            g.replace_ends(&x.x, &h, &x.other)
+        }
+        Call::FilterFrames { taps, mirror } => g.filter_frames(&x.x, &filter(taps), mirror),
+        Call::FilterFramesOfConvolution => {
+            let h = convolved(g)?;
+            g.filter_frames(&h, &filter(3), Mirror::Odd)
         }
         Call::HoldAndCrop => {
             let h = g.hold_frames(&x.x, 4)?;
@@ -313,15 +323,19 @@ fn every_operation_gives_what_the_interpreter_gives() {
         Call::Normalize,
         Call::Rotary,
         Call::HoldAndCrop,
-        Call::LaterFrames { shift: 1, spare: 0 },
-        Call::LaterFrames { shift: 0, spare: 2 },
+        Call::ShiftFrames { shift: 1, spare: 0 },
+        Call::ShiftFrames { shift: -2, spare: 0 },
+        Call::ShiftFrames { shift: 0, spare: 2 },
         // More than there are frames.
-        Call::LaterFrames { shift: 3, spare: FRAMES + 1 },
-        Call::LaterFramesOfConvolution,
-        Call::FilterFrames { taps: 5, spare: 0 },
-        Call::FilterFrames { taps: 5, spare: 2 },
-        Call::FilterFrames { taps: 3, spare: FRAMES + 1 },
-        Call::FilterFrames { taps: 2 * FRAMES + 3, spare: 1 },
+        Call::ShiftFrames { shift: 3, spare: FRAMES + 1 },
+        Call::ShiftFramesOfConvolution,
+        Call::ReplaceEnds,
+        Call::FilterFrames { taps: 5, mirror: Mirror::Even },
+        Call::FilterFrames { taps: 5, mirror: Mirror::Odd },
+        Call::FilterFramesOfConvolution,
+        // Longer than the period.
+        Call::FilterFrames { taps: 4 * FRAMES + 3, mirror: Mirror::Even },
+        Call::FilterFrames { taps: 4 * FRAMES + 3, mirror: Mirror::Odd },
         Call::HeldMask,
         Call::StridedMask,
     ];

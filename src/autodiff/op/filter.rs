@@ -7,39 +7,36 @@ use ndarray::Array2;
 use crate::autodiff::element::Element;
 use crate::autodiff::operation::{Backward, Operation, Run, expect_axes};
 use crate::autodiff::tensor::Tensor;
-use crate::model::{GraphError, Result};
+use crate::model::{GraphError, Mirror, Result};
 
-/// y\[t, c\] = Σ_j h\[c, j\] x\[t + j − m\], m = ⌊taps / 2⌋; x counts as zero beyond either end and in its last
-/// `spare` frames.
+/// y\[t, c\] = Σ_j h\[c, j\] x\[t + j − m\], m = ⌊taps / 2⌋; beyond its ends x is mirrored.
 ///
 /// \[batch, frames, channels\] → the same
 pub struct FilterFrames {
     /// h, \[channels, taps\], which is no parameter and learns nothing.
     pub kernel: Arc<Array2<f64>>,
-    pub spare: usize,
+    pub mirror: Mirror,
 }
 
 impl FilterFrames {
-    /// Filters, or for the gradient applies the transpose, which is the filter with its taps in reverse.
+    /// Filters, or for the gradient applies the transpose, which gives to the frame that a tap was taken from.
     fn apply<E: Element>(&self, shape: &[usize], x: &[E], y: &mut [E], is_transposed: bool) {
         let (frames, channels, taps) = (shape[1], shape[2], self.kernel.ncols());
-        let kernel: Vec<E> = self.kernel.iter().map(|&h| E::from_f64(h)).collect();
-        let half = taps / 2;
+        let kernel: Vec<E> = self.kernel.t().iter().map(|&h| E::from_f64(h)).collect();
+        let half = (taps / 2) as isize;
         y.fill(E::ZERO);
-        let counted = frames.saturating_sub(self.spare);
-        // The frames that are filtered, and those that are filled.
-        let (n_from, n_to) = if is_transposed { (frames, counted) } else { (counted, frames) };
         let sample = (frames * channels).max(1);
         for (y, x) in y.chunks_exact_mut(sample).zip(x.chunks_exact(sample)) {
-            for t in 0..n_to {
-                for j in 0..taps {
-                    let Some(from) = (t + j).checked_sub(half).filter(|&s| s < n_from) else {
-                        continue;
-                    };
-                    let tap = if is_transposed { taps - 1 - j } else { j };
-                    for c in 0..channels {
-                        let h = kernel[c * taps + tap];
-                        y[t * channels + c] += h * x[from * channels + c];
+            for t in 0..frames {
+                for (j, h) in kernel.chunks_exact(channels).enumerate() {
+                    let place = t as isize + j as isize - half;
+                    let Some((taken, sign)) = self.mirror.frame(place, frames) else { continue };
+                    let (from, to) = if is_transposed { (t, taken) } else { (taken, t) };
+                    let sign = E::from_f64(sign);
+                    let x = &x[from * channels..][..channels];
+                    let y = &mut y[to * channels..][..channels];
+                    for ((y, &x), &h) in y.iter_mut().zip(x).zip(h) {
+                        *y += sign * h * x;
                     }
                 }
             }

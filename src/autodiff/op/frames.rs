@@ -33,9 +33,9 @@ enum Choice {
         skip: usize,
         drop: usize,
     },
-    /// Those that come later; past the last that is not spared, that one.
-    Later {
-        shift: usize,
+    /// Those that come later, or earlier; past the first and the last that is not spared, that one.
+    Shifted {
+        shift: isize,
         spare: usize,
     },
 }
@@ -61,9 +61,9 @@ impl TakeFrames {
         Self::new("inner_frames", Choice::Inner { skip, drop })
     }
 
-    /// Frame t + `shift` at t, but none of the last `spare`: the one before them is held.
-    pub fn later(shift: usize, spare: usize) -> Self {
-        Self::new("later_frames", Choice::Later { shift, spare })
+    /// Frame t + `shift` at t, but none of the last `spare`: the one before them is held, as the first is.
+    pub fn shifted(shift: isize, spare: usize) -> Self {
+        Self::new("shift_frames", Choice::Shifted { shift, spare })
     }
 
     fn new(name: &'static str, choose: Choice) -> Self {
@@ -99,9 +99,9 @@ impl<E: Element> Operation<E> for TakeFrames {
                 }
                 (0..wanted).collect()
             }
-            Choice::Later { shift, spare } => {
+            Choice::Shifted { shift, spare } => {
                 let last = (frames - 1).saturating_sub(spare);
-                (0..frames).map(|i| (i + shift).min(last)).collect()
+                (0..frames).map(|i| i.saturating_add_signed(shift).min(last)).collect()
             }
             Choice::Inner { skip, drop } if skip + drop < frames => (skip..frames - drop).collect(),
             Choice::Inner { skip, drop } => {
@@ -140,6 +140,60 @@ impl<E: Element> Operation<E> for TakeFrames {
             found.push(None);
         }
         found
+    }
+}
+
+/// The first frame of a second input, the last of a third, and in between those of the first.
+///
+/// All \[batch, frames, channels\] → the same; of a single frame the third input counts.
+pub struct ReplaceEnds;
+
+impl ReplaceEnds {
+    /// Returns the input that frame t is taken from.
+    fn source(t: usize, frames: usize) -> usize {
+        if t + 1 == frames { 2 } else { usize::from(t == 0) }
+    }
+}
+
+impl<E: Element> Operation<E> for ReplaceEnds {
+    fn name(&self) -> &'static str {
+        "replace_ends"
+    }
+
+    fn forward(&mut self, x: &[&Tensor<E>], run: &Run<E>) -> Result<Tensor<E>> {
+        expect_axes("replace_ends", "input", x[0], 3, AXES)?;
+        for end in &x[1..] {
+            if end.shape() != x[0].shape() {
+                let (found, wanted) = (end.shape(), x[0].shape());
+                let problem = format!("an end has shape {found:?}, input expects {wanted:?}");
+                return Err(GraphError::shape("replace_ends", problem));
+            }
+        }
+        let (frames, channels) = (x[0].shape()[1], x[0].channels());
+        Ok(run.tensor(x[0].shape(), |y| {
+            for (i, y) in y.chunks_exact_mut(channels.max(1)).enumerate() {
+                let source = x[Self::source(i % frames, frames)];
+                y.copy_from_slice(&source.data()[i * channels..][..channels]);
+            }
+        }))
+    }
+
+    fn backward(&mut self, dy: Tensor<E>, at: &mut Backward<E>) -> Vec<Option<Tensor<E>>> {
+        let (frames, channels) = (dy.shape()[1], dy.channels());
+        let needs = at.needs.to_vec();
+        let gradient = |input: usize| {
+            at.tensor(dy.shape(), |dx| {
+                let rows =
+                    dx.chunks_exact_mut(channels.max(1)).zip(dy.data().chunks_exact(channels));
+                for (i, (dx, dy)) in rows.enumerate() {
+                    match Self::source(i % frames, frames) == input {
+                        true => dx.copy_from_slice(dy),
+                        false => dx.fill(E::ZERO),
+                    }
+                }
+            })
+        };
+        needs.iter().enumerate().map(|(i, needed)| needed.then(|| gradient(i))).collect()
     }
 }
 

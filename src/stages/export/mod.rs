@@ -55,11 +55,10 @@ pub struct Params {
     /// Licence of the model, as people will read it in its files.
     #[arg(long, value_name = "TEXT", default_value = "not stated")]
     pub licence: String,
-    /// End the decoder with fusion, as filters over frames, for programs that run its file without post-processing:
-    /// decoded velocities are then those of decoded poses, less exactly at the ends of a window, where generate's own
-    /// fusion is exact.
+    /// Leave out the decoder's last layer, which fuses poses with velocities: decoded channels then contradict each
+    /// other, and agree only after post-processing.
     #[arg(long)]
-    pub fuse_decoder: bool,
+    pub no_fusion: bool,
     /// Largest weights that lie within the .onnx file itself, in MB; larger ones lie beside it.
     #[arg(long, value_name = "MB", default_value_t = 1000)]
     pub embed_mb: usize,
@@ -114,7 +113,7 @@ impl Stage for Export {
         // In training its heads speak for themselves, and by what they were measured to leave they are fused.
         trained.state.config.network.decoder.fusion = sampling
             .as_ref()
-            .filter(|_| params.fuse_decoder)
+            .filter(|_| !params.no_fusion)
             .map(|sampling| sampling.fusion_variances);
         let measured = (motion_range(&phrases.dataset)?, sampling);
         let files = Files::make(&trained, &params, measured, learned_from)?;
