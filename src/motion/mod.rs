@@ -39,7 +39,8 @@ pub mod trajectory;
 
 pub use bvh::{Bvh, BvhError, BvhNote};
 pub use capture::{
-    Axis, Capture, CaptureAccount, CaptureError, CaptureNote, convert_bvh, convert_capture,
+    Axis, Capture, CaptureAccount, CaptureError, CaptureNote, RigidTrack, convert_bvh,
+    convert_capture, convert_track,
 };
 pub use channels::{CHANNEL_NAMES, Channel, MOTION_DIM, channel_unit};
 pub use clock::{CLOCK_DIM, CLOCK_NAMES, clock};
