@@ -7,6 +7,7 @@
 
 mod account;
 mod own;
+mod own_axes;
 mod skeleton;
 mod take;
 mod track;

@@ -8,6 +8,7 @@ use super::super::quaternion::{
 };
 use super::account::{CaptureAccount, CaptureNote};
 use super::own::{OWN_UNIT_M, is_own};
+use super::own_axes::OwnAxes;
 use super::skeleton::{Body, Positions};
 use super::unit::{DEFAULT_HEIGHT_M, is_usual, unit_of};
 use super::upright::{Axis, Up, UpBy, find_up, tilt};
@@ -131,7 +132,16 @@ impl Take {
         let to_y = found.axis.to_y();
         let at_rest = match (found.rest, &body.landmarks) {
             (Some(rest), Some(_)) => rest.to_y(),
-            _ => tilt(mul(to_y, above)),
+            _ => {
+                let of_file = tilt(mul(to_y, above));
+                match OwnAxes::find(bvh, &body, &world, &world_root, of_file) {
+                    Some(OwnAxes { up, to_body }) => {
+                        account.notes.push(CaptureNote::OwnAxes { root: account.root.clone(), up });
+                        to_body
+                    }
+                    None => of_file,
+                }
+            }
         };
         let mut orientation: Vec<Quaternion> =
             world_root.iter().map(|&q| normalize(mul(mul(to_y, q), conj(at_rest)))).collect();
