@@ -20,6 +20,7 @@ pub mod channels;
 pub mod choreography;
 pub mod clock;
 pub mod exchange;
+pub mod formats;
 pub mod kinematics;
 pub mod locking;
 pub mod lowpass;

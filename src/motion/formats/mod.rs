@@ -1,0 +1,9 @@
+//! Formats of the field that have no hierarchy of joints: each is read into the track of one rigid body.
+//!
+//! The bytes are untrusted. Nothing is allocated from a number that a file claims, and no byte makes a reader
+//! panic. [`super::convert_track`] turns a track into the 25 channels.
+
+mod keys;
+pub mod smpl;
+
+pub use smpl::SmplError;
