@@ -3,7 +3,9 @@
 //! The bytes are untrusted. Nothing is allocated from a number that a file claims, and no byte makes a reader
 //! panic. [`super::convert_track`] turns a track into the 25 channels.
 
+pub mod humanml3d;
 mod keys;
 pub mod smpl;
 
+pub use humanml3d::HumanMl3dError;
 pub use smpl::SmplError;
