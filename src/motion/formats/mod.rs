@@ -6,6 +6,8 @@
 pub mod humanml3d;
 mod keys;
 pub mod smpl;
+pub mod vmd;
 
 pub use humanml3d::HumanMl3dError;
 pub use smpl::SmplError;
+pub use vmd::VmdError;
