@@ -21,6 +21,7 @@ mod jobs;
 mod library;
 mod linear;
 mod motion_capture;
+mod motion_formats;
 mod notebooks;
 mod npy_files;
 mod object_store_conformance;

@@ -7,14 +7,17 @@
 
 mod account;
 mod own;
+mod own_axes;
 mod skeleton;
 mod take;
+mod track;
 mod unit;
 mod upright;
 
 use thiserror::Error;
 
 pub use account::{CaptureAccount, CaptureNote, Unit};
+pub use track::{RATE_RANGE_HZ, RigidTrack};
 pub use upright::Axis;
 
 use take::Take;
@@ -62,6 +65,23 @@ pub enum CaptureError {
          --up {one} or --up {other}"
     )]
     UpUnknown { one: Axis, other: Axis },
+    /// The body is carried along another axis than the format's.
+    #[error(
+        "capture holds its body along {posed}, while its format has {format} up; name the axis that is up \
+         with --up {posed} or --up {format}"
+    )]
+    UpUnlike { posed: Axis, format: Axis },
+    /// A value that is NaN or infinite.
+    #[error(
+        "capture has a value that is not finite in frame {frame}, counted from 0; repair or cut the take \
+         there"
+    )]
+    NotFinite { frame: usize },
+    /// A sampling rate that nothing is captured at.
+    #[error(
+        "capture has {rate_hz:?} frames per second, expected {low} to {high}; write the rate of the take"
+    )]
+    Rate { rate_hz: f64, low: f64, high: f64 },
     /// The capture's times cannot carry a spline.
     #[error(transparent)]
     Spline(#[from] SplineError),
@@ -95,11 +115,28 @@ pub fn convert_capture(
     beats: Option<&Beats>,
     up: Option<Axis>,
 ) -> Result<Capture, CaptureError> {
-    let (mut take, mut account) = Take::of(bvh, up)?;
+    let (take, mut account) = Take::of(bvh, up)?;
     let notes = bvh.notes().iter().map(|note| CaptureNote::Text(note.to_string()));
     account.notes.splice(0..0, notes);
+    Ok(Capture { trajectory: trajectory_of(take, beats)?, account })
+}
+
+/// Converts the track of one rigid body to a trajectory, as [`convert_capture`] does with a hierarchy.
+///
+/// Where the body stands over the floor is as the file says unless points beside it show the floor. A track
+/// that was drawn between keys is not filtered. Errors: [`CaptureError`].
+pub fn convert_track(
+    track: &RigidTrack,
+    beats: Option<&Beats>,
+    up: Option<Axis>,
+) -> Result<Capture, CaptureError> {
+    let (take, account) = Take::of_track(track, up)?;
+    Ok(Capture { trajectory: trajectory_of(take, beats)?, account })
+}
+
+fn trajectory_of(mut take: Take, beats: Option<&Beats>) -> Result<Trajectory, CaptureError> {
     let (grid_s, t_kept) = take.resampling_grid()?;
-    if !take.is_own {
+    if !take.is_smooth {
         take.lowpass();
     }
 
@@ -129,7 +166,9 @@ pub fn convert_capture(
         *p = std::array::from_fn(|axis| p[axis] - origin[axis]);
     }
     let mut nodes = Vec::with_capacity(take.nodes.len());
-    for (i, signal) in take.nodes.iter().enumerate() {
+    // A point without others beside it has no limbs.
+    let limbs = if take.nodes.len() > 3 { take.nodes.as_slice() } else { &[] };
+    for (i, signal) in limbs.iter().enumerate() {
         let centred: Vec<f64> = signal.iter().map(|x| x - origin[i % 3]).collect();
         nodes.push(resample(&take.times_s, &centred, &grid_s[..t_kept])?);
     }
@@ -156,7 +195,7 @@ pub fn convert_capture(
     }
     let trajectory = Trajectory::new(frames)?;
     trajectory.check_finite()?;
-    Ok(Capture { trajectory, account })
+    Ok(trajectory)
 }
 
 fn resample(times_s: &[f64], signal: &[f64], grid_s: &[f64]) -> Result<Vec<f64>, SplineError> {

@@ -20,6 +20,7 @@ pub mod channels;
 pub mod choreography;
 pub mod clock;
 pub mod exchange;
+pub mod formats;
 pub mod kinematics;
 pub mod locking;
 pub mod lowpass;
@@ -39,7 +40,8 @@ pub mod trajectory;
 
 pub use bvh::{Bvh, BvhError, BvhNote};
 pub use capture::{
-    Axis, Capture, CaptureAccount, CaptureError, CaptureNote, convert_bvh, convert_capture,
+    Axis, Capture, CaptureAccount, CaptureError, CaptureNote, RigidTrack, convert_bvh,
+    convert_capture, convert_track,
 };
 pub use channels::{CHANNEL_NAMES, Channel, MOTION_DIM, channel_unit};
 pub use clock::{CLOCK_DIM, CLOCK_NAMES, clock};

@@ -11,7 +11,7 @@ mod tests;
 use std::io::{self, Read};
 
 pub use error::NpyError;
-pub(crate) use error::preview;
+pub(crate) use error::{clip, preview};
 use header::{Dtype, Header, Kind};
 
 /// Most bytes one array may take in memory, and most that are read for it: 1 GiB.
@@ -203,7 +203,7 @@ fn checked_count<T>(dtype: &Dtype, shape: &[usize], limit_bytes: u64) -> Result<
         shape.iter().fold(item_bytes, |bytes, &length| bytes.saturating_mul(length.max(1) as u64));
     if declared_bytes > limit_bytes {
         let lengths: Vec<String> = shape.iter().map(usize::to_string).collect();
-        let shape = error::clip(&lengths.join(", "));
+        let shape = clip(&lengths.join(", "));
         let descr = dtype.descr.clone();
         return Err(NpyError::TooLarge { shape, descr, declared_bytes, limit_bytes });
     }

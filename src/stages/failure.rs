@@ -52,6 +52,8 @@ kinds! {
     Layout = "layout",
     LengthMismatch = "length_mismatch",
     MissingKey = "missing_key",
+    /// A motion file that is not as its format has it.
+    MotionFormat = "motion_format",
     Name = "name",
     /// A song without enough beats to dance to.
     NoBeats = "no_beats",

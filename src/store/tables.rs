@@ -29,7 +29,7 @@ rows! {
         has_features: bool, "", "Whether the phrase has a feature file, or was constructed with features.";
         has_audio: bool, "", "Whether the phrase has audio.";
         has_beats: bool, "", "Whether the phrase has beat times (beat list, feature file, or those of its song).";
-        motion_format: Option<String>, "", "`npy` (25 channels as they were), `bvh` (converted) or `constructed` (by library).";
+        motion_format: Option<String>, "", "`npy` (25 channels as they were), the format that was converted (`bvh`, `aist`, `amass`, `smpl`, `humanml3d`, `vmd`, `vmd_camera`) or `constructed` (by library).";
         motion_root: Option<String>, "", "Of a capture: the joint whose motion it is, the first that moves or branches. This and the columns to `motion_notes` are none for other motion, and in rows of release 0.1.";
         motion_up: Option<String>, "", "Of a capture: the axis that is up in the file, found or given by --up: `y`, `z`, `x`, `-y`, `-z` or `-x`.";
         motion_unit_m: Option<f64>, "m", "Of a capture: length of one file unit, guessed from the lengths of bones.";

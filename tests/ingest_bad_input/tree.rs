@@ -59,7 +59,7 @@ fn folders() -> Vec<Case> {
         Case::tree("folder-empty", "motion/folder-empty",
             |source| create_dir_all(source.join("motion/folder-empty")).unwrap(),
             "layout",
-            "folder {path} holds no trajectory.npy or motion.bvh; add it or remove the folder"),
+            "folder {path} holds no trajectory.npy or motion.bvh (or .npz, .npy, .vmd); add it or remove the folder"),
         Case::tree("features-folder-empty", "audio_features/features-folder-empty",
             |source| create_dir_all(source.join("audio_features/features-folder-empty")).unwrap(),
             "layout",
@@ -67,7 +67,7 @@ fn folders() -> Vec<Case> {
         Case::files("file-misnamed",
             [("motion/file-misnamed/Trajectory.npy", trajectory(&coherent(9, 1)))],
             "motion/file-misnamed", "layout",
-            "folder {path} holds no trajectory.npy or motion.bvh; add it or remove the folder"),
+            "folder {path} holds no trajectory.npy or motion.bvh (or .npz, .npy, .vmd); add it or remove the folder"),
     ]
 }
 

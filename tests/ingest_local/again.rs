@@ -175,7 +175,7 @@ fn a_dry_run_says_what_would_be_done_and_writes_nothing() {
     let output = ingest(&source, &store, &["--dry-run"]);
     says(&output, "would read 3 phrases (1 of them cannot be read), leave 0 as they are\n");
     let failed = "\n  failed [layout] phrase empty: folder motion/empty holds no trajectory.npy or \
-                  motion.bvh; add it or remove the folder\n";
+                  motion.bvh (or .npz, .npy, .vmd); add it or remove the folder\n";
     assert!(output.stdout.contains(failed), "{}", output.stdout);
     assert!(!store.exists());
 

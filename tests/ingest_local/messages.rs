@@ -34,8 +34,8 @@ fn what_cannot_run_says_why_in_a_sentence() {
             &[],
             format!(
                 "error: source {}: no phrases found among 1 files; expected \
-                 motion/ID/trajectory.npy (or motion.bvh), audio_features/ID/features.npz, or \
-                 audio files anywhere\n",
+                 motion/ID/trajectory.npy (or motion.bvh, .npz, .npy, .vmd), \
+                 audio_features/ID/features.npz, or audio files anywhere\n",
                 place("text")
             ),
         ),

@@ -264,7 +264,7 @@ fn nothing_to_dance_to_or_with_is_said_with_the_way_out() {
         refused(&["--songs".into(), songs.clone().into()]),
         format!(
             "error: store {place} has no captures: no phrase has motion without audio; ingest some, or \
-             name a folder of .bvh or .npy files with --captures\n"
+             name a folder of motion files with --captures\n"
         )
     );
     assert_eq!(
@@ -278,8 +278,8 @@ fn nothing_to_dance_to_or_with_is_said_with_the_way_out() {
     assert_eq!(
         refused(&from(&songs, &songs, &[])),
         format!(
-            "error: captures folder {}: no .bvh or .npy file anywhere below it; name the folder of your \
-             motion captures\n",
+            "error: captures folder {}: no .bvh, .npz, .npy or .vmd file anywhere below it; name the folder \
+             of your motion captures\n",
             songs.display()
         )
     );

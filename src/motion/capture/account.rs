@@ -42,6 +42,8 @@ pub enum CaptureNote {
     UpAssumed,
     /// Skeleton and poses differ about the axis, and the steadier floor decided.
     UpByFloor { up: Axis, other: Axis },
+    /// The root joint's axes are not the body's.
+    OwnAxes { root: String, up: Axis },
     /// Lengths are in an unusual unit.
     UnusualUnit { unit: &'static str, height_m: f64 },
     /// Lengths are in no unit of which a person would be made.
@@ -67,6 +69,10 @@ impl fmt::Display for CaptureNote {
             Self::UpByFloor { up, other } => write!(
                 f,
                 "{up} is up in the file by its steadier floor, {other} by its poses (--up names another)"
+            ),
+            Self::OwnAxes { root, up } => write!(
+                f,
+                "joint {root} has axes of its own, {up} is the body's up, it is turned upright"
             ),
             Self::UnusualUnit { unit, height_m } => {
                 write!(f, "lengths are taken for {unit}, the body for {height_m:.2} m")

@@ -138,6 +138,12 @@ impl Body {
         way
     }
 
+    /// The node next to `above` on the way up from `node`; `node` where it is not below.
+    pub fn branch_below(&self, above: usize, node: usize) -> usize {
+        let way = std::iter::successors(Some(node), |&i| self.parents[i]);
+        way.take_while(|&i| i != above).last().unwrap_or(node)
+    }
+
     fn meeting(&self, a: usize, b: usize) -> usize {
         let (mut a, mut b) = (a, b);
         while a != b {

@@ -8,6 +8,7 @@ use super::super::quaternion::{
 };
 use super::account::{CaptureAccount, CaptureNote};
 use super::own::{OWN_UNIT_M, is_own};
+use super::own_axes::OwnAxes;
 use super::skeleton::{Body, Positions};
 use super::unit::{DEFAULT_HEIGHT_M, is_usual, unit_of};
 use super::upright::{Axis, Up, UpBy, find_up, tilt};
@@ -44,8 +45,10 @@ pub struct Take {
     pub nodes: Vec<Vec<f64>>,
     /// Orientation of the root, one signal per component w, x, y, z.
     pub orientation: [Vec<f64>; 4],
-    /// Whether this program wrote it.
+    /// Whether this program wrote it: it stays where it is.
     pub is_own: bool,
+    /// Whether there is no noise to filter.
+    pub is_smooth: bool,
     /// Whether the root is the only joint.
     pub is_root_alone: bool,
 }
@@ -112,7 +115,7 @@ impl Take {
             };
         }
         let range = body.root_range(&world);
-        if range <= STILL_PER_HEIGHT * height {
+        if range <= still_range(height) {
             let (root, range_m) = (account.root.clone(), range * account.unit_m);
             account.notes.push(CaptureNote::Motionless { root, range_m });
         }
@@ -123,19 +126,29 @@ impl Take {
             nodes: turned(&body, &world, found.axis, account.unit_m),
             orientation: Default::default(),
             is_own,
+            is_smooth: is_own,
         };
         // What of the root's orientation belongs to the file's axes, not to the body.
         let to_y = found.axis.to_y();
         let at_rest = match (found.rest, &body.landmarks) {
             (Some(rest), Some(_)) => rest.to_y(),
-            _ => tilt(mul(to_y, above)),
+            _ => {
+                let of_file = tilt(mul(to_y, above));
+                match OwnAxes::find(bvh, &body, &world, &world_root, of_file) {
+                    Some(OwnAxes { up, to_body }) => {
+                        account.notes.push(CaptureNote::OwnAxes { root: account.root.clone(), up });
+                        to_body
+                    }
+                    None => of_file,
+                }
+            }
         };
         let mut orientation: Vec<Quaternion> =
             world_root.iter().map(|&q| normalize(mul(mul(to_y, q), conj(at_rest)))).collect();
         let start = if is_own {
             0
         } else {
-            let floor_m = POP_HEIGHTS_PER_S * height * account.unit_m * bvh.frame_time_s();
+            let floor_m = pop_floor_m(height * account.unit_m, bvh.frame_time_s());
             first_frame_after_pop(&take.nodes, bvh.frame_time_s(), floor_m)
         };
         if start > 0 {
@@ -264,12 +277,22 @@ pub fn forward_kinematics(
     }
 }
 
+/// Greatest range of a root that stands still, in the unit of the body's height.
+pub fn still_range(height: f64) -> f64 {
+    STILL_PER_HEIGHT * height
+}
+
+/// Shortest step of a frame that ends a leading T-pose, m.
+pub fn pop_floor_m(height_m: f64, frame_time_s: f64) -> f64 {
+    POP_HEIGHTS_PER_S * height_m * frame_time_s
+}
+
 /// First frame after a calibration pose: many takes begin with a T-pose and jump out of it.
 ///
 /// The last frame step within the first second (at most the first tenth) in which some node moves over 15
 /// times the median of the largest node step, over `floor_m`, and over three times what it moves in the step
 /// before and after.
-fn first_frame_after_pop(nodes: &[Vec<f64>], frame_time_s: f64, floor_m: f64) -> usize {
+pub fn first_frame_after_pop(nodes: &[Vec<f64>], frame_time_s: f64, floor_m: f64) -> usize {
     let n_frames = nodes.first().map_or(0, Vec::len);
     if n_frames <= MIN_FRAMES_FOR_POP {
         return 0;

@@ -56,7 +56,8 @@ impl Axis {
         }
     }
 
-    fn direction(self) -> [f64; 3] {
+    /// The axis as a unit vector.
+    pub fn direction(self) -> [f64; 3] {
         match self {
             Self::X => [1.0, 0.0, 0.0],
             Self::Y => [0.0, 1.0, 0.0],
@@ -78,6 +79,11 @@ impl Axis {
             Self::X => from_axis_angle(z, FRAC_PI_2),
             Self::MinusX => from_axis_angle(z, -FRAC_PI_2),
         }
+    }
+
+    /// The axis along which the mean of unit vectors is at least so long; none where they point everywhere.
+    pub fn along(mean: [f64; 3], least: f64) -> Option<Self> {
+        Self::ALL.into_iter().find(|axis| dot(axis.direction(), mean) >= least)
     }
 
     /// The axis next to a direction; none where two are about as near.

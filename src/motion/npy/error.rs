@@ -114,7 +114,7 @@ pub(crate) fn preview(bytes: &[u8]) -> String {
 }
 
 /// Shortens foreign text so that a hostile header cannot flood a message.
-pub(super) fn clip(text: &str) -> String {
+pub(crate) fn clip(text: &str) -> String {
     match text.char_indices().nth(MAX_QUOTED_CHARS) {
         Some((end, _)) => format!("{}…", &text[..end]),
         None => text.to_owned(),

@@ -399,7 +399,7 @@ fn version_lines(planned: &Planned) -> String {
     if has(Role::Beats) {
         lines += &format!("beats version {BEATS_VERSION}\n");
     }
-    if has(Role::MotionBvh) {
+    if has(Role::MotionCapture) {
         lines += &format!("capture version {CAPTURE_VERSION}\n");
     }
     lines

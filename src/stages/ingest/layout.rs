@@ -7,6 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crate::store::{Listing, SourceFile, SourceProblem, SourceProblemKind};
 
+use super::motion::CAPTURE_EXTENSIONS;
 use crate::stages::failure::{Failure, FailureKind};
 
 /// File name endings of audio.
@@ -19,7 +20,7 @@ pub enum Layout {
     /// Phrases if the source has `motion/` or `audio_features/`, or nothing but `audio/` and
     /// `beats/`; else a music library.
     Auto,
-    /// `motion/ID/trajectory.npy` or `motion.bvh`, `audio_features/ID/features.npz`,
+    /// `motion/ID/trajectory.npy` or `motion.bvh` (or `.npz`, `.npy`, `.vmd`), `audio_features/ID/features.npz`,
     /// `audio/ID.wav`, `beats/ID.beats.txt`.
     Phrases,
     /// Any tree of audio files; a phrase's id is its relative path, extension included.
@@ -32,7 +33,7 @@ pub enum Role {
     Audio,
     Beats,
     Features,
-    MotionBvh,
+    MotionCapture,
     MotionNpy,
 }
 
@@ -43,7 +44,7 @@ impl Role {
             Role::Audio => "audio",
             Role::Beats => "beats",
             Role::Features => "features",
-            Role::MotionBvh | Role::MotionNpy => "motion",
+            Role::MotionCapture | Role::MotionNpy => "motion",
         }
     }
 }
@@ -168,9 +169,11 @@ fn phrase_slot(path: &str) -> Option<(String, Role)> {
     let (top, rest) = path.split_once('/')?;
     let in_folder = |file: &str| rest.strip_suffix(file)?.strip_suffix('/').map(str::to_owned);
     let slot = match top {
-        "motion" => in_folder("trajectory.npy")
-            .map(|id| (id, Role::MotionNpy))
-            .or_else(|| Some((in_folder("motion.bvh")?, Role::MotionBvh))),
+        "motion" => in_folder("trajectory.npy").map(|id| (id, Role::MotionNpy)).or_else(|| {
+            let (stem, ending) = rest.rsplit_once('.')?;
+            let id = stem.strip_suffix("/motion")?.to_owned();
+            CAPTURE_EXTENSIONS.contains(&ending).then_some((id, Role::MotionCapture))
+        }),
         "audio_features" => in_folder("features.npz").map(|id| (id, Role::Features)),
         "beats" => Some((rest.strip_suffix(BEATS_SUFFIX)?.to_owned(), Role::Beats)),
         "audio" => match rest.strip_suffix(BEATS_SUFFIX) {
@@ -194,7 +197,7 @@ fn phrase_slot(path: &str) -> Option<(String, Role)> {
 fn phrase_folder(path: &str) -> Option<(String, &'static str)> {
     let (top, id) = path.split_once('/')?;
     let expects = match top {
-        "motion" => "trajectory.npy or motion.bvh",
+        "motion" => "trajectory.npy or motion.bvh (or .npz, .npy, .vmd)",
         "audio_features" => "features.npz",
         _ => return None,
     };

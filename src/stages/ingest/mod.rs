@@ -21,7 +21,9 @@ use super::failure::{Failure, failures_json, write_failures, write_notes};
 use super::seen::Seen;
 pub(in crate::stages) use layout::is_audio;
 pub use layout::{Layout, Plan, Planned, Role, plan};
-pub(in crate::stages) use motion::{notes_of, read_bvh, read_trajectory};
+pub(in crate::stages) use motion::{
+    CAPTURE_EXTENSIONS, ReadMotion, notes_of, read_bvh, read_motion, read_trajectory,
+};
 pub(in crate::stages) use phrase::read_beats;
 pub use phrase::{Rules, content_hash_of_audio};
 
@@ -99,7 +101,7 @@ impl Stage for Ingest {
         if plan.phrases.is_empty() {
             anyhow::bail!(
                 "source {}: no phrases found among {} files; expected motion/ID/trajectory.npy (or \
-                 motion.bvh), audio_features/ID/features.npz, or audio files anywhere",
+                 motion.bvh, .npz, .npy, .vmd), audio_features/ID/features.npz, or audio files anywhere",
                 source.location(),
                 plan.ignored.len()
             );

@@ -3,7 +3,7 @@
 use std::io::{Read as _, Seek as _};
 
 use super::layout::Role;
-use super::motion::{read_bvh, read_trajectory};
+use super::motion::{read_motion, read_trajectory};
 use crate::audio::header::{AudioHeader, AudioHeaderError, read_header, read_header_from};
 use crate::motion::text::text_of;
 use crate::motion::{Axis, Beats, BeatsPerBarSource, CaptureAccount, ChannelLimits, Trajectory};
@@ -103,7 +103,7 @@ impl Files {
             match role {
                 Role::Audio => of_audio = Some(hash),
                 Role::Features => of_features = Some(hash),
-                Role::Beats | Role::MotionNpy | Role::MotionBvh => {}
+                Role::Beats | Role::MotionNpy | Role::MotionCapture => {}
             }
             taken.push((role, file, content));
         }
@@ -154,14 +154,14 @@ impl Files {
                     // A beat list beside the audio was written by somebody; a tracker's was not.
                     phrase.tempo = phrase.tempo.or(features.tempo_bpm.map(tempo));
                 }
-                Role::MotionNpy | Role::MotionBvh => {
+                Role::MotionNpy | Role::MotionCapture => {
                     let bytes = bytes_of(&file, content)?;
                     let (format, motion) = if role == Role::MotionNpy {
                         ("npy", read_trajectory(path, &bytes)?)
                     } else {
-                        let capture = read_bvh(path, &bytes, phrase.beats.as_ref(), rules.up)?;
-                        phrase.capture = Some(capture.account);
-                        ("bvh", capture.trajectory)
+                        let read = read_motion(path, &bytes, phrase.beats.as_ref(), rules.up)?;
+                        phrase.capture = read.account;
+                        (read.format, read.trajectory)
                     };
                     motion.check(&rules.limits).map_err(|e| Failure::of(path, e.kind(), &e))?;
                     phrase.motion = Some(motion);

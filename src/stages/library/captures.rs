@@ -10,14 +10,14 @@ use super::Known;
 use crate::motion::choreography::{PrimitiveError, Repertoire};
 use crate::motion::{Axis, ChannelLimits, Trajectory};
 use crate::stages::failure::{Failure, FailureKind, guarded};
-use crate::stages::ingest::{notes_of, read_bvh, read_trajectory};
+use crate::stages::ingest::{CAPTURE_EXTENSIONS, ReadMotion, notes_of, read_motion};
 use crate::store::{
     Content, Listing, Source, SourceFile, SourceProblemKind, StoreError, StoreSnapshot, digest,
     tables,
 };
 
-/// Endings of the files that are read.
-const MOTION_EXTENSIONS: [&str; 2] = ["bvh", "npy"];
+/// Archives that lie beside motion and hold none: AMASS's shapes and first stages, and features of songs.
+const NOT_MOTION: [&str; 3] = ["shape.npz", "stagei.npz", "features.npz"];
 /// Largest motion file that is read, in bytes.
 const MAX_FILE_BYTES: u64 = 1 << 30;
 /// Raised when a capture is read in another way.
@@ -68,7 +68,7 @@ impl Captures {
         }
     }
 
-    /// Finds every `.bvh` and `.npy` file below a folder. `up` is the axis that is up in captures, none to
+    /// Finds every file that is named like a motion below a folder. `up` is the axis that is up in captures, none to
     /// find it.
     ///
     /// # Errors
@@ -79,7 +79,8 @@ impl Captures {
             let name = path.rsplit('/').next().unwrap_or(path);
             let extension = name.rsplit_once('.').map_or("", |(_, extension)| extension);
             !name.starts_with('.')
-                && MOTION_EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension))
+                && CAPTURE_EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension))
+                && !NOT_MOTION.iter().any(|e| name.ends_with(e))
         };
         let files: Vec<_> = files.into_iter().filter(|file| is_motion(&file.path)).collect();
         let problems = problems.into_iter();
@@ -128,7 +129,7 @@ impl Captures {
                 if ids.is_empty() {
                     bail!(
                         "store {} has no captures: no phrase has motion without audio; ingest \
-                         some, or name a folder of .bvh or .npy files with --captures",
+                         some, or name a folder of motion files with --captures",
                         place.store()
                     );
                 }
@@ -151,8 +152,8 @@ impl Captures {
             Place::Folder { source, files, problems, up } => {
                 if files.is_empty() && problems.is_empty() {
                     bail!(
-                        "captures folder {}: no .bvh or .npy file anywhere below it; name the folder \
-                         of your motion captures",
+                        "captures folder {}: no .bvh, .npz, .npy or .vmd file anywhere below it; \
+                         name the folder of your motion captures",
                         source.location()
                     );
                 }
@@ -239,26 +240,22 @@ fn bytes_of(
 
 /// One line of what the digest of captures is made from; none where all are trajectories.
 fn reading_line(files: &[SourceFile], up: Option<Axis>) -> String {
-    if !files.iter().any(|file| is_bvh(&file.path)) {
+    if files.iter().all(|file| is_npy(&file.path)) {
         return String::new();
     }
     format!("reading version {READING_VERSION}, up {}\n", up.map_or("found", Axis::name))
 }
 
-fn is_bvh(path: &str) -> bool {
-    path.rsplit_once('.').is_some_and(|(_, extension)| extension.eq_ignore_ascii_case("bvh"))
+fn is_npy(path: &str) -> bool {
+    path.rsplit_once('.').is_some_and(|(_, extension)| extension.eq_ignore_ascii_case("npy"))
 }
 
-/// Reads a capture, and what a reader should know of it.
+/// Reads a motion, and what a reader should know of it.
 fn read(
     path: &str,
     bytes: &[u8],
     up: Option<Axis>,
 ) -> Result<(Trajectory, Option<String>), Failure> {
-    if !is_bvh(path) {
-        return Ok((read_trajectory(path, bytes)?, None));
-    }
-    let capture = read_bvh(path, bytes, None, up)?;
-    let notes = notes_of(&capture.account);
-    Ok((capture.trajectory, notes))
+    let ReadMotion { trajectory, account, .. } = read_motion(path, bytes, None, up)?;
+    Ok((trajectory, account.as_ref().and_then(notes_of)))
 }

@@ -50,7 +50,7 @@ pub struct Params {
     /// Folder or bucket of songs: any tree of audio files, song.beats.txt beside song.ogg.
     #[arg(long, value_name = "DIR")]
     pub songs: Option<String>,
-    /// Folder or bucket of motion captures: any tree of .bvh and .npy ([frames, 25]) files.
+    /// Folder or bucket of motion captures: any tree of .bvh, .npz, .npy and .vmd files (docs/guide.md).
     #[arg(long, value_name = "DIR")]
     pub captures: Option<String>,
     /// The axis that is up in motion captures of --captures [default: found, by skeletons and poses].
