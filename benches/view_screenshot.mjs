@@ -21,7 +21,10 @@ const check = (is_right, what) => {
 
 const browser = await chromium.launch({
   executablePath: process.env.CHROMIUM || undefined,
-  args: ['--autoplay-policy=no-user-gesture-required', '--no-sandbox'],
+  args: [
+    '--autoplay-policy=no-user-gesture-required', '--no-sandbox', '--enable-precise-memory-info',
+    '--js-flags=--expose-gc',
+  ],
 });
 for (const colorScheme of ['light', 'dark']) {
   const context = await browser.newContext({
@@ -37,7 +40,20 @@ for (const colorScheme of ['light', 'dark']) {
     check(asked === url || /^(data|blob):/.test(asked), `asks for ${asked}`);
   });
   await page.goto(url);
-  await page.waitForFunction(() => window.motiongenReady === true, undefined, { timeout: 10_000 });
+  await page.waitForFunction(() => window.motiongenReady === true, undefined, { timeout: 60_000 });
+  // Pages of any length play their audio, from a file in memory and without the text that it came as.
+  if (await page.evaluate(() => document.getElementById('audio') !== null)) {
+    await page.waitForFunction(() => {
+      const audio = document.getElementById('audio');
+      return audio.src.startsWith('blob:') && audio.duration > 0;
+    }, undefined, { timeout: 60_000 });
+    const [heard, heap_mb] = await page.evaluate(() => {
+      globalThis.gc?.();
+      return [document.getElementById('audio').duration, performance.memory.usedJSHeapSize / 1e6];
+    });
+    check(heap_mb < 64, `holds ${heap_mb.toFixed(0)} MB beside its audio`);
+    console.log(`audio: ${heard.toFixed(2)} s, heap ${heap_mb.toFixed(0)} MB`);
+  }
   // A little past the frame's begin, as a clock is.
   const time = Number(seconds);
   const frame = await page.evaluate((s) => {

@@ -26,10 +26,11 @@ const BLOCK: usize = N_FFT - OVERLAP;
 
 /// h\[i\] = F_c · sinc(F_c z) · I₀(β√(1 − (z/194.5)²)) / I₀(β), z = i − 194.
 pub fn taps() -> Vec<f64> {
+    let window = Kaiser::new(BETA);
     (0..N_TAPS)
         .map(|i| {
             let z = i as f64 - CENTRE as f64;
-            CUT_OFF * sinc(CUT_OFF * z) * kaiser(z / HALF_LENGTH, BETA)
+            CUT_OFF * sinc(CUT_OFF * z) * window.at(z / HALF_LENGTH)
         })
         .collect()
 }
@@ -40,8 +41,22 @@ pub fn sinc(x: f64) -> f64 {
 }
 
 /// Kaiser's window I₀(β√(1 − x²))/I₀(β) for |x| < 1, else 0.
-pub fn kaiser(x: f64, beta: f64) -> f64 {
-    if x.abs() < 1.0 { bessel_i0(beta * (1.0 - x * x).sqrt()) / bessel_i0(beta) } else { 0.0 }
+#[derive(Clone, Debug, PartialEq)]
+pub struct Kaiser {
+    beta: f64,
+    /// I₀(β).
+    middle: f64,
+}
+
+impl Kaiser {
+    pub fn new(beta: f64) -> Self {
+        Self { beta, middle: bessel_i0(beta) }
+    }
+
+    /// Returns the window's value at x.
+    pub fn at(&self, x: f64) -> f64 {
+        if x.abs() < 1.0 { bessel_i0(self.beta * (1.0 - x * x).sqrt()) / self.middle } else { 0.0 }
+    }
 }
 
 /// The modified Bessel function of order 0: Σ ((x/2)ᵏ/k!)².

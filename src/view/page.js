@@ -252,9 +252,7 @@ function fill() {
   }
 }
 
-// Audio as an address is not to be sought through in every browser; as a file in memory it is.
-function bringAudio() {
-  if (!audio) return;
+function listenToAudio() {
   at('volume-choice').hidden = false;
   at('volume').addEventListener('input', (event) => {
     audio.volume = Number(event.target.value);
@@ -263,21 +261,37 @@ function bringAudio() {
     sound();
     draw();
   });
-  const address = audio.getAttribute('src');
-  const [head, base64] = address.split(';base64,');
-  let isOriginal = false;
+}
+
+function missAudio() {
+  state.hasSound = false;
+  at('problem').textContent = 'This browser cannot play the audio; the motion plays without it.';
+  at('problem').hidden = false;
+}
+
+// Returns the file that the audio element has as an address, and takes it from there: what the browser
+// reads of an address it holds beside the file.
+function takeAudio() {
+  const [head, base64] = audio.getAttribute('src').split(';base64,');
+  audio.removeAttribute('src');
+  audio.load();
+  return decodeBlob(base64, head.slice('data:'.length));
+}
+
+// Audio as an address is not to be sought through in every browser; as a file in memory it is. Until it
+// is one, the motion plays by its own clock.
+async function bringAudio() {
+  const file = await takeAudio();
   audio.addEventListener('error', () => {
-    if (isOriginal) {
-      state.hasSound = false;
-      at('problem').textContent = 'This browser cannot play the audio; the motion plays without it.';
-      at('problem').hidden = false;
-      return;
-    }
-    isOriginal = true;
-    audio.src = address;
-  });
-  const bytes = Uint8Array.from(atob(base64), (c) => c.charCodeAt(0));
-  audio.src = URL.createObjectURL(new Blob([bytes], { type: head.slice('data:'.length) }));
+    audio.addEventListener('error', missAudio);
+    const reader = new FileReader();
+    reader.onload = () => {
+      audio.src = reader.result;
+    };
+    reader.onerror = missAudio;
+    reader.readAsDataURL(file);
+  }, { once: true });
+  audio.src = URL.createObjectURL(file);
 }
 
 function run(now) {
@@ -302,11 +316,13 @@ window.motiongen = {
 
 fill();
 listen();
-bringAudio();
+if (audio) listenToAudio();
 choose(0);
 requestAnimationFrame((now) => {
   clock.wall = now;
   draw();
   window.motiongenReady = true;
   run(now);
+  // After the first picture: a long recording takes seconds.
+  if (audio) setTimeout(() => bringAudio().catch(missAudio));
 });
