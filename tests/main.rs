@@ -1,6 +1,7 @@
 //! The one integration-test crate; every file of `tests/` is a module of it.
 
 mod adversaries;
+mod audio_cases;
 mod audio_header;
 mod beats;
 mod boundaries;

@@ -50,13 +50,14 @@ const MAY_USE: [(&str, &[&str]); 19] = [
 ];
 
 /// Crates that only one place may name: crate, where.
-const KEPT_TO: [(&str, &str); 16] = [
+const KEPT_TO: [(&str, &str); 17] = [
     ("polars", "store/query"),
     ("sqlparser", "store/sql.rs"),
     ("object_store", "store/"),
     ("parquet", "store/"),
     ("arrow_array", "store/"),
     ("symphonia", "audio/"),
+    ("opus_pure", "audio/"),
     ("realfft", "audio/"),
     ("tiny_skia", "plot/"),
     ("ab_glyph", "plot/"),

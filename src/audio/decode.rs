@@ -1,20 +1,21 @@
 //! Samples of an audio file, decoded block by block to mono.
 //!
-//! Symphonia decodes; lengths follow libsndfile and libmpg123, which librosa reads with, and for
-//! MP4 files FFmpeg. Encoder delay and padding are cut where the file states them: LAME's tag in
-//! MP3 files, end positions in Ogg, the edit list or iTunes' tag in MP4. Deviations: an MP3 file of
-//! variable bit rate without a tag is read to its end (libsndfile stops at an estimate), and so
-//! are chained Ogg streams and a stream in which the number of channels changes.
+//! Lengths follow libsndfile and libmpg123, which librosa reads with, and for MP4 files, files that
+//! were appended to one another and chained streams FFmpeg. Encoder delay and padding are cut where
+//! the file states them: LAME's tag in MP3 files, end positions in Ogg, the edit list or iTunes' tag
+//! in MP4. Deviation: an MP3 file of variable bit rate without a tag is read to its end (libsndfile
+//! stops at an estimate).
 //!
-//! A file that ends early, or with damage at its end, gives the samples before that. Damage with
-//! intact data after it is an error, except in MP3 and Vorbis: there, as in libmpg123 and
-//! libsndfile, a broken MP3 frame is silence and a broken Ogg page is left out.
+//! A file that ends early, or with damage at its end, gives the samples before that, and [`Loss`]
+//! says what its header promised beyond them. Damage with intact data after it is an error, except
+//! in MP3 and Vorbis: there, as in libmpg123 and libsndfile, a broken MP3 frame is silence and a
+//! broken Ogg page is left out, up to a thousandth of the file or a second.
 
-mod edits;
+mod codec;
 mod error;
-mod flac;
+mod layer3;
+mod loss;
 mod mix;
-mod mpeg;
 mod packets;
 #[cfg(test)]
 mod tests;
@@ -22,41 +23,44 @@ mod tests;
 use std::io::{Read, Seek};
 use std::mem;
 
-use symphonia::core::codecs::audio::{AudioCodecParameters, AudioDecoder};
-use symphonia::core::formats::well_known::{FORMAT_ID_ISOMP4, FORMAT_ID_MP3};
-
-use super::header::AudioHeaderError;
-use super::header::media::{self, Survey, codec_name, container_name, pcm_frame_bytes};
-use edits::Edits;
+use super::container::{FLAC_FRAMES_START, Opened, Stream, extension};
+use super::pcm::SampleFormat;
+use codec::Codec;
 pub use error::DecodeError;
-use mpeg::Frames;
-use packets::{Source, audio_track, extension, input_error, make_decoder};
+pub use loss::Loss;
+use loss::Losses;
 
 /// Packets in a row without a sample after which a stream counts as endless. A video's packets are
 /// such, too: these are of four hours at 60 a second.
 const MAX_EMPTY_PACKETS: u64 = 1 << 20;
+
+/// Largest sample of a codec of integers, or of one that is made from them; more is damage.
+const MAX_PLAUSIBLE: f32 = 8.0;
 
 /// Decodes a file to mono f32 at its own rate, block by block.
 ///
 /// x_t = (1 / C) sum_c x_tc over the C channels of a packet, summed in f32 in NumPy's order, so
 /// that WAV, AIFF and FLAC are bit-equal to `librosa.load(path, sr=None)`.
 pub struct Decoder<'a> {
-    source: Source<'a>,
-    decoder: Box<dyn AudioDecoder>,
+    /// `None` behind the end.
+    source: Option<Stream<'a>>,
+    decoder: Codec,
     codec: &'static str,
     extension: &'static str,
     sample_rate_hz: u32,
     n_channels: u16,
-    params: AudioCodecParameters,
-    /// Channels that `decoder` expects, for MP3.
-    mpeg_channels: u16,
+    /// Whether samples may be of any size.
+    is_float: bool,
     /// Samples decoded so far, with those that are cut.
     n_decoded: u64,
     /// Samples given so far.
     n_given: u64,
+    /// Samples that the file states.
+    n_stated: Option<u64>,
+    losses: Losses,
     /// The first sample to give, and the one after the last.
     kept: (u64, u64),
-    /// Where the next packet must start, in samples; for FLAC.
+    /// Where the next packet must start, in samples; for FLAC and Vorbis.
     expected: Option<i64>,
     /// Where the next FLAC frame lies in the file, and the samples that its header promises.
     flac_frames: Option<(u64, u64)>,
@@ -64,6 +68,8 @@ pub struct Decoder<'a> {
     damage: Option<(f64, String)>,
     /// Samples beyond the stated end of an Ogg page, given unless the stream ends there.
     held: Vec<f32>,
+    /// Interleaved samples of one block.
+    values: Vec<f32>,
     /// The first block, decoded by `open`.
     first: Vec<f32>,
     n_empty_packets: u64,
@@ -71,73 +77,49 @@ pub struct Decoder<'a> {
 }
 
 impl<'a> Decoder<'a> {
-    /// Opens a WAV, AIFF, FLAC, MP3, Ogg, MP4 or ADTS file and decodes its first block.
+    /// Opens a file of any kind that is read and decodes its first block.
     ///
     /// The content decides; `extension_hint` (no dot, may be empty) only completes messages.
     /// Errors: [`DecodeError`], also for what the first block has.
     pub fn open(
-        mut input: impl Read + Seek + Send + Sync + 'a,
+        input: impl Read + Seek + Send + Sync + 'a,
         extension_hint: &str,
     ) -> Result<Self, DecodeError> {
-        let survey = Survey::of(&mut input)?;
-        let edits = match survey.head.get(4..8) {
-            // A file cut within its atoms is for symphonia to refuse.
-            Some(b"ftyp") => Edits::read(&mut input, survey.n_bytes).unwrap_or_default(),
-            _ => Edits::default(),
-        };
-        let flac_start = match survey.marker.as_slice() {
-            b"fLaC" => flac::frames_start(&mut input, survey.start).ok(),
-            _ => None,
-        };
-        let reader = media::open(input, &survey, extension_hint)?;
-        let info = reader.format_info();
-        let (format, container) = (info.format, container_name(info.short_name));
-        let (track, params) =
-            audio_track(reader.as_ref()).ok_or(AudioHeaderError::NoAudioTrack { container })?;
-        let codec = codec_name(params.codec);
+        let opened = Opened::open(input, extension_hint)?;
+        let Opened { container, codec, sample_rate_hz, n_channels, n_stated, kept, .. } = opened;
         let extension = extension(container);
-        let sample_rate_hz = params.sample_rate.unwrap_or(0);
-        if sample_rate_hz == 0 {
-            return Err(AudioHeaderError::NoSampleRate { container, codec }.into());
-        }
-        let n_channels = params.channels.as_ref().map_or(0, |channels| channels.count());
-        let n_channels = u16::try_from(n_channels).unwrap_or(0);
-        let decoder = make_decoder(&params, extension)?;
-
-        let n_samples = track.num_frames;
-        let mut kept = (0, u64::MAX);
-        if let (Some(size), Some(n)) =
-            (pcm_frame_bytes(params.codec, n_channels), survey.pcm_data_bytes)
-        {
-            kept.1 = n / size.max(1);
-        }
-        let source = if format == FORMAT_ID_MP3 {
-            let (frames, tag) =
-                Frames::open(reader.into_inner()).map_err(|e| input_error(&e, 0.0))?;
-            kept = tag.map_or(kept, |tag| (tag.start, tag.end));
-            Source::Mpeg(frames)
-        } else {
-            if format == FORMAT_ID_ISOMP4 {
-                kept = edits.of_track(track.id, sample_rate_hz, n_samples).unwrap_or(kept);
+        let (mut decoder, mut flac_frames) = (Codec::None, None);
+        let (mut is_float, mut expected) = (false, None);
+        match &opened.stream {
+            Stream::Pcm(samples) => is_float = SampleFormat::is_float(samples.format),
+            Stream::Mpeg(_) => decoder = Codec::mp3(),
+            Stream::Packets(packets) => {
+                decoder = Codec::new(&packets.params, container, extension)?;
+                is_float = codec.starts_with("pcm_f");
+                let n_samples = packets.track.num_frames;
+                let is_flac = container == "flac";
+                expected = Some(0).filter(|_| is_flac);
+                flac_frames = n_samples.filter(|_| is_flac).map(|n| (FLAC_FRAMES_START, n));
             }
-            Source::Container { reader, track_id: track.id }
-        };
+        }
         let mut decoder = Self {
-            source,
+            source: Some(opened.stream),
             decoder,
             codec,
             extension,
             sample_rate_hz,
             n_channels,
-            params,
-            mpeg_channels: n_channels,
+            is_float,
             n_decoded: 0,
             n_given: 0,
+            n_stated,
+            losses: Losses::default(),
             kept,
-            expected: flac_start.map(|_| 0),
-            flac_frames: flac_start.zip(n_samples),
+            expected,
+            flac_frames,
             damage: None,
             held: Vec::new(),
+            values: Vec::new(),
             first: Vec::new(),
             n_empty_packets: 0,
             ended: false,
@@ -165,6 +147,11 @@ impl<'a> Decoder<'a> {
         self.codec
     }
 
+    /// What the file lacks of what it states, and what could not be decoded; known at the end.
+    pub fn loss(&self) -> Loss {
+        self.losses.sum(self.n_stated, self.n_given, self.sample_rate_hz)
+    }
+
     /// Appends the next block of mono samples, at least one; false at the end.
     ///
     /// Errors: [`DecodeError`]; after one, and after the end, there are no more blocks.
@@ -180,7 +167,8 @@ impl<'a> Decoder<'a> {
             let answer = self.next_packet(mono);
             self.cut(mono, n_before);
             let answer = answer.and_then(|goes_on| {
-                self.check_finite(&mono[n_before..])?;
+                self.check_samples(&mono[n_before..])?;
+                self.losses.check(self.codec, self.sample_rate_hz, None)?;
                 Ok(goes_on)
             });
             if answer.is_err() {
@@ -200,6 +188,10 @@ impl<'a> Decoder<'a> {
                 return Err(DecodeError::NoProgress { codec, time_s: self.time_s(), n_packets });
             }
         }
+        // After an error, there is nothing left to check.
+        if self.source.take().is_some() {
+            self.losses.check(self.codec, self.sample_rate_hz, Some(self.n_given))?;
+        }
         Ok(false)
     }
 
@@ -215,10 +207,18 @@ impl<'a> Decoder<'a> {
         mono.drain(n_before..n_before + n_until(start).min(mono.len() - n_before));
     }
 
-    fn check_finite(&self, block: &[f32]) -> Result<(), DecodeError> {
-        let Some(idx) = block.iter().position(|x| !x.is_finite()) else { return Ok(()) };
-        let value = if block[idx].is_nan() { "NaN" } else { "infinite" };
+    fn check_samples(&self, block: &[f32]) -> Result<(), DecodeError> {
+        let limit = if self.is_float { f32::MAX } else { MAX_PLAUSIBLE };
+        let Some(idx) = block.iter().position(|x| !x.is_finite() || x.abs() > limit) else {
+            return Ok(());
+        };
         let time_s = (self.n_given + idx as u64) as f64 / f64::from(self.sample_rate_hz);
+        let x = block[idx];
+        if x.is_finite() {
+            let reason = format!("a sample is {:.0} times full scale", x.abs());
+            return Err(DecodeError::Damaged { codec: self.codec, time_s, reason });
+        }
+        let value = if x.is_nan() { "NaN" } else { "infinite" };
         Err(DecodeError::NotFinite { time_s, value })
     }
 

@@ -1,22 +1,25 @@
 //! Audio: bytes become samples, and samples the 163 features of every frame.
 //!
-//! Data flow: `decode` → `resample` → `features`, whose first pass collects spectra
+//! Data flow: `container` → `decode` → `resample` → `features`, whose first pass collects spectra
 //! (`spectral`: mel, RMS, centroid) and the tuning, and whose second pass adds chroma. Onsets, MFCC
 //! and beats follow from the mel bands of the whole file. Apart from them, `meter` finds the beats and bars that motion
 //! follows.
 
 pub mod beat;
 pub mod chroma;
+mod container;
 pub mod cqt;
 pub mod decimate;
 pub mod decode;
 pub mod features;
+pub mod formats;
 pub mod framing;
 pub mod header;
 pub mod mel;
 pub mod meter;
 pub mod mfcc;
 pub mod onset;
+mod pcm;
 pub mod recording;
 pub mod resample;
 mod scale;

@@ -3,7 +3,7 @@
 use std::io::{self, Read, Seek};
 
 use super::SAMPLE_RATE_HZ;
-use super::decode::{DecodeError, Decoder};
+use super::decode::{DecodeError, Decoder, Loss};
 use super::features::{FeatureError, FirstPass, RawFeatures};
 use super::meter::{Meter, MeterPass};
 use super::resample::Resampler;
@@ -42,6 +42,8 @@ pub struct Recording {
     /// The beats and bars that motion follows.
     pub meter: Meter,
     pub encoding: Encoding,
+    /// What is missing of it.
+    pub loss: Loss,
 }
 
 /// How a recording was stored.
@@ -123,7 +125,7 @@ impl Recording {
         let mut meter = MeterPass::new();
         let mut digest = Digest::default();
         let input = open().map_err(RecordingError::Open)?;
-        let encoding = decode(input, extension_hint, options, |samples| {
+        let (encoding, loss) = decode(input, extension_hint, options, |samples| {
             first.push(samples);
             meter.push(samples);
             digest.add(samples);
@@ -153,7 +155,7 @@ impl Recording {
                 }
             }
         }
-        Ok(Self { raw: second.finish(), meter, encoding })
+        Ok(Self { raw: second.finish(), meter, encoding, loss })
     }
 }
 
@@ -166,7 +168,7 @@ fn decode(
     extension_hint: &str,
     options: &Options<'_>,
     mut visit: impl FnMut(&[f32]),
-) -> Result<Encoding, RecordingError> {
+) -> Result<(Encoding, Loss), RecordingError> {
     let mut decoder = Decoder::open(input, extension_hint)?;
     let rate_hz = decoder.sample_rate_hz();
     if !(MIN_RATE_HZ..=MAX_RATE_HZ).contains(&rate_hz) {
@@ -201,11 +203,8 @@ fn decode(
     }
     resampler.finish(&mut block);
     visit(&block);
-    Ok(Encoding {
-        codec: decoder.codec(),
-        sample_rate_hz: rate_hz,
-        n_channels: decoder.n_channels(),
-    })
+    let (codec, n_channels) = (decoder.codec(), decoder.n_channels());
+    Ok((Encoding { codec, sample_rate_hz: rate_hz, n_channels }, decoder.loss()))
 }
 
 /// Tells two streams of samples apart (FNV-1a over their bits, in words).

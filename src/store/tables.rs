@@ -75,7 +75,7 @@ rows! {
 
 rows! {
     "One row per phrase whose features extract has, with what holds for the whole phrase."
-    ExtractionRow in "extractions" version 2 reads 1 sorted by [phrase_id]
+    ExtractionRow in "extractions" version 3 reads 1 sorted by [phrase_id]
     {
         phrase_id: String, "", "The phrase, as in `phrases`.";
         origin: String, "", "`audio` (extracted here) or `feature_file` (brought in from `features.npz`, as it was).";
@@ -91,6 +91,8 @@ rows! {
         sample_rate_hz: Option<i32>, "Hz", "Sample rate of the file.";
         n_channels: Option<i32>, "channels", "Channels of the file.";
         content_hash: Option<String>, "BLAKE3", "`content_hash` of the phrase when its features were extracted; where `phrases` has another, the features are of files that were replaced. None in rows of version 1.";
+        truncated: Option<bool>, "", "Whether the audio ends more than a frame before the end that its header states. This and `lost_s` are none without audio, and in rows of versions 1 and 2.";
+        lost_s: Option<f64>, "s", "Audio that is missing at such an end or that could not be decoded; of the latter, more than a thousandth or 1 s fails the phrase instead.";
     }
 }
 

@@ -45,13 +45,13 @@ pub struct Audio {
 /// of which browsers look at the bytes.
 pub fn mime_of(extension: &str) -> &'static str {
     match extension.to_ascii_lowercase().as_str() {
-        "mp3" => "audio/mpeg",
-        "wav" => "audio/wav",
+        "mp3" | "mpga" => "audio/mpeg",
+        "wav" | "wave" => "audio/wav",
         "flac" => "audio/flac",
         "ogg" | "oga" | "opus" => "audio/ogg",
-        "m4a" | "mp4" => "audio/mp4",
+        "m4a" | "m4b" | "mp4" => "audio/mp4",
         "aac" => "audio/aac",
-        "aif" | "aiff" => "audio/aiff",
+        "aif" | "aifc" | "aiff" => "audio/aiff",
         _ => "application/octet-stream",
     }
 }

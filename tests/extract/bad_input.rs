@@ -17,7 +17,7 @@ const A: usize = 128 + 9;
 const RMS: usize = 160;
 
 /// Returns a mono WAV file of 32-bit floats.
-fn float_wav(rate_hz: u32, samples: &[f32]) -> Vec<u8> {
+pub(super) fn float_wav(rate_hz: u32, samples: &[f32]) -> Vec<u8> {
     let spec = hound::WavSpec {
         channels: 1,
         sample_rate: rate_hz,
@@ -178,6 +178,9 @@ const REFUSED: [Refusal; 6] = [
     ("corrupt", "audio_data",
         "audio/corrupt.flac: flac data is damaged at 0.46 s (a frame's checksum does not match); \
          re-encode or restore the file"),
+    ("glitch", "audio_data",
+        "audio/glitch.mp3: mp3 data is damaged at 0.24 s, and 0.03 s of it cannot be decoded; \
+         re-encode or restore the file"),
     ("gone", "unreadable", "{source}/audio/gone.wav: not found"),
     ("infinite", "audio_not_finite",
         "audio/infinite.wav: sample at 0.499 s is infinite; samples must be finite, export the file \
@@ -185,9 +188,6 @@ const REFUSED: [Refusal; 6] = [
     ("nan", "audio_not_finite",
         "audio/nan.wav: sample at 0.250 s is NaN; samples must be finite, export the file again, for \
          example as 16-bit integers"),
-    ("opus", "audio_codec",
-        "audio/opus.opus: audio is Opus, which this program does not decode; convert it, for example \
-         with: ffmpeg -i in.opus out.flac"),
 ];
 
 #[test]
@@ -208,7 +208,12 @@ fn broken_files_fail_alone_and_are_done_once_repaired() {
     samples[2_000] = 0.1;
     samples[3_992] = f32::INFINITY;
     dir.write("source/audio/infinite.wav", float_wav(8_000, &samples));
-    dir.write("source/audio/opus.opus", read(&golden("audio_header/opus.opus")));
+    let mut glitch = read(&golden("audio_header/cbr_no_xing.mp3"));
+    // The tenth frame of 64 kbit/s, but for its header.
+    let first = glitch.windows(2).position(|two| two == [0xff, 0xfb]).unwrap();
+    let tenth = (first + 9 * 208..).find(|&at| glitch[at..].starts_with(&[0xff, 0xfb])).unwrap();
+    glitch[tenth + 4..tenth + 204].fill(0xff);
+    dir.write("source/audio/glitch.mp3", glitch);
     let output = ingest(&source, &store, &[]);
     assert_eq!(output.code, 0, "{output:?}");
     let mut file =
@@ -236,7 +241,7 @@ fn broken_files_fail_alone_and_are_done_once_repaired() {
         assert_eq!(row.stage, "extract");
         let extension = match id.as_str() {
             "corrupt" => "flac",
-            "opus" => "opus",
+            "glitch" => "mp3",
             _ => "wav",
         };
         let path = source.join(format!("audio/{id}.{extension}"));
@@ -262,8 +267,8 @@ fn broken_files_fail_alone_and_are_done_once_repaired() {
     for name in ["nan", "infinite"] {
         dir.write(format!("source/audio/{name}.wav"), float_wav(8_000, &samples));
     }
-    std::fs::remove_file(source.join("audio/opus.opus")).unwrap();
-    dir.write("source/audio/opus.wav", wav(0.2));
+    std::fs::remove_file(source.join("audio/glitch.mp3")).unwrap();
+    dir.write("source/audio/glitch.wav", wav(0.2));
     let output = ingest(&source, &store, &[]);
     assert_eq!(output.code, 0, "{output:?}");
     let output = extract(&store, &[]);
@@ -271,7 +276,7 @@ fn broken_files_fail_alone_and_are_done_once_repaired() {
     assert_eq!(told(&store), []);
     assert_consistent(&store);
     let found = extractions(&store);
-    let ids = ["changed", "corrupt", "gone", "infinite", "nan", "opus", "sound-1", "sound-2"];
+    let ids = ["changed", "corrupt", "glitch", "gone", "infinite", "nan", "sound-1", "sound-2"];
     assert_eq!(found.keys().collect::<Vec<_>>(), ids);
     let frames = features(&store);
     assert!(frames["gone"] == frames["sound-1"], "one file, two sets of features");
@@ -361,5 +366,37 @@ fn limits_fail_the_files_beyond_them() {
     assert_eq!(output.code, 0, "{output:?}");
     assert_eq!(told(&store), []);
     assert_eq!(extractions(&store)["long"].n_samples, Some(154_350));
+    assert_consistent(&store);
+}
+
+#[test]
+fn a_file_that_ends_early_is_told_and_marked() {
+    let dir = Dir::new();
+    let (source, store) = (dir.at("source"), dir.at("store"));
+    let case = |name: &str| {
+        read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/audio_cases").join(name))
+    };
+    dir.write("source/audio/half.flac", case("half_flac.flac"));
+    // A chain of two links, and names that are less usual.
+    dir.write("source/audio/chain.oga", case("a19_chained_same.ogg"));
+    dir.write("source/audio/adts.aac", case("a31_adts.aac"));
+    assert_eq!(ingest(&source, &store, &[]).code, 0);
+    let output = extract(&store, &[]);
+    assert_eq!(output.code, 0, "{output:?}");
+    let line = "  half ends before its header says: 5.38 s are missing\n";
+    assert!(output.stdout.contains(line), "{}", output.stdout);
+    let found = extractions(&store);
+    let marks = found.values().map(|row| (row.phrase_id.as_str(), row.n_samples, row.truncated));
+    assert_eq!(
+        marks.collect::<Vec<_>>(),
+        [
+            ("adts", Some(134_144), Some(false)),
+            ("chain", Some(264_600), Some(false)),
+            ("half", Some(233_472), Some(true)),
+        ]
+    );
+    let lost_s = found["half"].lost_s.unwrap();
+    assert!((lost_s - (470_723.0 - 233_472.0) / 44_100.0).abs() < 1e-9, "{lost_s}");
+    assert_eq!(found["chain"].lost_s, Some(0.0));
     assert_consistent(&store);
 }

@@ -3,6 +3,7 @@
 use std::path::Path;
 use std::time::Duration;
 
+use super::bad_input::float_wav;
 use super::{assert_consistent, contents, copy, extract, extract_command, extractions};
 use crate::ingest_kill::Running;
 use crate::support::files::{features_npz, wav};
@@ -33,8 +34,8 @@ fn runs_killed_six_times_commit_what_one_undisturbed_run_commits() {
     }
     // Two that fail, each time with the same sentence.
     for i in [3, 20] {
-        let opus = super::read(&super::golden("audio_header/opus.opus"));
-        dir.write(format!("source/audio/opus {i:02}.opus"), opus);
+        let infinite = float_wav(8_000, &[0.1, f32::INFINITY]);
+        dir.write(format!("source/audio/infinite {i:02}.wav"), infinite);
     }
     let (one, two) = (features_npz(1), features_npz(2));
     for i in 0..N_IMPORTED {

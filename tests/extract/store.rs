@@ -108,6 +108,8 @@ fn tables_hold_what_the_files_hold() {
         sample_rate_hz: Some(44_100),
         n_channels: Some(1),
         content_hash: Some(phrases["clicks"].content_hash.clone()),
+        truncated: Some(false),
+        lost_s: Some(0.0),
     };
     assert_eq!(rows["clicks"], expected);
     let expected = ExtractionRow {
@@ -125,6 +127,8 @@ fn tables_hold_what_the_files_hold() {
         sample_rate_hz: None,
         n_channels: None,
         content_hash: Some(phrases["imported"].content_hash.clone()),
+        truncated: None,
+        lost_s: None,
     };
     assert_eq!(rows["imported"], expected);
     let row = &rows["a b/ü"];

@@ -271,7 +271,7 @@ fn nothing_to_dance_to_or_with_is_said_with_the_way_out() {
         refused(&from(&captures, &captures, &[])),
         format!(
             "error: songs folder {}: no audio among 3 files; name the folder of your music (WAV, AIFF, \
-             FLAC, MP3, Ogg Vorbis, M4A or AAC)\n",
+             FLAC, MP3, Ogg Vorbis, Opus, M4A or AAC)\n",
             captures.display()
         )
     );

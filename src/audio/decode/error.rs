@@ -14,12 +14,6 @@ pub enum DecodeError {
         "audio file could not be read on at {time_s:.2} s ({reason}); check the disk and try again"
     )]
     Input { time_s: f64, reason: String },
-    /// A codec that nothing here decodes.
-    #[error(
-        "audio is {name}, which this program does not decode; convert it, for example with: \
-         ffmpeg -i in.{extension} out.flac"
-    )]
-    UnsupportedCodec { name: &'static str, extension: &'static str },
     /// A codec that is known, with parameters that are not.
     #[error(
         "{codec} stream cannot be decoded ({reason}); convert it, for example with: \
@@ -29,6 +23,12 @@ pub enum DecodeError {
     /// Data that breaks its codec's rules, with intact data after it.
     #[error("{codec} data is damaged at {time_s:.2} s ({reason}); re-encode or restore the file")]
     Damaged { codec: &'static str, time_s: f64, reason: String },
+    /// More of a stream lost than can pass for a glitch.
+    #[error(
+        "{codec} data is damaged at {time_s:.2} s, and {lost_s:.2} s of it cannot be decoded; \
+         re-encode or restore the file"
+    )]
+    Lost { codec: &'static str, time_s: f64, lost_s: f64 },
     /// Two sample rates in one file.
     #[error(
         "sample rate changes from {from_hz} Hz to {to_hz} Hz at {time_s:.2} s; split the file \
@@ -61,8 +61,11 @@ impl DecodeError {
     pub fn kind(&self) -> &'static str {
         match self {
             Self::Header(error) => error.kind(),
-            Self::UnsupportedCodec { .. } | Self::UnsupportedStream { .. } => "audio_codec",
-            Self::Input { .. } | Self::Damaged { .. } | Self::NoProgress { .. } => "audio_data",
+            Self::UnsupportedStream { .. } => "audio_codec",
+            Self::Input { .. }
+            | Self::Damaged { .. }
+            | Self::Lost { .. }
+            | Self::NoProgress { .. } => "audio_data",
             Self::RateChange { .. } => "audio_sample_rate",
             Self::NotFinite { .. } => "audio_not_finite",
             Self::NoSamples { .. } => "audio_no_samples",

@@ -34,6 +34,24 @@ pub(super) fn append_mono(buffer: &GenericAudioBufferRef<'_>, mono: &mut Vec<f32
     }
 }
 
+/// Appends mean_c x_c of each frame of interleaved samples to `mono`.
+pub(super) fn append_interleaved(values: &[f32], n_channels: u16, mono: &mut Vec<f32>) {
+    let mean = |sum: f32| sum / f32::from(n_channels);
+    match n_channels {
+        0 => {}
+        1 => mono.extend_from_slice(values),
+        2 => mono.extend(values.as_chunks::<2>().0.iter().map(|[l, r]| (0.0 + l + r) / 2.0)),
+        3..8 => {
+            let frames = values.chunks_exact(usize::from(n_channels));
+            mono.extend(frames.map(|frame| mean(frame.iter().fold(0.0, |sum, x| sum + x))));
+        }
+        _ => {
+            let frames = values.chunks_exact(usize::from(n_channels));
+            mono.extend(frames.map(|frame| mean(0.0 + pairwise_sum(frame))));
+        }
+    }
+}
+
 fn append<S: Sample>(
     buffer: &AudioBuffer<S>,
     to_f32: impl Fn(S) -> f32 + Copy,

@@ -3,46 +3,54 @@
 use std::io;
 use std::mem;
 
-use symphonia::core::codecs::audio::{AudioCodecParameters, AudioDecoder, AudioDecoderOptions};
+use symphonia::core::codecs::audio::AudioDecoder;
 use symphonia::core::errors::Error;
-use symphonia::core::formats::{FormatReader, Track, TrackType};
 use symphonia::core::packet::Packet;
 use symphonia::core::units::{Duration, Timestamp};
 
-use super::mpeg::{FrameHeader, Frames};
-use super::{DecodeError, Decoder, flac, mix};
-use crate::audio::header::media::codec_name;
+use super::codec::Codec;
+use super::layer3::{Fault, MAX_FRAME_SAMPLES};
+use super::{DecodeError, Decoder, MAX_PLAUSIBLE, mix};
+use crate::audio::container::media::codec_name;
+use crate::audio::container::mpeg::FrameHeader;
+use crate::audio::container::{Stream, audio_track, possible_frame};
+
+/// Samples of the longest Vorbis block are 8,192, of the usual one 2,048: positions of pages that
+/// jump by less are an encoder's, not a page's that is missing.
+const MIN_GAP_SAMPLES: i64 = 2_048;
 
 /// Samples beyond the stated end of pages in a row after which that end counts as wrong. One page
 /// has 255 packets, of up to 8,192 samples.
 const MAX_HELD_SAMPLES: usize = 1 << 20;
 
-/// Where packets come from.
-pub(super) enum Source<'a> {
-    Container { reader: Box<dyn FormatReader + 'a>, track_id: u32 },
-    Mpeg(Frames<'a>),
-    Ended,
-}
-
 impl Decoder<'_> {
     /// Decodes one packet onto `mono`, which may give no samples; false at the end.
     pub(super) fn next_packet(&mut self, mono: &mut Vec<f32>) -> Result<bool, DecodeError> {
+        let time_s = self.time_s();
         match &mut self.source {
-            Source::Mpeg(frames) => {
-                let (header, packet) = match frames.next() {
+            None => Ok(false),
+            Some(Stream::Pcm(samples)) => {
+                samples.next(&mut self.values).map_err(|e| input_error(&e, time_s))?;
+                mix::append_interleaved(&self.values, self.n_channels, mono);
+                self.n_decoded += self.values.len() as u64 / u64::from(self.n_channels).max(1);
+                Ok(!self.values.is_empty())
+            }
+            Some(Stream::Mpeg(frames)) => {
+                let Codec::Mp3(layer3) = &mut self.decoder else { return Ok(false) };
+                let (header, outcome) = match frames.next() {
                     Ok(Some((header, frame))) => {
-                        let duration = Duration::new(header.n_samples);
-                        (header, Packet::new(0, Timestamp::ZERO, duration, frame))
+                        self.values.clear();
+                        self.values.resize(header.n_values().min(MAX_FRAME_SAMPLES), 0.0);
+                        (header, layer3.decode(frame, &mut self.values))
                     }
                     Ok(None) => return Ok(false),
-                    Err(error) => return Err(input_error(&error, self.time_s())),
+                    Err(error) => return Err(input_error(&error, time_s)),
                 };
-                self.decode_mpeg(&packet, header, mono)?;
+                self.add_mpeg(header, outcome, mono)?;
                 Ok(true)
             }
-            Source::Ended => Ok(false),
-            Source::Container { reader, track_id } => match reader.next_packet() {
-                Ok(Some(packet)) if packet.track_id == *track_id => {
+            Some(Stream::Packets(packets)) => match packets.next() {
+                Ok(Some(packet)) if packet.track_id == packets.track.id => {
                     self.decode_packet(packet, mono)?;
                     Ok(true)
                 }
@@ -54,9 +62,9 @@ impl Decoder<'_> {
                     self.decode_flac_end(mono);
                     Ok(false)
                 }
-                Err(Error::IoError(error)) => Err(input_error(&error, self.time_s())),
+                Err(Error::IoError(error)) => Err(input_error(&error, time_s)),
                 Err(error) => {
-                    self.note_damage(&error);
+                    self.note_damage(reason_of(&error), 0);
                     Ok(true)
                 }
             },
@@ -68,43 +76,112 @@ impl Decoder<'_> {
         mut packet: Packet,
         mono: &mut Vec<f32>,
     ) -> Result<(), DecodeError> {
+        let Self { decoder, values, .. } = self;
+        match decoder {
+            Codec::None => Ok(()),
+            Codec::Mp3(layer3) => {
+                let Some(header) = FrameHeader::parse(&packet.data) else {
+                    self.note_damage("mp3: not a frame".to_owned(), packet.dur.get());
+                    return Ok(());
+                };
+                values.clear();
+                values.resize(header.n_values().min(MAX_FRAME_SAMPLES), 0.0);
+                let outcome = layer3.decode(&packet.data, values);
+                self.add_mpeg(header, outcome, mono)
+            }
+            Codec::Opus(opus) => {
+                let n_beyond = mem::take(&mut packet.trim_end).get() as usize;
+                let outcome = opus.decode(&packet.data, values);
+                let n_channels = opus.n_channels;
+                self.hold(n_beyond, mono);
+                let n_before = mono.len();
+                match outcome {
+                    Ok(()) => mix::append_interleaved(&self.values, n_channels, mono),
+                    Err(reason) => {
+                        self.note_damage(reason, packet.dur.get());
+                        return Ok(());
+                    }
+                }
+                self.add(mono, n_before, n_beyond, 48_000, n_channels)
+            }
+            Codec::Symphonia(_) => self.decode_with_symphonia(packet, mono),
+        }
+    }
+
+    fn decode_with_symphonia(
+        &mut self,
+        mut packet: Packet,
+        mono: &mut Vec<f32>,
+    ) -> Result<(), DecodeError> {
         // Symphonia cuts what goes beyond a page's stated end; libvorbis does so on the last page
         // only, and other pages of some encoders state too early an end.
-        let n_beyond = match self.codec {
-            "vorbis" => mem::replace(&mut packet.trim_end, Duration::ZERO).get() as usize,
-            _ => 0,
+        let is_vorbis = self.codec == "vorbis";
+        let n_beyond = match is_vorbis {
+            true => mem::take(&mut packet.trim_end).get() as usize,
+            false => 0,
         };
-        if n_beyond == 0 || self.held.len() > MAX_HELD_SAMPLES {
-            self.release(mono);
+        // A hole in a file that was restored: even silence has an end mark.
+        if self.codec == "alac" && packet.data.iter().all(|&byte| byte == 0) {
+            self.note_damage("a packet of zeros".to_owned(), packet.dur.get());
+            return Ok(());
         }
+        self.hold(n_beyond, mono);
         let n_before = mono.len();
-        let buffer = match self.decoder.decode(&packet) {
-            Ok(buffer) => buffer,
-            Err(error) => {
+        let Codec::Symphonia(decoder) = &mut self.decoder else { return Ok(()) };
+        let (rate_hz, n_channels) = match decode(decoder.as_mut(), &packet, mono) {
+            Ok(found) => found,
+            Err(reason) => {
                 // libvorbis leaves such packets out, too.
-                if self.codec != "vorbis" {
-                    self.note_damage(&error);
+                match is_vorbis {
+                    true => self.losses.left_out(packet.dur.get(), self.n_given),
+                    false => self.note_damage(reason, packet.dur.get()),
                 }
                 return Ok(());
             }
         };
-        let rate_hz = buffer.spec().rate();
-        let n_channels = u16::try_from(buffer.num_planes()).unwrap_or(u16::MAX);
-        mix::append_mono(&buffer, mono);
-        let n_kept = mono.len().saturating_sub(n_beyond).max(n_before);
-        self.held.extend(mono.drain(n_kept..));
-        let n_new = (n_kept - n_before) as u64;
+        let start = packet.pts.get();
+        let gap = self.expected.map_or(0, |expected| start.saturating_sub(expected));
         if self.codec == "flac" {
             // Symphonia leaves broken frames out without a word.
-            let start = packet.pts.get();
-            if self.expected.is_some_and(|expected| start > expected) {
-                self.note_damage(&Error::DecodeError("a frame's checksum does not match"));
+            if gap > 0 {
+                self.note_damage("a frame's checksum does not match".to_owned(), 0);
             }
             self.expected = Some(start.saturating_add_unsigned(packet.dur.get()));
             if let Some((position, _)) = &mut self.flac_frames {
                 *position += packet.data.len() as u64;
             }
         }
+        if is_vorbis {
+            // Nor does it say that a page is missing.
+            if gap >= MIN_GAP_SAMPLES {
+                self.losses.left_out(gap.unsigned_abs(), self.n_given);
+            }
+            let n_whole = packet.dur.get().saturating_add(n_beyond as u64);
+            self.expected = Some(start.saturating_add_unsigned(n_whole));
+        }
+        self.add(mono, n_before, n_beyond, rate_hz, n_channels)
+    }
+
+    /// Gives what was held back of earlier pages, unless this one ends early, too.
+    fn hold(&mut self, n_beyond: usize, mono: &mut Vec<f32>) {
+        if n_beyond == 0 || self.held.len() > MAX_HELD_SAMPLES {
+            self.release(mono);
+        }
+    }
+
+    /// Counts a packet's samples, from `n_before` on in `mono`, and holds the last `n_beyond` back.
+    fn add(
+        &mut self,
+        mono: &mut Vec<f32>,
+        n_before: usize,
+        n_beyond: usize,
+        rate_hz: u32,
+        n_channels: u16,
+    ) -> Result<(), DecodeError> {
+        let n_kept = mono.len().saturating_sub(n_beyond).max(n_before);
+        self.held.extend(mono.drain(n_kept..));
+        let n_new = (n_kept - n_before) as u64;
+        self.losses.start();
         if let Some((time_s, reason)) = self.damage.take() {
             return Err(DecodeError::Damaged { codec: self.codec, time_s, reason });
         }
@@ -129,12 +206,12 @@ impl Decoder<'_> {
     fn decode_flac_end(&mut self, mono: &mut Vec<f32>) {
         let Some((position, n_samples)) = self.flac_frames.take() else { return };
         let n_missing = n_samples.saturating_sub(self.n_decoded);
-        let source = mem::replace(&mut self.source, Source::Ended);
-        let Source::Container { reader, .. } = source else { return };
-        let (rest, ends) = flac::possible_frame(&mut reader.into_inner(), position);
+        let Some(Stream::Packets(packets)) = self.source.take() else { return };
+        let Codec::Symphonia(decoder) = &mut self.decoder else { return };
+        let (rest, ends) = possible_frame(&mut packets.reader.into_inner(), position);
         for end in ends {
             let packet = Packet::new(0, Timestamp::ZERO, Duration::new(n_missing), &rest[..end]);
-            if let Ok(buffer) = self.decoder.decode(&packet)
+            if let Ok(buffer) = decoder.decode(&packet)
                 && buffer.frames() as u64 == n_missing
             {
                 mix::append_mono(&buffer, mono);
@@ -144,88 +221,70 @@ impl Decoder<'_> {
         }
     }
 
-    /// Decodes one MPEG frame; one that cannot be decoded is silence, as in libmpg123.
-    fn decode_mpeg(
+    /// Adds one MPEG frame, which lies in `values`; one that cannot be decoded is silence, as in
+    /// libmpg123.
+    fn add_mpeg(
         &mut self,
-        packet: &Packet,
         header: FrameHeader,
+        outcome: Result<(), Fault>,
         mono: &mut Vec<f32>,
     ) -> Result<(), DecodeError> {
         self.check_rate(header.sample_rate_hz)?;
-        // Symphonia's decoder refuses frames of another number of channels than its first.
         if self.n_decoded == 0 {
             self.n_channels = header.n_channels;
-        } else if self.mpeg_channels != header.n_channels {
-            self.decoder = make_decoder(&self.params, self.extension)?;
         }
-        self.mpeg_channels = header.n_channels;
-        let n_after = mono.len() + header.n_samples as usize;
-        if let Ok(buffer) = self.decoder.decode(packet) {
-            mix::append_mono(&buffer, mono);
+        let is_plausible = self.values.iter().all(|x| x.abs() <= MAX_PLAUSIBLE);
+        if outcome.is_err() || !is_plausible {
+            self.values.fill(0.0);
+            let is_cut = outcome == Err(Fault::Reservoir);
+            self.losses.silence(header.n_samples, self.n_given, is_cut);
+        } else {
+            self.losses.start();
         }
-        mono.resize(n_after, 0.0);
+        mix::append_interleaved(&self.values, header.n_channels, mono);
         self.n_decoded += header.n_samples;
         Ok(())
     }
 
     /// Goes on with the next stream of a chain (RFC 3533 section 4).
     fn next_link(&mut self) -> Result<bool, DecodeError> {
-        let Source::Container { reader, track_id } = &mut self.source else { return Ok(false) };
-        let Some((track, params)) = audio_track(reader.as_ref()) else { return Ok(false) };
-        *track_id = track.id;
-        self.decoder = make_decoder(&params, self.extension)?;
+        let Some(Stream::Packets(packets)) = &mut self.source else { return Ok(false) };
+        let Some((track, params)) = audio_track(packets.reader.as_ref()) else { return Ok(false) };
+        self.decoder = Codec::new(&params, "ogg", self.extension)?;
         self.codec = codec_name(params.codec);
+        packets.track = track;
         self.expected = None;
         self.held.clear();
         Ok(true)
     }
 
-    /// Remembers the first damage since the last intact packet.
-    fn note_damage(&mut self, error: &Error) {
+    /// Remembers the first damage since the last intact packet, and how many samples it costs.
+    fn note_damage(&mut self, reason: String, n_samples: u64) {
         let time_s = self.time_s();
-        let reason = match error {
-            Error::DecodeError(reason) | Error::Unsupported(reason) => (*reason).to_owned(),
-            other => other.to_string(),
-        };
         self.damage.get_or_insert((time_s, reason));
+        self.losses.trail(n_samples);
     }
 }
 
-pub(super) fn audio_track(reader: &dyn FormatReader) -> Option<(Track, AudioCodecParameters)> {
-    let track =
-        reader.default_track(TrackType::Audio).or_else(|| reader.first_track(TrackType::Audio))?;
-    let params = track.codec_params.as_ref()?.audio()?;
-    Some((track.clone(), params.clone()))
+/// Decodes a packet onto `mono`; returns its sample rate and number of channels.
+fn decode(
+    decoder: &mut dyn AudioDecoder,
+    packet: &Packet,
+    mono: &mut Vec<f32>,
+) -> Result<(u32, u16), String> {
+    let buffer = decoder.decode(packet).map_err(|e| reason_of(&e))?;
+    mix::append_mono(&buffer, mono);
+    let n_channels = u16::try_from(buffer.num_planes()).unwrap_or(u16::MAX);
+    Ok((buffer.spec().rate(), n_channels))
 }
 
-pub(super) fn make_decoder(
-    params: &AudioCodecParameters,
-    extension: &'static str,
-) -> Result<Box<dyn AudioDecoder>, DecodeError> {
-    let codecs = symphonia::default::get_codecs();
-    if codecs.get_audio_decoder(params.codec).is_none() {
-        let (name, extension) = match codec_name(params.codec) {
-            "opus" => ("Opus", "opus"),
-            "unknown" => ("of an unknown codec", extension),
-            name => (name, extension),
-        };
-        return Err(DecodeError::UnsupportedCodec { name, extension });
+fn reason_of(error: &Error) -> String {
+    match error {
+        Error::DecodeError(reason) | Error::Unsupported(reason) => (*reason).to_owned(),
+        other => other.to_string(),
     }
-    codecs.make_audio_decoder(params, &AudioDecoderOptions::default()).map_err(|error| {
-        let codec = codec_name(params.codec);
-        DecodeError::UnsupportedStream { codec, extension, reason: error.to_string() }
-    })
 }
 
-pub(super) fn input_error(error: &io::Error, time_s: f64) -> DecodeError {
+fn input_error(error: &io::Error, time_s: f64) -> DecodeError {
     DecodeError::Input { time_s, reason: error.to_string() }
-}
-
-/// The usual file name extension of a container.
-pub(super) fn extension(container: &'static str) -> &'static str {
-    match container {
-        "mp4" => "m4a",
-        "adts" => "aac",
-        container => container,
-    }
 }

@@ -1,6 +1,10 @@
 //! What can be wrong with an audio file's header, each as one sentence.
 
+use std::io;
+
 use symphonia::core::errors::Error;
+
+use crate::audio::container::media::Survey;
 
 /// Why a file's audio header could not be read.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -34,6 +38,18 @@ pub enum AudioHeaderError {
     /// No channels.
     #[error("{container} header gives its {codec} track 0 channels; encode the file again")]
     NoChannels { container: &'static str, codec: &'static str },
+    /// A codec or variant that nothing here decodes.
+    #[error(
+        "audio is {name}, which this program does not decode; convert it, for example with: \
+         ffmpeg -i in.{extension} out.flac"
+    )]
+    UnsupportedCodec { name: String, extension: &'static str },
+    /// HE-AAC, of which only the lower half of the spectrum could be decoded.
+    #[error(
+        "audio is HE-AAC, whose upper half of the spectrum (SBR) this program does not decode; \
+         convert it, for example with: ffmpeg -i in.{extension} out.flac"
+    )]
+    HighEfficiency { extension: &'static str },
     /// A readable header before nothing.
     #[error(
         "{container} file has 0 samples of {codec} at {sample_rate_hz} Hz; \
@@ -43,14 +59,18 @@ pub enum AudioHeaderError {
 }
 
 impl AudioHeaderError {
-    /// The error's class in reports: `audio_header` or `empty_file`.
+    /// The error's class in reports: `audio_header`, `audio_codec` or `empty_file`.
     pub fn kind(&self) -> &'static str {
         match self {
             Self::Empty => "empty_file",
+            Self::UnsupportedCodec { .. } | Self::HighEfficiency { .. } => "audio_codec",
             _ => "audio_header",
         }
     }
 }
+
+/// What is said of a header that goes on behind the end of its file.
+const ENDS_EARLY: &str = "it ends before a known codec's header does";
 
 /// Starts of files that are not audio; a search for markers within them could still find some.
 const OTHER_FORMATS: [(&[u8], &str); 13] = [
@@ -70,7 +90,7 @@ const OTHER_FORMATS: [(&[u8], &str); 13] = [
 ];
 
 /// The error for bytes that are surely of another format.
-pub(super) fn other_format(bytes: &[u8]) -> Option<AudioHeaderError> {
+pub(in crate::audio) fn other_format(bytes: &[u8]) -> Option<AudioHeaderError> {
     let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes).trim_ascii_start();
     let way_out = match text.first() {
         Some(b'<') => "was an error page saved as audio?",
@@ -81,12 +101,23 @@ pub(super) fn other_format(bytes: &[u8]) -> Option<AudioHeaderError> {
 }
 
 /// The error for a file whose bytes cannot be had.
-pub(super) fn broken_input(error: &std::io::Error) -> AudioHeaderError {
+pub(in crate::audio) fn broken_input(error: &io::Error) -> AudioHeaderError {
     AudioHeaderError::Input { reason: error.to_string() }
 }
 
+/// The error for the header of an uncompressed file that cannot be read.
+pub(in crate::audio) fn broken_header(survey: &Survey, error: &io::Error) -> AudioHeaderError {
+    let reason = match error.kind() {
+        io::ErrorKind::UnexpectedEof => ENDS_EARLY.to_owned(),
+        io::ErrorKind::InvalidData => error.to_string(),
+        _ => return broken_input(error),
+    };
+    let found = preview(&survey.head);
+    AudioHeaderError::Unreadable { found_bytes: survey.n_bytes, found, reason }
+}
+
 /// The error for a file that symphonia refuses: its first bytes, and how many it has.
-pub(super) fn unreadable(
+pub(in crate::audio) fn unreadable(
     bytes: &[u8],
     n_bytes: u64,
     extension: &str,
@@ -101,7 +132,7 @@ pub(super) fn unreadable(
     if audio {
         let found = preview(bytes);
         let reason = match error {
-            Error::IoError(_) => "it ends before a known codec's header does".to_owned(),
+            Error::IoError(_) => ENDS_EARLY.to_owned(),
             Error::DecodeError(reason) | Error::Unsupported(reason) => {
                 reason.trim_start_matches("core (probe): ").to_owned()
             }
@@ -113,13 +144,14 @@ pub(super) fn unreadable(
 }
 
 /// The error for bytes that start like no audio format.
-pub(super) fn unknown(bytes: &[u8], extension: &str) -> AudioHeaderError {
+pub(in crate::audio) fn unknown(bytes: &[u8], extension: &str) -> AudioHeaderError {
     let name = match extension {
         "" => String::new(),
         extension => format!(" under the name .{}", extension.chars().take(8).collect::<String>()),
     };
-    let way_out =
-        format!("WAV, AIFF, FLAC, MP3, Ogg and MP4 are read, was another format saved{name}?");
+    let way_out = format!(
+        "WAV, AIFF, FLAC, MP3, Ogg, MP4, AAC, CAF and AU are read, was another format saved{name}?"
+    );
     AudioHeaderError::NotAudio { found: preview(bytes), way_out }
 }
 

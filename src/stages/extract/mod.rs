@@ -19,7 +19,7 @@ pub use one::{Extracted, Rules};
 pub(in crate::stages) use one::{Origin, extract, needed_bytes};
 
 /// Raised when extract writes something else for the same input and parameters.
-const OUTPUT_VERSION: u32 = 1;
+const OUTPUT_VERSION: u32 = 2;
 
 /// The stage.
 pub struct Extract;
@@ -31,7 +31,7 @@ pub struct Params {
     /// no current features. Not used with --audio.
     #[arg(long, value_name = "URL", required_unless_present = "audio")]
     pub store: Option<String>,
-    /// Audio files to extract without a store (WAV, AIFF, FLAC, MP3, Ogg Vorbis, M4A or AAC).
+    /// Audio files to extract without a store (WAV, AIFF, AU, CAF, FLAC, MP3, Ogg Vorbis, Opus, M4A or AAC).
     #[arg(long, value_name = "FILE", num_args = 1.., requires = "output")]
     pub audio: Vec<PathBuf>,
     /// With --audio: FILE.npz for one file, FILE.parquet for any number in one table, or a folder for
@@ -148,6 +148,8 @@ struct Done {
     n_frames: u64,
     duration_s: f64,
     n_imported: u64,
+    /// Name, missing seconds, and whether they are missing at the end, of files that lack some.
+    short: Vec<(String, f64, bool)>,
     /// One line on each of the first files that were done.
     told: Vec<String>,
     n_done: u64,
@@ -164,6 +166,10 @@ impl Done {
                 self.n_frames += extracted.frames.nrows() as u64;
                 self.duration_s += extracted.duration_s();
                 self.n_imported += u64::from(extracted.audio.is_none());
+                if extracted.lost_s() > 0.0 {
+                    let is_truncated = extracted.audio.is_some_and(|h| h.loss.is_truncated);
+                    self.short.push((name.to_owned(), extracted.lost_s(), is_truncated));
+                }
                 if self.told.len() <= N_SHOWN {
                     self.told.push(told(name, extracted));
                 }
@@ -234,6 +240,14 @@ impl Summary for Report {
         if done.n_imported > 0 {
             writeln!(out, "  {} of them brought in from feature files", done.n_imported)?;
         }
+        done.short.sort_by(|a, b| a.0.cmp(&b.0));
+        for (name, lost_s, is_truncated) in done.short.iter().take(N_SHOWN) {
+            let what = if *is_truncated { "ends before its header says" } else { "has gaps" };
+            writeln!(out, "  {name} {what}: {lost_s:.2} s are missing")?;
+        }
+        if done.short.len() > N_SHOWN {
+            writeln!(out, "  {} more lack audio", done.short.len() - N_SHOWN)?;
+        }
         if done.n_without > 0 {
             writeln!(out, "  {} phrases have neither audio nor features", done.n_without)?;
         }
@@ -270,6 +284,7 @@ impl Summary for Report {
             "n_unchanged": done.n_unchanged,
             "n_without_audio": done.n_without,
             "n_imported": done.n_imported,
+            "n_short": done.short.len(),
             "n_frames": done.n_frames,
             "duration_s": done.duration_s,
             "failures": failures_json(done.failed.iter().map(|(name, why)| (name, why))),

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use ndarray::{Array2, s};
 
+use crate::audio::decode::Loss;
 use crate::audio::recording::{Encoding, MAX_HELD_SAMPLES, Options, Recording};
 use crate::audio::{BLOCKS, FEATURE_DIM, Tuning};
 use crate::motion::Beats;
@@ -73,9 +74,16 @@ pub struct Heard {
     /// `estimated` or `given`.
     pub tuning_source: &'static str,
     pub encoding: Encoding,
+    pub loss: Loss,
 }
 
 impl Extracted {
+    /// Returns how many seconds of the audio are missing at an end before the stated one, or could
+    /// not be decoded.
+    pub fn lost_s(&self) -> f64 {
+        self.audio.map_or(0.0, |heard| heard.loss.lost_s)
+    }
+
     /// Returns the beats that motion follows, in their bars; none for too few.
     pub fn counted_beats(&self) -> Option<Beats> {
         let (times_s, numbers): (Vec<f64>, Vec<Option<i64>>) = self.pulse.iter().copied().unzip();
@@ -181,7 +189,7 @@ fn from_audio(path: &str, content: Content, rules: &Rules) -> Result<Extracted, 
             Recording::analyse(open, extension, &options)
         }
     };
-    let Recording { raw, meter, encoding } =
+    let Recording { raw, meter, encoding, loss } =
         recording.map_err(|e| Failure::of(path, e.kind(), &e))?;
     let features = raw.normalize();
     let beats = features.rhythm.beat_frames.iter().map(|&frame| (frame, frames_to_s(frame)));
@@ -195,6 +203,7 @@ fn from_audio(path: &str, content: Content, rules: &Rules) -> Result<Extracted, 
             tuning: features.tuning,
             tuning_source: if rules.tuning.is_some() { "given" } else { "estimated" },
             encoding,
+            loss,
         }),
         frames: features.frames,
     })

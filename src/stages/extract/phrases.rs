@@ -20,6 +20,7 @@ use crate::store::{
     ClientOptions, Commit, Content, InOrder, Item, Ledger, Location, Row as _, Shard, Source,
     SourceFile, StoreError, StoreSnapshot, TimestampUs, batch_of, checkpoint,
 };
+use crate::units::frames_to_s;
 
 /// Where the items of this stage come from, as its commits name it.
 const ITEMS_FROM: &str = "phrases";
@@ -188,6 +189,22 @@ fn is_as_recorded(task: &Task, hash: &str) -> bool {
     !is_alone || content_hash_of_audio(hash) == row.content_hash
 }
 
+/// Refuses audio that is longer or shorter than ingest read in its header, by more than a frame,
+/// unless what is missing was counted.
+fn as_long_as_recorded(task: &Task, extracted: Extracted) -> Outcome {
+    let (found_s, said_s) = (extracted.duration_s(), task.row.duration_s);
+    let is_near = |s: f64| (s - said_s).abs() <= frames_to_s(1);
+    if extracted.audio.is_none() || is_near(found_s) || is_near(found_s + extracted.lost_s()) {
+        return Ok(extracted);
+    }
+    let path = &task.url;
+    let message = format!(
+        "{path}: has {found_s:.2} s of audio but {said_s:.2} s by its header; re-encode the file, \
+         for example with: ffmpeg -i IN OUT.flac"
+    );
+    Err(Failure::new(FailureKind::LengthMismatch, path, message))
+}
+
 /// The name under which a phrase fails whose earlier rows stay.
 fn beside(id: &str) -> String {
     format!("{id} @ {}", Extract::NAME)
@@ -229,6 +246,7 @@ fn work_off(
             let outcome = {
                 let _share = budget.take(needed_bytes(task.row.duration_s, task.size_bytes));
                 extract(task.origin, &file, content, |hash| is_as_recorded(&task, hash), &job.rules)
+                    .and_then(|extracted| as_long_as_recorded(&task, extracted))
             };
             job.progress.advance(task.row.duration_s.round() as u64);
             lock(done).add(&task.row.phrase_id, &outcome);
@@ -420,6 +438,8 @@ fn extraction_row(id: &str, task: &Task, extracted: &Extracted) -> ExtractionRow
         sample_rate_hz: heard.map(|h| h.encoding.sample_rate_hz as i32),
         n_channels: heard.map(|h| i32::from(h.encoding.n_channels)),
         content_hash: Some(task.row.content_hash.clone()),
+        truncated: heard.map(|h| h.loss.is_truncated),
+        lost_s: heard.map(|h| h.loss.lost_s),
     }
 }
 

@@ -5,13 +5,12 @@ mod tests;
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use crate::audio::formats::is_audio_extension as is_audio;
 use crate::store::{Listing, SourceFile, SourceProblem, SourceProblemKind};
 
 use super::motion::CAPTURE_EXTENSIONS;
 use crate::stages::failure::{Failure, FailureKind};
 
-/// File name endings of audio.
-const AUDIO_EXTENSIONS: [&str; 8] = ["wav", "flac", "mp3", "ogg", "opus", "m4a", "aif", "aiff"];
 const BEATS_SUFFIX: &str = ".beats.txt";
 
 /// How a source is organised.
@@ -334,9 +333,4 @@ fn at_and_above(path: &str) -> impl Iterator<Item = &str> {
 fn extension(path: &str) -> Option<&str> {
     let name = path.rsplit('/').next()?;
     name.rsplit_once('.').map(|(_, extension)| extension)
-}
-
-/// Returns whether files that end so are audio.
-pub fn is_audio(extension: &str) -> bool {
-    AUDIO_EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension))
 }

@@ -19,7 +19,7 @@ use crate::store::{
 
 use super::failure::{Failure, failures_json, write_failures, write_notes};
 use super::seen::Seen;
-pub(in crate::stages) use layout::is_audio;
+pub(in crate::stages) use crate::audio::formats::is_audio_extension as is_audio;
 pub use layout::{Layout, Plan, Planned, Role, plan};
 pub(in crate::stages) use motion::{
     CAPTURE_EXTENSIONS, ReadMotion, notes_of, read_bvh, read_motion, read_trajectory,

@@ -139,7 +139,7 @@ impl Songs {
         if plan.phrases.is_empty() {
             bail!(
                 "songs folder {}: no audio among {} files; name the folder of your music (WAV, AIFF, \
-                 FLAC, MP3, Ogg Vorbis, M4A or AAC)",
+                 FLAC, MP3, Ogg Vorbis, Opus, M4A or AAC)",
                 source.location(),
                 plan.ignored.len()
             );

@@ -25,7 +25,7 @@ use super::output::{WIDTHS_PX, format_of, write_picture};
 /// What the user asks for.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Params {
-    /// Audio file whose features are extracted and drawn (WAV, AIFF, FLAC, MP3, Ogg Vorbis, M4A or
+    /// Audio file whose features are extracted and drawn (WAV, AIFF, FLAC, MP3, Ogg Vorbis, Opus, M4A or
     /// AAC).
     #[arg(long, value_name = "FILE")]
     pub audio: Option<PathBuf>,

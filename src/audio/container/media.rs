@@ -8,13 +8,13 @@ use symphonia::core::codecs::audio::well_known as codec;
 use symphonia::core::common::Limit;
 use symphonia::core::formats::probe::{Hint, Probe, ProbeOptions};
 use symphonia::core::formats::well_known::{
-    FORMAT_ID_AIFF, FORMAT_ID_FLAC, FORMAT_ID_ISOMP4, FORMAT_ID_OGG, FORMAT_ID_WAVE,
+    FORMAT_ID_CAF, FORMAT_ID_FLAC, FORMAT_ID_ISOMP4, FORMAT_ID_OGG,
 };
 use symphonia::core::formats::{FormatId, FormatOptions, FormatReader};
 use symphonia::core::io::{MediaSource, MediaSourceStream};
 use symphonia::core::meta::MetadataOptions;
 
-use super::error::{self, AudioHeaderError};
+use crate::audio::header::error::{self, AudioHeaderError};
 
 /// Bytes without a known marker after which the search for one ends. Symphonia's own 1 MiB lets
 /// chance pairs of MPEG sync words turn one in twenty random files into audio.
@@ -22,10 +22,6 @@ const MAX_PROBE_BYTES: u32 = 64 * 1024;
 
 /// Bytes at the start of a file that messages and checks look at.
 const HEAD_BYTES: u64 = 4096;
-
-/// Zero bytes that follow an uncompressed file: one of symphonia's packets of 1,152 frames, which
-/// it would drop when the file ends within it, of up to 1,820 channels of 8 bytes.
-const TAIL_BYTES: u64 = 16 << 20;
 
 static PROBE: LazyLock<Probe> = LazyLock::new(|| {
     let options = ProbeOptions { max_probe_depth: MAX_PROBE_BYTES, ..ProbeOptions::default() };
@@ -43,8 +39,6 @@ pub(in crate::audio) struct Survey {
     pub start: u64,
     /// The four bytes there.
     pub marker: Vec<u8>,
-    /// Bytes from the samples' start in a WAV or AIFF file to the end of the file.
-    pub pcm_data_bytes: Option<u64>,
 }
 
 impl Survey {
@@ -70,14 +64,7 @@ impl Survey {
         let mut marker = Vec::new();
         input.seek(SeekFrom::Start(start))?;
         input.take(4).read_to_end(&mut marker)?;
-        let pcm_data_bytes = match marker.as_slice() {
-            b"RIFF" => pcm_data_bytes(input, start, n_bytes, *b"data", u32::from_le_bytes)?,
-            // The samples follow an offset and a block size of 4 bytes each.
-            b"FORM" => pcm_data_bytes(input, start, n_bytes, *b"SSND", u32::from_be_bytes)?
-                .map(|n| n.saturating_sub(8)),
-            _ => None,
-        };
-        Ok(Self { head, n_bytes, start, marker, pcm_data_bytes })
+        Ok(Self { head, n_bytes, start, marker })
     }
 }
 
@@ -100,109 +87,81 @@ fn tags_end(input: &mut (impl Read + Seek), n_bytes: u64) -> io::Result<u64> {
     Ok(if start < n_bytes { start } else { 0 })
 }
 
-/// Finds the chunk of samples in an IFF file and returns the bytes from its content to the end.
-fn pcm_data_bytes(
-    input: &mut (impl Read + Seek),
-    start: u64,
-    n_bytes: u64,
-    wanted: [u8; 4],
-    size_of: fn([u8; 4]) -> u32,
-) -> io::Result<Option<u64>> {
-    let mut chunk_start = start + 12;
-    // A chunk has a head of 8 bytes, so the walk ends after at most n_bytes / 8 steps.
-    while chunk_start + 8 <= n_bytes {
-        input.seek(SeekFrom::Start(chunk_start))?;
-        let mut head = [0; 8];
-        input.read_exact(&mut head)?;
-        let [id @ .., s0, s1, s2, s3] = head;
-        if id == wanted {
-            return Ok(Some(n_bytes - chunk_start - 8));
-        }
-        let size = u64::from(size_of([s0, s1, s2, s3]));
-        // Chunks start at even offsets.
-        chunk_start += 8 + size + size % 2;
-    }
-    Ok(None)
-}
+/// What bytes of audio are read from.
+pub(in crate::audio) trait Bytes: Read + Seek + Send + Sync {}
+impl<T: Read + Seek + Send + Sync> Bytes for T {}
 
-/// A reader as symphonia takes it: without the tags before the audio, with zeros after it.
-struct Media<R> {
-    input: R,
-    /// Where the audio starts in `input`.
+/// A part of a file, behind other bytes than those before it in the file.
+pub(in crate::audio) struct Section<'a> {
+    prefix: Vec<u8>,
+    input: Box<dyn Bytes + 'a>,
+    /// Where the part starts in `input`.
     start: u64,
+    /// Bytes of the prefix and the part.
     n_bytes: u64,
-    tail_bytes: u64,
     position: u64,
-    /// Whether to read the RIFF chunk's size as unknown.
-    riff: bool,
 }
 
-impl<R: Read> Read for Media<R> {
+impl<'a> Section<'a> {
+    /// Returns the `n_bytes` of `input` from `start` on, behind `prefix`.
+    pub fn new(input: Box<dyn Bytes + 'a>, prefix: Vec<u8>, start: u64, n_bytes: u64) -> Self {
+        let n_bytes = prefix.len() as u64 + n_bytes;
+        Self { prefix, input, start, n_bytes, position: u64::MAX }
+    }
+}
+
+impl Read for Section<'_> {
     fn read(&mut self, bytes: &mut [u8]) -> io::Result<usize> {
-        let n_read = if self.position < self.n_bytes {
-            let wanted = (self.n_bytes - self.position).min(bytes.len() as u64) as usize;
-            self.input.read(&mut bytes[..wanted])?
-        } else {
-            let left = (self.n_bytes + self.tail_bytes).saturating_sub(self.position);
-            let n_zeros = left.min(bytes.len() as u64) as usize;
-            bytes[..n_zeros].fill(0);
-            n_zeros
-        };
-        // A size of 0 or of part of the file, as interrupted writers leave it, hides the samples
-        // from symphonia; libsndfile does not look at it either.
-        if self.riff && self.position < 8 {
-            for (byte, offset) in bytes[..n_read].iter_mut().zip(self.position..) {
-                if (4..8).contains(&offset) {
-                    *byte = 0xff;
-                }
-            }
+        if self.position == u64::MAX {
+            self.rewind()?;
         }
+        let n_prefix = self.prefix.len() as u64;
+        let n_read = if self.position < n_prefix {
+            let mut rest = &self.prefix[self.position as usize..];
+            rest.read(bytes)?
+        } else {
+            let n_left = self.n_bytes.saturating_sub(self.position);
+            let wanted = n_left.min(bytes.len() as u64) as usize;
+            self.input.read(&mut bytes[..wanted])?
+        };
         self.position += n_read as u64;
         Ok(n_read)
     }
 }
 
-impl<R: Seek> Seek for Media<R> {
+impl Seek for Section<'_> {
     fn seek(&mut self, position: SeekFrom) -> io::Result<u64> {
         let target = match position {
             SeekFrom::Start(target) => Some(target),
             SeekFrom::Current(delta) => self.position.checked_add_signed(delta),
-            SeekFrom::End(delta) => (self.n_bytes + self.tail_bytes).checked_add_signed(delta),
+            SeekFrom::End(delta) => self.n_bytes.checked_add_signed(delta),
         };
         let target = target.ok_or(io::ErrorKind::InvalidInput)?;
-        self.input.seek(SeekFrom::Start(self.start + target.min(self.n_bytes)))?;
+        let n_prefix = self.prefix.len() as u64;
+        let offset = target.min(self.n_bytes).saturating_sub(n_prefix);
+        self.input.seek(SeekFrom::Start(self.start + offset))?;
         self.position = target;
         Ok(target)
     }
 }
 
-impl<R: Read + Seek + Send + Sync> MediaSource for Media<R> {
+impl MediaSource for Section<'_> {
     fn is_seekable(&self) -> bool {
         true
     }
 
     fn byte_len(&self) -> Option<u64> {
-        Some(self.n_bytes + self.tail_bytes)
+        Some(self.n_bytes)
     }
 }
 
-/// Opens a surveyed file. The samples of an uncompressed file are followed by zeros that are not
-/// in it: count them with [`Survey::pcm_data_bytes`].
+/// Opens a section of a surveyed file with symphonia's demuxers.
 pub(in crate::audio) fn open<'a>(
-    mut input: impl Read + Seek + Send + Sync + 'a,
+    section: Section<'a>,
     survey: &Survey,
     extension_hint: &str,
 ) -> Result<Box<dyn FormatReader + 'a>, AudioHeaderError> {
-    input.seek(SeekFrom::Start(survey.start)).map_err(|e| error::broken_input(&e))?;
-    let media = Media {
-        input,
-        start: survey.start,
-        n_bytes: survey.n_bytes - survey.start,
-        tail_bytes: if survey.pcm_data_bytes.is_some() { TAIL_BYTES } else { 0 },
-        position: 0,
-        riff: survey.marker == b"RIFF",
-    };
-    let stream = MediaSourceStream::new(Box::new(media), Default::default());
+    let stream = MediaSourceStream::new(Box::new(section), Default::default());
     let mut hint = Hint::new();
     if !extension_hint.is_empty() {
         hint.with_extension(extension_hint);
@@ -222,8 +181,7 @@ pub(in crate::audio) fn open<'a>(
 /// another format. Only MPEG streams occur with other bytes before them.
 fn starts_as(format: FormatId, bytes: &[u8]) -> bool {
     let marker = match format {
-        FORMAT_ID_WAVE => bytes.get(..4) == Some(b"RIFF"),
-        FORMAT_ID_AIFF => bytes.get(..4) == Some(b"FORM"),
+        FORMAT_ID_CAF => bytes.get(..4) == Some(b"caff"),
         FORMAT_ID_FLAC => bytes.get(..4) == Some(b"fLaC"),
         FORMAT_ID_OGG => bytes.get(..4) == Some(b"OggS"),
         FORMAT_ID_ISOMP4 => bytes.get(4..8) == Some(b"ftyp"),
@@ -234,30 +192,13 @@ fn starts_as(format: FormatId, bytes: &[u8]) -> bool {
 
 pub(in crate::audio) fn container_name(symphonia_name: &str) -> &'static str {
     match symphonia_name {
-        "wave" | "wav" => "wav",
-        "aiff" => "aiff",
+        "caf" => "caf",
         "flac" => "flac",
-        "mp1" => "mp1",
-        "mp2" => "mp2",
-        "mp3" => "mp3",
         "ogg" => "ogg",
         "isomp4" => "mp4",
         "aac" | "adts" => "adts",
         _ => "audio",
     }
-}
-
-/// Bytes of one frame, all channels, of an uncompressed codec.
-pub(in crate::audio) fn pcm_frame_bytes(id: AudioCodecId, n_channels: u16) -> Option<u64> {
-    let name = codec_name(id).strip_prefix("pcm_")?;
-    let sample_bytes = match name.get(1..3)? {
-        "64" => 8,
-        "32" => 4,
-        "24" => 3,
-        "16" => 2,
-        _ => 1,
-    };
-    Some(sample_bytes * u64::from(n_channels))
 }
 
 pub(in crate::audio) fn codec_name(id: AudioCodecId) -> &'static str {
@@ -291,4 +232,13 @@ pub(in crate::audio) fn codec_name(id: AudioCodecId) -> &'static str {
         codec::CODEC_ID_VORBIS => "vorbis",
         _ => "unknown",
     }
+}
+
+/// Whether a file has no marker of another container, as MPEG streams, which have none.
+pub(in crate::audio) fn may_be_mpeg(survey: &Survey) -> bool {
+    let is_adts = matches!(survey.marker.as_slice(), [0xff, second, ..] if second & 0xf6 == 0xf0);
+    let is_marked = [&b"fLaC"[..], b"OggS", b"caff"]
+        .iter()
+        .any(|marker| survey.marker.starts_with(marker) || marker.starts_with(&survey.marker));
+    !is_adts && !is_marked && survey.head.get(4..8) != Some(b"ftyp")
 }

@@ -17,7 +17,7 @@ const MAX_TRACKS: usize = 256;
 
 /// What one file says of its tracks' samples.
 #[derive(Debug, Default, PartialEq)]
-pub(super) struct Edits {
+pub(in crate::audio) struct Edits {
     /// Units of a second in which edits' durations are.
     movie_timescale: u32,
     tracks: Vec<TrackEdit>,
