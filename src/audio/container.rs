@@ -37,7 +37,7 @@ const N_PEEKED: usize = 16;
 pub(in crate::audio) enum Stream<'a> {
     Pcm(Samples<Section<'a>>),
     Mpeg(Frames<'a>),
-    Packets(Packets<'a>),
+    Packets(Box<Packets<'a>>),
 }
 
 /// The packets of a container's audio track.
@@ -300,7 +300,7 @@ fn packets<'a>(
         n_stated,
         is_as_stated: true,
         kept,
-        stream: Stream::Packets(Packets { reader, track, params, peeked }),
+        stream: Stream::Packets(Box::new(Packets { reader, track, params, peeked })),
         n_bytes,
     })
 }

@@ -16,9 +16,8 @@ pub const NAMED_EXTENSIONS: [&str; 15] = [
 
 /// Returns whether a file name extension, in any case, is one of audio.
 pub fn is_audio_extension(extension: &str) -> bool {
-    let is = |known: &&str| known.eq_ignore_ascii_case(extension);
-    READ_EXTENSIONS.iter().any(|known| is(&known))
-        || NAMED_EXTENSIONS.iter().any(|known| is(&known))
+    let mut known = READ_EXTENSIONS.iter().chain(&NAMED_EXTENSIONS);
+    known.any(|known| known.eq_ignore_ascii_case(extension))
 }
 
 /// Names the codec of a WAVE format tag (RFC 2361) whose samples are not read.

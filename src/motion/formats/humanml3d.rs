@@ -92,7 +92,7 @@ pub fn read(bytes: &[u8]) -> Result<RigidTrack, HumanMl3dError> {
     }
     let mut position_m = Vec::with_capacity(n_frames);
     let mut orientation: Vec<Quaternion> = Vec::with_capacity(n_frames);
-    let mut points_m = vec![Vec::with_capacity(n_frames); N_JOINTS];
+    let mut points_m: Vec<_> = (0..N_JOINTS).map(|_| Vec::with_capacity(n_frames)).collect();
     let (mut half_turn, mut x, mut z) = (0.0f64, 0.0, 0.0);
     let mut before: Option<&[f64]> = None;
     for row in array.values.chunks_exact(FEATURE_DIM) {

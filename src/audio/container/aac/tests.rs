@@ -33,7 +33,7 @@ fn fill(frame: Writer, n_bytes: u32, extension: u32) -> Writer {
         _ => frame.put(15, 4).put(n_bytes - 14, 8),
     };
     let frame = frame.put(extension, 4);
-    (1..2 * n_bytes).fold(frame, |frame, i| frame.put(i * 7 & 0xf, 4))
+    (1..2 * n_bytes).fold(frame, |frame, i| frame.put((i * 7) & 0xf, 4))
 }
 
 #[test]

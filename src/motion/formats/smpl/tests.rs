@@ -106,7 +106,7 @@ fn what_is_no_motion_of_smpl_is_refused_with_both_values() {
     let pose: Member = ("poses", &[5, 72], poses(n, 0.0));
     let trans: Member = ("trans", &[5, 3], places(n));
     assert_eq!(
-        refusal(&[pose.clone()]),
+        refusal(std::slice::from_ref(&pose)),
         (
             "npz has no translation: it holds poses, expected smpl_trans, trans or transl; save them with \
              numpy.savez(path, poses=…, trans=…, mocap_framerate=…)"
