@@ -118,7 +118,7 @@ fn what_cannot_be_drawn_is_said_in_a_sentence() {
             &["--audio", &no_audio],
             format!(
                 "{no_audio}: not audio: it starts with \"remember the milk\"; WAV, AIFF, FLAC, MP3, \
-                 Ogg and MP4 are read, was another format saved under the name .wav?"
+                 Ogg, MP4, AAC, CAF and AU are read, was another format saved under the name .wav?"
             ),
         ),
         (

@@ -145,7 +145,7 @@ fn large_files() -> Vec<Case> {
             |source| zeros(&source.join("audio/wav-of-zeros.wav"), MEMORY_BYTES + (100 << 20)),
             "audio_header",
             "{path}: not audio: it starts with bytes 00 00 00 00 00 00 00 00; WAV, AIFF, FLAC, \
-             MP3, Ogg and MP4 are read, was another format saved under the name .wav?"),
+             MP3, Ogg, MP4, AAC, CAF and AU are read, was another format saved under the name .wav?"),
     ]
 }
 
