@@ -6,6 +6,7 @@ use libfuzzer_sys::fuzz_target;
 #[path = "../../src/motion"]
 #[allow(dead_code, reason = "this target reaches a part of the modules")]
 mod motion {
+    mod beat_list;
     pub mod phase;
     pub mod quantile;
 }
