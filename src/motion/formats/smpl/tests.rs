@@ -158,9 +158,11 @@ fn what_is_no_motion_of_smpl_is_refused_with_both_values() {
 proptest! {
     #[test]
     fn no_archive_makes_the_reader_panic(
-        n in 0..40usize, dim in 0..170usize, rows in 0..40usize, value in prop::num::f64::ANY,
+        n in 0..40usize, dim in prop_oneof![Just(72), Just(0), 0..170usize], other in 0..40usize,
+        is_whole in any::<bool>(), value in prop::num::f64::ANY,
         key in 0..5usize, flips in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 0..4)
     ) {
+        let rows = if is_whole { n } else { other };
         let rate = ["mocap_framerate", "fps", "smpl_scaling", "poses2", "betas"][key];
         let mut bytes = npz(&[
             ("poses", &[n, dim], vec![value; n * dim]),
