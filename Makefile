@@ -132,7 +132,7 @@ fuzz: ## fuzz the readers of untrusted files, each for a minute [FUZZ_SECONDS=60
 	  { echo 'make fuzz needs cargo-fuzz; install it with: cargo install cargo-fuzz' >&2; exit 2; }
 	for target in $(basename $(notdir $(wildcard fuzz/fuzz_targets/*.rs))); do \
 	  mkdir -p fuzz/corpus/$$target; \
-	  RUSTC_BOOTSTRAP=1 $(CARGO) fuzz run $$target fuzz/corpus/$$target fuzz/seeds/$$target -- \
+	  RUSTC_BOOTSTRAP=1 $(CARGO) fuzz run $$target fuzz/corpus/$$target $$(ls -d fuzz/seeds/$$target 2> /dev/null) -- \
 	    -max_total_time=$(FUZZ_SECONDS) -rss_limit_mb=1024; \
 	done
 

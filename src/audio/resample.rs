@@ -11,9 +11,9 @@ mod phases;
 use std::sync::Arc;
 
 use super::SAMPLE_RATE_HZ;
-use phases::{Kept, Phases};
+use phases::{PhaseCache, Phases};
 
-static PHASES: Kept = Kept::new();
+static PHASES: PhaseCache = PhaseCache::new();
 
 /// Converts a stream to 44.1 kHz; ⌈n · 44,100 / rate⌉ samples.
 ///

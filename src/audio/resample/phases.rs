@@ -87,14 +87,14 @@ fn gcd(a: u32, b: u32) -> u32 {
 }
 
 /// The phases of the rates that were asked for last.
-pub struct Kept(Mutex<Vec<(u32, Made)>>);
+pub struct PhaseCache(Mutex<Vec<(u32, SharedPhases)>>);
 
-type Made = Arc<OnceLock<Arc<Phases>>>;
+type SharedPhases = Arc<OnceLock<Arc<Phases>>>;
 
 /// Rates that are kept, of at most 2.4 MB each.
 const MAX_KEPT: usize = 8;
 
-impl Kept {
+impl PhaseCache {
     pub const fn new() -> Self {
         Self(Mutex::new(Vec::new()))
     }
@@ -106,7 +106,7 @@ impl Kept {
         let made = {
             let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
             let found = kept.iter().position(|(kept_hz, _)| *kept_hz == rate_hz);
-            let made = found.map_or_else(Made::default, |i| kept.remove(i).1);
+            let made = found.map_or_else(SharedPhases::default, |i| kept.remove(i).1);
             // The latest stands last.
             kept.push((rate_hz, Arc::clone(&made)));
             if kept.len() > MAX_KEPT {
@@ -189,7 +189,7 @@ mod tests {
 
     #[test]
     fn few_rates_are_kept_and_the_latest_longest() {
-        let kept = Kept::new();
+        let kept = PhaseCache::new();
         let mut n_made = 0;
         let mut ask = |rate_hz| {
             kept.phases(rate_hz, |rate_hz| {
@@ -209,7 +209,7 @@ mod tests {
 
     #[test]
     fn nobody_waits_for_another_rate() {
-        let kept = Kept::new();
+        let kept = PhaseCache::new();
         let (started, is_started) = channel();
         let (release, is_released) = channel::<()>();
         let (done, is_done) = channel();
