@@ -4,6 +4,7 @@ mod configuration;
 mod content;
 mod dry_run;
 mod exit_codes;
+mod one_writer;
 mod pipelines;
 
 use std::path::Path;

@@ -105,3 +105,37 @@ fn twice_the_phrases_cost_twice_as_much() {
     }
     assert!(dear.is_empty(), "{dear:?} cost more than {MOST} times as much:\n{all}");
 }
+
+/// Requests that counting a table and looking a phrase up may take each; opening a phrase's page over a network takes
+/// about 30 ms for each of them.
+const MOST_REQUESTS: u64 = 20;
+
+#[test]
+fn a_thousand_commits_cost_a_reader_few_requests() {
+    let dir = Dir::new();
+    for i in 0..1500 {
+        let frames = coherent(N_FRAMES, i % 97);
+        dir.write(format!("source/motion/p{i:05}/trajectory.npy"), trajectory(&frames));
+    }
+    let store = "--store=memory://few-requests";
+    let source = format!("--source={}", dir.at("source").display());
+    run_stage::<Ingest>(&[store, &source, "--batch-phrases=1"]);
+    let location = Location::open("memory://few-requests", &ClientOptions::default());
+    let commits = location.and_then(|store| store.list("commits/ingest")).expect("a listing");
+    // More than an object store lists at once.
+    assert!(commits.len() > 1000, "{}", commits.len());
+    let n_requests = |work: &dyn Fn()| {
+        let before = memory_traffic("few-requests");
+        work();
+        memory_traffic("few-requests").n_requests - before.n_requests
+    };
+    let page = format!("--output={}", dir.at("page.html").display());
+    let looked_up = n_requests(&|| run_stage::<View>(&[store, "--phrase=p00777", &page]));
+    assert!(looked_up < MOST_REQUESTS, "{looked_up}");
+    #[cfg(feature = "query")]
+    {
+        let counted =
+            n_requests(&|| run_stage::<Query>(&[store, "select count(*) from phrases"]));
+        assert!(counted < MOST_REQUESTS, "{counted}");
+    }
+}

@@ -1,10 +1,10 @@
 //! `compact`: parts that hold dead rows or are small become few whole ones.
 
 use std::io::{self, Write};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
-use super::{ClientParams, Contract, Progress, Stage, Summary};
-use crate::store::{self, Compaction, Lease, Location};
+use super::{ClientParams, Contract, Progress, Stage, Summary, lease};
+use crate::store::{self, Compaction, Location};
 
 /// The stage.
 pub struct Compact;
@@ -37,14 +37,13 @@ impl Stage for Compact {
     fn run(params: Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
         let started = Instant::now();
         let store = Location::open(&params.store, &params.client.options())?;
-        let waiting = |holder: &str, rest: Duration| {
-            progress.note(&format!("compact waits for {holder}, at most {} s", rest.as_secs() + 1));
-        };
         let lease = match params.dry_run {
             true => None,
             false => {
                 store.sweep();
-                Some(Lease::take(&store, Self::NAME, &waiting)?)
+                let what = format!("store {store}");
+                let (lease, _) = lease::take(&store, Self::NAME, &what, &|text| progress.note(text))?;
+                Some(lease)
             }
         };
         let mut is_begun = std::cell::Cell::new(false);

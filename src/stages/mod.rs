@@ -11,6 +11,7 @@ pub mod finetune;
 pub mod generate;
 pub mod ingest;
 pub mod learned;
+mod lease;
 pub mod library;
 pub mod model;
 mod model_files;

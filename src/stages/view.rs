@@ -11,7 +11,7 @@ use super::motion_source::{MotionParams, Room, Subject};
 use super::{ClientParams, Contract, Progress, Stage, Summary};
 use crate::audio::header::read_header;
 use crate::store::tables::PhraseRow;
-use crate::store::{self, ClientOptions, Content, Ledger, Location, Source};
+use crate::store::{self, ClientOptions, Content, Location, Source};
 use crate::units::frames_to_s;
 use crate::view::{self, Audio, View as Page, ViewSample};
 
@@ -157,9 +157,9 @@ fn phrase_audio(
         check_size(url, size_bytes)?;
         // A page may be passed on, and a table may have been written by anybody: what goes into the page is audio
         // that was ingested from where it lies.
-        let ledger = Ledger::read(&Location::open(store, options)?, Ingest::NAME)?;
-        let is_ingested =
-            ledger.get(&row.phrase_id).is_some_and(|known| known.origin == row.source);
+        let store = Location::open(store, options)?;
+        let origin = store::origin_of(&store, Ingest::NAME, &row.phrase_id)?;
+        let is_ingested = origin.is_some_and(|origin| origin == row.source);
         let source = Source::open(&row.source, options, None)?;
         let file = source.recorded(url, size_bytes, "").filter(|_| is_ingested);
         let file = file.with_context(|| {

@@ -70,5 +70,5 @@ pub use redaction::{lines, one_line, redacted};
 pub use schema::{Cell, Column, ColumnType, Row, TableSchema, TimestampUs};
 pub use shard::{Shard, batch_of, split_of};
 pub use source::{Content, InOrder, Listing, Source, SourceFile, SourceProblem, SourceProblemKind};
-pub use store_snapshot::{LivePart, StoreSnapshot, checkpoint, live_parts};
+pub use store_snapshot::{LivePart, StoreSnapshot, checkpoint, live_parts, origin_of};
 pub use vacuum::{Vacuumed, vacuum};

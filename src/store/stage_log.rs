@@ -286,8 +286,21 @@ impl StageLog {
     /// # Errors
     /// [`StoreError`] when manifests cannot be read.
     pub fn parts_of(&self, item: &str) -> Result<Vec<Part>, StoreError> {
+        Ok(self.latest(item)?.map(|(_, parts)| parts).unwrap_or_default())
+    }
+
+    /// Returns where an item came from when it was last settled.
+    ///
+    /// # Errors
+    /// [`StoreError`] when manifests cannot be read.
+    pub fn origin_of(&self, item: &str) -> Result<Option<String>, StoreError> {
+        Ok(self.latest(item)?.map(|(header, _)| header.origin))
+    }
+
+    /// Returns the header and the parts of the latest commit that settled an item.
+    fn latest(&self, item: &str) -> Result<Option<(Header, Vec<Part>)>, StoreError> {
         self.with_contents(|contents| {
-            let mut best: Option<(Rank, &[Part])> = None;
+            let mut best: Option<(Rank, &Header, &[Part])> = None;
             let headers: Vec<_> = contents.newer.iter().map(Manifest::headers).collect();
             for (manifest, headers) in contents.newer.iter().zip(&headers) {
                 let Some(i) = manifest.items.iter().position(|known| known.id == item) else {
@@ -295,19 +308,20 @@ impl StageLog {
                 };
                 let header = &headers[manifest.header_of(i)];
                 let rank = Rank::new(header, manifest.generation(), &manifest.key);
-                if best.is_none_or(|(known, _)| rank > known) {
-                    best = Some((rank, &manifest.parts));
+                if best.as_ref().is_none_or(|(known, ..)| rank > *known) {
+                    best = Some((rank, header, &manifest.parts));
                 }
             }
             if let Some(catalogue) = contents.catalogue
                 && let Some((commit, header)) = catalogue.find(item)?
             {
                 let rank = catalogue.rank(Row { item, commit, header });
-                if best.is_none_or(|(known, _)| rank > known) {
-                    best = Some((rank, &catalogue.meta.commits[commit].parts));
+                if best.as_ref().is_none_or(|(known, ..)| rank > *known) {
+                    let meta = &catalogue.meta;
+                    best = Some((rank, &meta.headers[header], &meta.commits[commit].parts));
                 }
             }
-            Ok(best.map(|(_, parts)| parts.to_vec()).unwrap_or_default())
+            Ok(best.map(|(_, header, parts)| (header.clone(), parts.to_vec())))
         })
     }
 

@@ -180,6 +180,14 @@ fn live_parts_of(log: &StageLog) -> Result<Vec<LivePart>, StoreError> {
     Ok(live)
 }
 
+/// Returns where an item of a stage came from when it was last settled, without reading what is known of others.
+///
+/// # Errors
+/// [`StoreError`] when commits cannot be read.
+pub fn origin_of(store: &Location, stage: &str, item: &str) -> Result<Option<String>, StoreError> {
+    StageLog::read(store, stage)?.origin_of(item)
+}
+
 /// Writes catalogues of stages whose last one is behind; what keeps them from being written is logged and no
 /// more, because a store is whole without them.
 pub fn checkpoint(store: &Location, stages: &[&str]) {

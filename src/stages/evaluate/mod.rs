@@ -23,11 +23,11 @@ use std::time::Instant;
 use anyhow::Context as _;
 
 use super::failure::{failures_json, write_failures};
-use super::{Contract, Progress, Stage, Summary};
+use super::{Contract, Progress, Stage, Summary, lease};
 use crate::evaluation::verdict::Quality;
 use crate::report::{self, Report};
 use crate::store::tables::SanityCheckRow;
-use crate::store::{self, Location};
+use crate::store::{self, Lease, Location};
 
 use evaluand::Evaluand;
 use foreign::Refused;
@@ -68,10 +68,14 @@ impl Stage for Evaluate {
             input_hash: &subject.input_hash(&data_hash)?,
         };
         let n_wanted = if params.quick { 1 } else { rows::STAGES.len() };
-        let mut is_up_to_date = !params.force;
-        for stage in &rows::STAGES[..n_wanted] {
-            is_up_to_date = is_up_to_date && known.is_up_to_date(stage)?;
-        }
+        let look = || -> anyhow::Result<bool> {
+            let mut is_up_to_date = !params.force;
+            for stage in &rows::STAGES[..n_wanted] {
+                is_up_to_date = is_up_to_date && known.is_up_to_date(stage)?;
+            }
+            Ok(is_up_to_date)
+        };
+        let mut is_up_to_date = look()?;
         if params.dry_run {
             let (n_motions, length_s) = (subject.motions.len(), subject.length_s());
             let n_refused = subject.refused.len();
@@ -84,11 +88,20 @@ impl Stage for Evaluate {
                 is_up_to_date,
             }));
         }
+        let mut lease = None;
+        if !is_up_to_date {
+            let (name, what) = (format!("{}/{run}", Self::NAME), format!("evaluation of {run}"));
+            let (taken, has_waited) = lease::take(&store, &name, &what, &|text| progress.note(text))?;
+            lease = Some(taken);
+            // The other process may have evaluated the same.
+            is_up_to_date = has_waited && look()?;
+        }
         let found = if is_up_to_date {
             Rows::read(&store, &run, params.quick)?
         } else {
             store.sweep();
             let found = subject.evaluate(&store, &params, &data_hash, progress)?;
+            lease.as_ref().map_or(Ok(()), Lease::check)?;
             known.commit_checks(&found, &subject.refused)?;
             if !params.quick {
                 known.commit_numbers(&found)?;

@@ -6,7 +6,6 @@ mod report;
 mod tuning;
 
 use std::path::PathBuf;
-use std::time::Duration;
 
 use anyhow::{bail, ensure};
 
@@ -17,13 +16,13 @@ use super::learned;
 use super::model_files::{POINTER, current_folder, folder_of, is_model_name, pointer_to, sha256};
 use super::train::session::{Looker, MachineParams, check_run_name, read_phrases};
 use super::trained::{Stand, Trained};
-use super::{ClientParams, Contract, Progress, Stage, Summary};
+use super::{ClientParams, Contract, Progress, Stage, Summary, lease};
 use crate::generation::file_names;
 use crate::motion::rates::MotionRange;
 use crate::onnx::{Runtime, Storage};
 use crate::store::tables::OnnxCheckRow;
 use crate::store::{
-    Commit, Item, Lease, Ledger, Listed, Location, Row as _, StoreError, TimestampUs, checkpoint,
+    Commit, Item, Ledger, Listed, Location, Row as _, StoreError, TimestampUs, checkpoint,
     digest,
 };
 use crate::training::{Dataset, Split};
@@ -120,14 +119,8 @@ impl Stage for Export {
         if params.dry_run {
             return Ok(Box::new(Planned::new(&params, &files, &store)));
         }
-        let waiting = |holder: &str, rest: Duration| {
-            progress.note(&format!(
-                "model {} was last written by {holder}; waiting {} s for a sign of life",
-                params.model,
-                rest.as_secs() + 1
-            ));
-        };
-        let lease = Lease::take(&store, &folder_of(&params.model), &waiting)?;
+        let (folder, what) = (folder_of(&params.model), format!("model {}", params.model));
+        let (lease, _) = lease::take(&store, &folder, &what, &|text| progress.note(text))?;
         match store.read_if_there(&card_path(&store, &params.model)?)? {
             Some(there) if there == files.card_text => {
                 return Ok(Box::new(Report::up_to_date(&params, &store, &files)));

@@ -17,7 +17,7 @@ use super::{Done, Generate};
 use crate::stages::beats::{self, BeatSource, PhraseBeats};
 use crate::stages::extract::pool::{self, lock};
 use crate::stages::failure::{Failure, FailureKind};
-use crate::stages::{Progress, Stage as _};
+use crate::stages::{Progress, Stage as _, lease};
 use crate::store::tables::{self, ExtractionRow, FailureRow, GenerationRow, PhraseRow};
 use crate::store::{
     Commit, Item, Label, Ledger, Location, Row as _, Shard, Snapshot, StoreError, StoreSnapshot,
@@ -83,16 +83,20 @@ type Outcome = Result<Made, Failure>;
 /// # Errors
 /// When the store cannot be read or written; what was committed stays.
 pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::Result<Done> {
-    let snapshot = StoreSnapshot::take(target.store)?;
-    let ledger = snapshot.ledger(Generate::NAME)?;
-    let mut done = Done::default();
-    let tasks = plan(maker, target, &snapshot, &ledger, &mut done)?;
-    done.n_todo = tasks.iter().map(|task| task.samples.len() as u64).sum();
-    done.todo_s =
-        tasks.iter().map(|task| frames_to_s(task.n_frames) * task.samples.len() as f64).sum();
-    if target.dry_run || tasks.is_empty() {
-        return Ok(done);
+    let mut planned = Planned::new(maker, target)?;
+    if target.dry_run || planned.tasks.is_empty() {
+        return Ok(planned.done);
     }
+    let shard = target.shard.to_string().replace('/', "-of-");
+    let name = format!("{}/{}/{shard}", Generate::NAME, maker.run);
+    let what = format!("run {}", maker.run);
+    let (lease, has_waited) =
+        lease::take(target.store, &name, &what, &|text| progress.note(text))?;
+    if has_waited {
+        // The other process may have made some of the motions.
+        planned = Planned::new(maker, target)?;
+    }
+    let Planned { snapshot, ledger, tasks, mut done } = planned;
     target.store.sweep();
     snapshot.checkpoint();
     progress.start_audio("generate", done.todo_s.ceil() as u64);
@@ -106,6 +110,7 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
         ahead.read(&batches[i..])?;
         let outcomes = make_batch(maker, target, tasks, &ahead, progress)?;
         done.add(&outcomes);
+        lease.check()?;
         commit(maker, target, &ledger, tasks, outcomes)?;
         ahead.forget(tasks);
         if progress.is_interrupted() && i + 1 < batches.len() {
@@ -116,6 +121,27 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
     progress.finish();
     checkpoint(target.store, &[Generate::NAME]);
     Ok(done)
+}
+
+/// The store as it was when it was looked at, and what it lacks.
+struct Planned {
+    snapshot: StoreSnapshot,
+    ledger: Ledger,
+    tasks: Vec<Task>,
+    done: Done,
+}
+
+impl Planned {
+    fn new(maker: &Maker, target: &Target) -> anyhow::Result<Self> {
+        let snapshot = StoreSnapshot::take(target.store)?;
+        let ledger = snapshot.ledger(Generate::NAME)?;
+        let mut done = Done::default();
+        let tasks = plan(maker, target, &snapshot, &ledger, &mut done)?;
+        done.n_todo = tasks.iter().map(|task| task.samples.len() as u64).sum();
+        done.todo_s =
+            tasks.iter().map(|task| frames_to_s(task.n_frames) * task.samples.len() as f64).sum();
+        Ok(Self { snapshot, ledger, tasks, done })
+    }
 }
 
 /// The features of the batches that come next. Parts of `features` hold the phrases of several batches, so

@@ -195,7 +195,7 @@ impl Job<'_> {
     ) -> (String, Result<Phrase, Failure>) {
         let without_content = |failure: &Failure| digest(failure.message.as_bytes());
         if let Some(problem) = &planned.problem {
-            return (without_content(problem), Err(problem.clone()));
+            return (without_content(problem), Err((**problem).clone()));
         }
         let files = match Files::take(files) {
             Ok(files) => files,

@@ -54,7 +54,7 @@ pub struct Planned {
     pub id: String,
     /// The phrase's files, sorted by role.
     pub files: Vec<(Role, SourceFile)>,
-    pub problem: Option<Failure>,
+    pub problem: Option<Box<Failure>>,
 }
 
 /// Everything that a source offers, phrases sorted by id.
@@ -101,85 +101,103 @@ fn looks_like_phrases(listing: &Listing) -> bool {
 }
 
 fn phrase_layout(listing: Listing, drafts: &mut Drafts) {
-    // Folders of `motion/` and `audio_features/` that must hold a phrase's file.
-    let mut folders: BTreeMap<String, &'static str> = BTreeMap::new();
-    // Folders that need nothing more, and those among them that are a phrase's own.
-    let mut filled: BTreeSet<String> = BTreeSet::new();
-    let mut phrases: BTreeSet<String> = BTreeSet::new();
-    for folder in &listing.folders {
-        let is_parent = any_below(&listing.folders, String::as_str, folder);
-        if let (Some((_, expects)), false) = (phrase_folder(folder), is_parent) {
-            folders.insert(folder.clone(), expects);
-        }
-    }
-    // Folders that are called like a phrase's file; what they hold is nobody's.
-    let mut slots: BTreeSet<String> = BTreeSet::new();
+    let lacking = lacking_files(&listing);
     for folder in listing.folders {
+        // What a folder holds that is called like a phrase's file is nobody's.
         if let Some((id, _)) = phrase_slot(&folder) {
-            if let Some((parent, _)) = folder.rsplit_once('/') {
-                filled.insert(parent.to_owned());
-            }
-            drafts.fail(id, not_a_file(&folder));
-            slots.insert(folder);
+            drafts.fail(id.to_owned(), not_a_file(&folder));
         }
     }
     for file in listing.files {
-        if let Some((parent, _)) = file.path.rsplit_once('/')
-            && let Some((_, expects)) = phrase_folder(parent)
-        {
-            folders.insert(parent.to_owned(), expects);
-        }
         match phrase_slot(&file.path) {
-            Some((id, role)) => {
-                if let Some((parent, _)) = file.path.rsplit_once('/')
-                    && phrase_folder(parent).is_some()
-                {
-                    filled.insert(parent.to_owned());
-                    phrases.insert(parent.to_owned());
-                }
-                drafts.add(id, role, file);
-            }
+            Some((id, role)) => drafts.add(id.to_owned(), role, file),
             None => drafts.ignored.push(file.path),
         }
     }
     for problem in listing.problems {
-        if let Some((parent, _)) = problem.path.rsplit_once('/') {
-            filled.insert(parent.to_owned());
-        }
-        filled.insert(problem.path.clone());
-        let id = phrase_slot(&problem.path).map(|(id, _)| id);
-        let id = id.or_else(|| phrase_folder(&problem.path).map(|(id, _)| id));
+        let id = phrase_slot(&problem.path).map(|(id, _)| id.to_owned());
+        let id = id.or_else(|| phrase_folder(&problem.path).map(|(id, _)| id.to_owned()));
         drafts.problem(id, problem);
     }
-    for (folder, expects) in folders {
-        // A folder inside a phrase's own holds extras, which are left alone.
-        let settled = filled.contains(&folder)
-            || at_and_above(&folder).any(|f| phrases.contains(f) || slots.contains(f));
-        if let (Some((id, _)), false) = (phrase_folder(&folder), settled) {
-            let message =
-                format!("folder {folder} holds no {expects}; add it or remove the folder");
-            drafts.fail(id, Failure::new(FailureKind::Layout, &folder, message));
-        }
+    for (id, failure) in lacking {
+        drafts.fail(id, failure);
     }
 }
 
+/// Returns the phrases whose folder of `motion/` or `audio_features/` lacks the phrase's file.
+///
+/// Paths are borrowed and kept in sorted lists: a source may have a million folders.
+fn lacking_files(listing: &Listing) -> Vec<(String, Failure)> {
+    // Folders that must hold a phrase's file.
+    let mut expecting: Vec<&str> = Vec::new();
+    // Folders that need nothing more, and those that are a phrase's own or are called like a phrase's file.
+    let (mut filled, mut taken): (Vec<&str>, Vec<&str>) = (Vec::new(), Vec::new());
+    for folder in &listing.folders {
+        let is_parent = any_below(&listing.folders, String::as_str, folder);
+        if phrase_folder(folder).is_some() && !is_parent {
+            expecting.push(folder);
+        }
+        if phrase_slot(folder).is_some() {
+            filled.extend(parent(folder));
+            taken.push(folder);
+        }
+    }
+    for file in &listing.files {
+        let Some(folder) = parent(&file.path).filter(|folder| phrase_folder(folder).is_some())
+        else {
+            continue;
+        };
+        expecting.push(folder);
+        if phrase_slot(&file.path).is_some() {
+            filled.push(folder);
+            taken.push(folder);
+        }
+    }
+    for problem in &listing.problems {
+        filled.extend(parent(&problem.path));
+        filled.push(&problem.path);
+    }
+    for folders in [&mut expecting, &mut filled, &mut taken] {
+        folders.sort_unstable();
+        folders.dedup();
+    }
+    let has = |folders: &[&str], folder: &str| folders.binary_search(&folder).is_ok();
+    let lacks = |folder: &&str| {
+        // A folder inside a phrase's own holds extras, which are left alone.
+        !has(&filled, folder) && !at_and_above(folder).any(|above| has(&taken, above))
+    };
+    let lacking = expecting.iter().filter(|folder| lacks(folder));
+    lacking
+        .filter_map(|folder| {
+            let (id, expects) = phrase_folder(folder)?;
+            let message =
+                format!("folder {folder} holds no {expects}; add it or remove the folder");
+            Some((id.to_owned(), Failure::new(FailureKind::Layout, folder, message)))
+        })
+        .collect()
+}
+
+fn parent(path: &str) -> Option<&str> {
+    path.rsplit_once('/').map(|(parent, _)| parent)
+}
+
 /// Returns the phrase and role that a path of the phrase layout stands for.
-fn phrase_slot(path: &str) -> Option<(String, Role)> {
+fn phrase_slot(path: &str) -> Option<(&str, Role)> {
     let (top, rest) = path.split_once('/')?;
-    let in_folder = |file: &str| rest.strip_suffix(file)?.strip_suffix('/').map(str::to_owned);
+    let in_folder = |file: &str| rest.strip_suffix(file)?.strip_suffix('/');
     let slot = match top {
         "motion" => in_folder("trajectory.npy").map(|id| (id, Role::MotionNpy)).or_else(|| {
             let (stem, ending) = rest.rsplit_once('.')?;
-            let id = stem.strip_suffix("/motion")?.to_owned();
+            let id = stem.strip_suffix("/motion")?;
             CAPTURE_EXTENSIONS.contains(&ending).then_some((id, Role::MotionCapture))
         }),
         "audio_features" => in_folder("features.npz").map(|id| (id, Role::Features)),
-        "beats" => Some((rest.strip_suffix(BEATS_SUFFIX)?.to_owned(), Role::Beats)),
+        "beats" => Some((rest.strip_suffix(BEATS_SUFFIX)?, Role::Beats)),
         "audio" => match rest.strip_suffix(BEATS_SUFFIX) {
-            Some(id) => Some((id.to_owned(), Role::Beats)),
+            Some(id) => Some((id, Role::Beats)),
             None => {
                 let extension = extension(rest).filter(|e| is_audio(e))?;
-                Some((rest[..rest.len() - extension.len() - 1].to_owned(), Role::Audio))
+                Some((&rest[..rest.len() - extension.len() - 1], Role::Audio))
             }
         },
         _ => None,
@@ -193,14 +211,14 @@ fn phrase_slot(path: &str) -> Option<(String, Role)> {
 }
 
 /// Returns the phrase whose folder this is, and what the folder must hold.
-fn phrase_folder(path: &str) -> Option<(String, &'static str)> {
+fn phrase_folder(path: &str) -> Option<(&str, &'static str)> {
     let (top, id) = path.split_once('/')?;
     let expects = match top {
         "motion" => "trajectory.npy or motion.bvh (or .npz, .npy, .vmd)",
         "audio_features" => "features.npz",
         _ => return None,
     };
-    Some((id.to_owned(), expects))
+    Some((id, expects))
 }
 
 fn library_layout(listing: Listing, drafts: &mut Drafts) {
@@ -240,27 +258,26 @@ fn library_layout(listing: Listing, drafts: &mut Drafts) {
     }
 }
 
+/// What becomes a plan, in the order in which it is met.
 #[derive(Default)]
 struct Drafts {
-    phrases: BTreeMap<String, Planned>,
+    /// The id of a phrase, and what is known of it.
+    entries: Vec<(String, Draft)>,
     ignored: Vec<String>,
 }
 
-impl Drafts {
-    fn draft(&mut self, id: String) -> &mut Planned {
-        self.phrases.entry(id).or_insert_with_key(|id| Planned {
-            id: id.clone(),
-            files: Vec::new(),
-            problem: None,
-        })
-    }
+enum Draft {
+    File(Role, SourceFile),
+    Problem(Box<Failure>),
+}
 
+impl Drafts {
     fn add(&mut self, id: String, role: Role, file: SourceFile) {
-        self.draft(id).files.push((role, file));
+        self.entries.push((id, Draft::File(role, file)));
     }
 
     fn fail(&mut self, id: String, failure: Failure) {
-        self.draft(id).problem.get_or_insert(failure);
+        self.entries.push((id, Draft::Problem(Box::new(failure))));
     }
 
     fn problem(&mut self, id: Option<String>, problem: SourceProblem) {
@@ -275,17 +292,36 @@ impl Drafts {
         self.fail(id.unwrap_or(problem.path), failure);
     }
 
-    fn finish(self) -> Plan {
-        let mut plan = Plan { phrases: Vec::new(), ignored: self.ignored };
-        for mut phrase in self.phrases.into_values() {
+    fn finish(mut self) -> Plan {
+        // Of several problems of a phrase the first counts, so that the sort has to be stable.
+        self.entries.sort_by(|a, b| a.0.cmp(&b.0));
+        let is_first = |i: usize| i == 0 || self.entries[i].0 != self.entries[i - 1].0;
+        let n_phrases = (0..self.entries.len()).filter(|&i| is_first(i)).count();
+        let mut phrases: Vec<Planned> = Vec::with_capacity(n_phrases);
+        for (id, draft) in self.entries {
+            if phrases.last().is_none_or(|last| last.id != id) {
+                phrases.push(Planned { id, files: Vec::new(), problem: None });
+            }
+            let Some(phrase) = phrases.last_mut() else { continue };
+            match draft {
+                Draft::File(role, file) => {
+                    // Most phrases have one file or two, and a plan may have a million phrases.
+                    phrase.files.reserve_exact(1);
+                    phrase.files.push((role, file));
+                }
+                Draft::Problem(failure) => {
+                    phrase.problem.get_or_insert(failure);
+                }
+            }
+        }
+        for phrase in &mut phrases {
             phrase.files.sort_by(|a, b| (a.0, &a.1.path).cmp(&(b.0, &b.1.path)));
             if phrase.problem.is_none() {
-                phrase.problem = conflict(&phrase);
+                phrase.problem = conflict(phrase).map(Box::new);
             }
-            plan.phrases.push(phrase);
         }
-        plan.ignored.sort();
-        plan
+        self.ignored.sort();
+        Plan { phrases, ignored: self.ignored }
     }
 }
 

@@ -147,7 +147,7 @@ impl Stage for Ingest {
         };
         if params.dry_run {
             let problems = todo.iter().filter_map(|p| {
-                let failure = p.problem.clone()?;
+                let failure = *p.problem.clone()?;
                 Some(Refused { id: p.id.clone(), failure })
             });
             report.tally.failed = problems.collect();
@@ -170,6 +170,9 @@ impl Stage for Ingest {
             if !report.tally.is_stopped {
                 job.forget_failures(&plan.phrases, shard)?;
             }
+            // The plan and the catalogue of a million phrases are not needed at once.
+            drop(batches);
+            drop((plan.phrases, ledger, seen));
             checkpoint(&store, &[Self::NAME]);
             progress.finish();
         }

@@ -148,7 +148,7 @@ impl Songs {
         for planned in plan.phrases {
             let file = |role: Role| planned.files.iter().find(|(r, _)| *r == role);
             let file = |role: Role| file(role).map(|(_, file)| file.clone());
-            let mut problem = planned.problem.clone();
+            let mut problem = planned.problem.as_deref().cloned();
             let audio = file(Role::Audio).unwrap_or_else(|| {
                 let message = format!("{} is no audio file; remove it", planned.id);
                 let failure = Failure::new(FailureKind::NotAFile, &planned.id, message);

@@ -10,7 +10,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::autodiff::Threads;
-use crate::stages::{Progress, all_threads};
+use crate::stages::{Progress, all_threads, lease};
 use crate::store::tables::FailureRow;
 use crate::store::{
     Commit, Item, Lease, Ledger, Location, Patience, Put, Row as _, StoreError, TimestampUs, digest,
@@ -80,13 +80,8 @@ pub fn check_run_name(run: &str) -> anyhow::Result<()> {
 /// # Errors
 /// [`StoreError::Held`] when another process writes it.
 pub fn lease_of(store: &Location, run: &str, watch: &Looker) -> Result<Lease, StoreError> {
-    let waiting = |holder: &str, rest: Duration| {
-        watch.note(&format!(
-            "run {run} was last written by {holder}; waiting {} s for a sign of life",
-            rest.as_secs() + 1
-        ));
-    };
-    Lease::take(store, &format!("runs/{run}"), &waiting)
+    let note = |text: &str| watch.note(text);
+    lease::take(store, &format!("runs/{run}"), &format!("run {run}"), &note).map(|(lease, _)| lease)
 }
 
 /// Returns where a command's claim on a run lies below the store.
