@@ -63,6 +63,18 @@ check-code: build/venv/ready setup
 lint: check-format ## check formatting and run clippy
 	$(CARGO) clippy --locked --all-targets -- -D warnings
 
+# Advisories come from a repository beyond the package registries; everything else needs no network.
+DENY_CHECKS  ?= bans licenses sources
+DENY_VERSION := 0.20.2
+DENY         := build/tools/cargo-deny-$(DENY_VERSION)/bin/cargo-deny
+.PHONY: deny
+deny: $(DENY) ## check licences, sources and banned crates of all dependencies [DENY_CHECKS=advisories]
+	$(DENY) --locked check $(DENY_CHECKS)
+
+# Built without optimisation: it runs for a second.
+$(DENY):
+	$(CARGO) install cargo-deny --version $(DENY_VERSION) --locked --debug --root build/tools/cargo-deny-$(DENY_VERSION)
+
 .PHONY: doc
 doc: ## build the library's documentation
 	RUSTDOCFLAGS='-D warnings' $(CARGO) doc --locked --no-deps
@@ -82,6 +94,16 @@ bench-audio: build/bench-venv/ready ## measure the audio features beside librosa
 	$(CARGO) build --locked --profile $(BENCH_PROFILE) --bin motiongen --example audio-blocks
 	build/bench-venv/bin/python benches/audio.py --profile $(BENCH_PROFILE) --bin $(BENCH_BIN) $(BENCH_ARGS)
 	$(BENCH_BIN)/examples/audio-blocks build/bench-audio/corpus-*/songs/song.mp3
+
+.PHONY: bench-inputs
+bench-inputs: build/bench-venv/ready ## read a corpus of audio files as FFmpeg and libsndfile do [BENCH_ARGS=--list]
+	$(CARGO) build --locked --release --no-default-features --example audio-decoded
+	build/bench-venv/bin/python benches/inputs.py --bin $(TARGET)/release/examples/audio-decoded $(BENCH_ARGS)
+
+# Rows that need hours; `--seeds 0 --only clock` measures some of them.
+.PHONY: bench-ablation
+bench-ablation: build setup ## train and measure with each choice left out, three seeds [BENCH_ARGS]
+	$(PYTHON) benches/ablation.py --bin $(BIN)/motiongen $(BENCH_ARGS)
 
 .PHONY: bench-parity
 bench-parity: build/bench-venv/ready ## compare the audio features with those of librosa [BENCH_ARGS=--per-clip]

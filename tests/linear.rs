@@ -134,8 +134,7 @@ fn a_thousand_commits_cost_a_reader_few_requests() {
     assert!(looked_up < MOST_REQUESTS, "{looked_up}");
     #[cfg(feature = "query")]
     {
-        let counted =
-            n_requests(&|| run_stage::<Query>(&[store, "select count(*) from phrases"]));
+        let counted = n_requests(&|| run_stage::<Query>(&[store, "select count(*) from phrases"]));
         assert!(counted < MOST_REQUESTS, "{counted}");
     }
 }

@@ -42,7 +42,8 @@ impl Stage for Compact {
             false => {
                 store.sweep();
                 let what = format!("store {store}");
-                let (lease, _) = lease::take(&store, Self::NAME, &what, &|text| progress.note(text))?;
+                let (lease, _) =
+                    lease::take(&store, Self::NAME, &what, &|text| progress.note(text))?;
                 Some(lease)
             }
         };

@@ -88,7 +88,8 @@ impl Ledger {
     /// Returns the latest word on an item.
     pub fn get(&self, id: &str) -> Option<&Settled> {
         let before = || {
-            let place = self.settled.binary_search_by(|known| known.item.id.as_str().cmp(id)).ok()?;
+            let place =
+                self.settled.binary_search_by(|known| known.item.id.as_str().cmp(id)).ok()?;
             self.settled.get(place)
         };
         self.added.get(id).or_else(before)

@@ -36,7 +36,11 @@ fn a_run_that_another_process_generates_or_evaluates_is_refused_until_it_ends() 
 
     let lease = hold(&store, "generate/m/0-of-1");
     refused("generate", &GENERATE, "generate/m/0-of-1");
-    assert_eq!(rows::<GenerationRow>(&store).len(), 0, "nothing was written beside the other process");
+    assert_eq!(
+        rows::<GenerationRow>(&store).len(),
+        0,
+        "nothing was written beside the other process"
+    );
     // A look, another run and another shard are nobody else's.
     succeed(&mut stage("generate", &store, &[&GENERATE[..], &["--dry-run"]].concat()));
     succeed(&mut stage("generate", &store, &[&GENERATE[..], &["--run=other"]].concat()));

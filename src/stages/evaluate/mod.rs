@@ -91,7 +91,8 @@ impl Stage for Evaluate {
         let mut lease = None;
         if !is_up_to_date {
             let (name, what) = (format!("{}/{run}", Self::NAME), format!("evaluation of {run}"));
-            let (taken, has_waited) = lease::take(&store, &name, &what, &|text| progress.note(text))?;
+            let (taken, has_waited) =
+                lease::take(&store, &name, &what, &|text| progress.note(text))?;
             lease = Some(taken);
             // The other process may have evaluated the same.
             is_up_to_date = has_waited && look()?;

@@ -22,8 +22,7 @@ use crate::motion::rates::MotionRange;
 use crate::onnx::{Runtime, Storage};
 use crate::store::tables::OnnxCheckRow;
 use crate::store::{
-    Commit, Item, Ledger, Listed, Location, Row as _, StoreError, TimestampUs, checkpoint,
-    digest,
+    Commit, Item, Ledger, Listed, Location, Row as _, StoreError, TimestampUs, checkpoint, digest,
 };
 use crate::training::{Dataset, Split};
 

@@ -90,8 +90,7 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
     let shard = target.shard.to_string().replace('/', "-of-");
     let name = format!("{}/{}/{shard}", Generate::NAME, maker.run);
     let what = format!("run {}", maker.run);
-    let (lease, has_waited) =
-        lease::take(target.store, &name, &what, &|text| progress.note(text))?;
+    let (lease, has_waited) = lease::take(target.store, &name, &what, &|text| progress.note(text))?;
     if has_waited {
         // The other process may have made some of the motions.
         planned = Planned::new(maker, target)?;
