@@ -69,7 +69,7 @@ DENY_VERSION := 0.20.2
 DENY         := build/tools/cargo-deny-$(DENY_VERSION)/bin/cargo-deny
 .PHONY: deny
 deny: $(DENY) ## check licences, sources and banned crates of all dependencies [DENY_CHECKS=advisories]
-	$(DENY) --locked check $(DENY_CHECKS)
+	$(DENY) --locked check --hide-inclusion-graph $(DENY_CHECKS)
 
 # Built without optimisation: it runs for a second.
 $(DENY):

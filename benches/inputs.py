@@ -12,8 +12,8 @@ cases of tests/data/audio_cases; and the samples of mutagen (its source package)
   same       every sample as one of the references has it, or both refuse it
   length     the samples agree where both have some, and one has more of them
   told       samples are missing, and `lost_s` and the summary say so
-  refused    a codec that is not supported, with a sentence that says it
-  refused, read by the reference   a supported codec that is not read
+  refused    a codec or container that is not supported, named, with the way out: convert it
+  refused, read by the reference   something else is said to be wrong with it
   DIFFERENT  a silent difference: other samples, or fewer, and no word
 """
 
@@ -38,8 +38,8 @@ SECONDS = 5
 # Absolute differences that rounding explains, by the codec: lossless ones have none.
 TOLERANCES = {"opus": 2e-3, "vorbis": 2e-5, "aac": 1e-4, "mp3": 2e-5, "mp2": 2e-5, "mp1": 2e-5}
 LOSSLESS = 1.6e-7
-# A codec whose refusal is right.
-UNSUPPORTED = "not supported"
+# What every refusal of a format that is not supported tells its user to do.
+UNSUPPORTED = "convert it"
 
 
 def run(*command: object, allow: bool = False) -> subprocess.CompletedProcess:
