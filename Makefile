@@ -27,6 +27,20 @@ build: ## build the executables (dev profile)
 demo: build setup ## from tests/data to tables, a library, trained networks, a plot and answers (build/demo)
 	@$(MAKE) --file pipelines/demo.mk BIN=$(BIN)
 
+# Processors round transforms differently; a phrase that library constructs is named by a digest of every bit.
+TABLES := phrases,motion,beats,features,extractions
+DIFF_TABLES = $(BIN)/examples/diff-tables --tables $(TABLES)
+.PHONY: build-diff-tables
+build-diff-tables:
+	$(CARGO) build --locked --example diff-tables
+.PHONY: check-tables
+check-tables: build-diff-tables ## compare the demo's tables with what is kept of them (pipelines/demo.tables.json)
+	$(DIFF_TABLES) pipelines/demo.tables.json build/demo/store --tolerance features=1e-4 --tolerance motion=1e-5 \
+	  --tolerance phrases.content_hash=inf
+.PHONY: keep-tables
+keep-tables: build-diff-tables ## keep the demo's tables as they are now; CHANGELOG says why they changed
+	$(DIFF_TABLES) --digest build/demo/store > pipelines/demo.tables.json
+
 .PHONY: pretrained
 pretrained: build setup ## train the model that ships with the program again (models/pretrained)
 	@$(MAKE) --file pipelines/pretrained.mk BIN=$(BIN)

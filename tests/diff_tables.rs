@@ -86,6 +86,9 @@ fn one_value_that_differs_is_named_with_its_place_and_size() {
 
     let wide = Tolerances { usual: 0.0, named: vec![("motion.position_y".into(), 10.0)] };
     assert_eq!(both(&a, &b, &tables::motion(), &wide), [Vec::<String>::new(), Vec::new()]);
+    let left_out =
+        Tolerances { usual: 0.0, named: vec![("phrases.content_hash".into(), f64::INFINITY)] };
+    assert_eq!(both(&a, &b, &PhraseRow::schema(), &left_out), [Vec::<String>::new(), Vec::new()]);
     let elsewhere = Tolerances { usual: 0.0, named: vec![("motion.position_x".into(), 10.0)] };
     assert_eq!(both(&a, &b, &tables::motion(), &elsewhere)[0].len(), 1);
 

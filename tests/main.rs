@@ -7,6 +7,7 @@ mod beats;
 mod boundaries;
 mod calibration;
 mod compact;
+mod dependencies;
 mod diff_tables;
 mod diffusion;
 mod engine;

@@ -7,7 +7,8 @@ use super::table::{Table, Values};
 pub struct Tolerances {
     /// Relative to a column's root mean square, for columns that are not named.
     pub usual: f64,
-    /// `TABLE.COLUMN` or `TABLE`, and its tolerance; the last that fits counts.
+    /// `TABLE.COLUMN` or `TABLE`, and its tolerance; the last that fits counts. With an infinite one a column is not
+    /// compared, be it of numbers or of text.
     pub named: Vec<(String, f64)>,
 }
 
@@ -29,12 +30,14 @@ pub fn tables(name: &str, a: &Table, b: &Table, tolerances: &Tolerances) -> Vec<
         let Some((_, others)) = b.columns.iter().find(|(other, _)| other == column) else {
             continue;
         };
+        let tolerance = tolerances.of(name, column);
         let difference = match (values, others) {
+            _ if tolerance.is_infinite() => None,
             (Values::Texts(a), Values::Texts(b)) => {
                 let first = a.iter().zip(b).position(|(a, b)| a != b);
                 first.map(|i| format!("first in row {i}: {:?}, then {:?}", a[i], b[i]))
             }
-            (Values::Numbers(a), Values::Numbers(b)) => numbers(a, b, tolerances.of(name, column)),
+            (Values::Numbers(a), Values::Numbers(b)) => numbers(a, b, tolerance),
             _ => Some("of another type".to_owned()),
         };
         found.extend(difference.map(|text| format!("{name}.{column}: {text}")));
@@ -79,12 +82,14 @@ pub fn digests(
     let mut found = other_columns(name, &known(a), &known(b));
     for (column, a) in &a.columns {
         let Some(b) = b.columns.get(column) else { continue };
+        let tolerance = tolerances.of(name, column);
         let difference = match (a, b) {
+            _ if tolerance.is_infinite() => None,
             (ColumnDigest::Texts(a), ColumnDigest::Texts(b)) => {
                 (a != b).then(|| format!("other text: {a:?}, then {b:?}"))
             }
             (ColumnDigest::Numbers(a), ColumnDigest::Numbers(b)) => {
-                let most = tolerances.of(name, column) * a.rms;
+                let most = tolerance * a.rms;
                 let is_far = |a: f64, b: f64| (a - b).abs() > most;
                 let differs = (a.n_null, a.n_not_finite) != (b.n_null, b.n_not_finite)
                     || is_far(a.min, b.min)

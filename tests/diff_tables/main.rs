@@ -7,7 +7,7 @@
 //! ```
 //!
 //! `--tables phrases,motion` compares some tables alone. Numbers may lie apart by `--tolerance` (1e-6) of their column's
-//! root mean square, `--tolerance TABLE=X` or `--tolerance TABLE.COLUMN=X` for some. Columns that tell when and how fast
+//! root mean square, `--tolerance TABLE=X` or `--tolerance TABLE.COLUMN=X` for some, X = inf to leave them out. Columns that tell when and how fast
 //! something ran, and where files lay, are left out. Exit codes: 0 nothing differs, 1 something does, 2 could not run.
 
 mod compare;
