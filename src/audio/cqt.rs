@@ -13,6 +13,7 @@ use realfft::num_complex::Complex64;
 
 use super::tuning::{BINS_PER_OCTAVE, Tuning};
 use super::{HOP, SAMPLE_RATE_HZ};
+use crate::instructions::vectorized;
 
 /// Octaves from C1 on.
 pub const N_OCTAVES: usize = 7;
@@ -72,14 +73,13 @@ pub fn octaves() -> [Octave; N_OCTAVES] {
 /// The bins [`DFT_BINS`] of one frame, real and imaginary parts apart so that sums vectorise.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Spectrum {
-    re: [f64; N_DFT_BINS],
-    im: [f64; N_DFT_BINS],
+    pub re: [f64; N_DFT_BINS],
+    pub im: [f64; N_DFT_BINS],
 }
 
-impl Spectrum {
-    /// Takes the bins in order.
-    pub fn new(bins: &[Complex64; N_DFT_BINS]) -> Self {
-        Self { re: bins.map(|d| d.re), im: bins.map(|d| d.im) }
+impl Default for Spectrum {
+    fn default() -> Self {
+        Self { re: [0.0; N_DFT_BINS], im: [0.0; N_DFT_BINS] }
     }
 }
 
@@ -113,10 +113,11 @@ impl Kernel {
     }
 
     /// Returns the bin's magnitude in a frame of its octave.
-    pub fn magnitude(&self, spectrum: &Spectrum) -> f64 {
+    #[inline(always)]
+    fn magnitude(&self, spectrum: &Spectrum) -> f64 {
         let bins = self.first..self.first + self.re.len() * LANES;
-        let d_re = spectrum.re[bins.clone()].chunks_exact(LANES);
-        let d_im = spectrum.im[bins].chunks_exact(LANES);
+        let d_re = spectrum.re[bins.clone()].as_chunks::<LANES>().0;
+        let d_im = spectrum.im[bins].as_chunks::<LANES>().0;
         let (mut re, mut im) = ([0.0; LANES], [0.0; LANES]);
         for (((b_re, b_im), d_re), d_im) in self.re.iter().zip(&self.im).zip(d_re).zip(d_im) {
             for l in 0..LANES {
@@ -139,6 +140,15 @@ impl Kernel {
 
 /// The kernels of one octave, lowest first.
 pub type OctaveKernels = Vec<Kernel>;
+
+vectorized! {
+    /// Writes the magnitudes of an octave's bins in one of its frames, lowest first.
+    pub fn magnitudes(kernels: &[Kernel], spectrum: &Spectrum, magnitudes: &mut [f64; BINS_PER_OCTAVE]) {
+        for (magnitude, kernel) in magnitudes.iter_mut().zip(kernels) {
+            *magnitude = kernel.magnitude(spectrum);
+        }
+    }
+}
 
 /// Returns the kernels of all octaves for a tuning, highest octave first.
 ///

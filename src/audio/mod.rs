@@ -5,6 +5,7 @@
 //! and beats follow from the mel bands of the whole file. Apart from them, `meter` finds the beats and bars that motion
 //! follows.
 
+mod bank;
 pub mod beat;
 pub mod chroma;
 mod container;

@@ -17,9 +17,9 @@ use std::sync::{Arc, LazyLock};
 
 use ndarray::linalg::general_mat_mul;
 use ndarray::{Array1, Array2, ArrayView1, s};
-use realfft::num_complex::Complex64;
 
-use super::cqt::{DFT_BINS, N_DFT_BINS, Octave, octaves};
+use super::cqt::{DFT_BINS, N_DFT_BINS, Octave, Spectrum, octaves};
+use crate::instructions::vectorized;
 
 /// Samples by which a frame advances.
 const HOP: usize = 735;
@@ -84,7 +84,7 @@ struct Plan {
     cosines: Factors,
     sines: Factors,
     /// e^(735iθ) and e^(368iθ).
-    turns: [(Complex64, Complex64); N_DFT_BINS],
+    turns: [Spectrum; 2],
 }
 
 impl Plan {
@@ -93,15 +93,18 @@ impl Plan {
         let waves = |wave: fn(f64) -> f64| {
             Array2::from_shape_fn((N_DFT_BINS, HALF + 1), |(i, m)| wave(theta(i) * m as f64))
         };
-        let turn = |i: usize| {
-            let by = |samples: usize| Complex64::from_polar(1.0, theta(i) * samples as f64);
-            (by(HOP), by(HOP - HALF))
+        let turn = |samples: usize| {
+            let angle = |i: usize| theta(i) * samples as f64;
+            Spectrum {
+                re: std::array::from_fn(|i| angle(i).cos()),
+                im: std::array::from_fn(|i| angle(i).sin()),
+            }
         };
         Self {
             n_fft,
             cosines: Factors::of(&waves(f64::cos)),
             sines: Factors::of(&waves(f64::sin)),
-            turns: std::array::from_fn(turn),
+            turns: [turn(HOP), turn(HOP - HALF)],
         }
     }
 
@@ -118,7 +121,7 @@ impl Plan {
 pub struct SlidingDft {
     plan: Arc<Plan>,
     /// D of the latest frame.
-    spectrum: [Complex64; N_DFT_BINS],
+    spectrum: Spectrum,
     /// Samples from the start of the latest frame on.
     buffer: Vec<f32>,
     /// Samples at the buffer's start that the latest frame has left behind.
@@ -148,7 +151,7 @@ impl SlidingDft {
         let n_before = half.div_ceil(HOP);
         let rank = plan.cosines.weights.nrows().max(plan.sines.weights.nrows());
         Some(Self {
-            spectrum: [Complex64::default(); N_DFT_BINS],
+            spectrum: Spectrum::default(),
             // Frame −n_before ends at or before sample 0.
             buffer: vec![0.0; HOP * n_before + half],
             start: 0,
@@ -168,7 +171,7 @@ impl SlidingDft {
     }
 
     /// Takes the next samples and calls `visit` with the spectra that are ready, frame by frame.
-    pub fn push(&mut self, samples: &[f32], mut visit: impl FnMut(&[Complex64; N_DFT_BINS])) {
+    pub fn push(&mut self, samples: &[f32], mut visit: impl FnMut(&Spectrum)) {
         self.n_in += samples.len();
         self.buffer.extend_from_slice(samples);
         while self.buffer.len() - self.start >= self.plan.n_fft + HOP * BATCH {
@@ -178,7 +181,7 @@ impl SlidingDft {
     }
 
     /// Ends the signal and calls `visit` with the rest of its 1 + ⌊n/735⌋ spectra.
-    pub fn finish(&mut self, mut visit: impl FnMut(&[Complex64; N_DFT_BINS])) {
+    pub fn finish(&mut self, mut visit: impl FnMut(&Spectrum)) {
         let n_frames = 1 + self.n_in / HOP;
         while self.n_out < n_frames {
             let n_steps = (n_frames - self.n_out + self.n_before.saturating_sub(1)).min(BATCH);
@@ -197,7 +200,7 @@ impl SlidingDft {
     }
 
     /// Advances by `n_steps` frames, at most [`BATCH`].
-    fn advance(&mut self, n_steps: usize, visit: &mut impl FnMut(&[Complex64; N_DFT_BINS])) {
+    fn advance(&mut self, n_steps: usize, visit: &mut impl FnMut(&Spectrum)) {
         let Self { plan, work, buffer, start, .. } = self;
         let n_fft = plan.n_fft;
         for step in 0..n_steps {
@@ -226,16 +229,13 @@ impl SlidingDft {
                 Some(last) => HOP - 1 - last,
                 None => self.n_zeros + HOP,
             };
-            let sums =
-                self.work.cosine_sums.row(step).into_iter().zip(self.work.sine_sums.row(step));
-            for ((d, (whole, half)), (&cos, &sin)) in
-                self.spectrum.iter_mut().zip(&self.plan.turns).zip(sums)
-            {
-                *d = *d * whole + half * Complex64::new(cos, -sin);
+            let (cosines, sines) = (self.work.cosine_sums.row(step), self.work.sine_sums.row(step));
+            if let (Some(cosines), Some(sines)) = (cosines.to_slice(), sines.to_slice()) {
+                turn(&mut self.spectrum, &self.plan.turns, cosines, sines);
             }
             if self.n_zeros >= n_fft {
                 // Of silence nothing remains, not even rounding.
-                self.spectrum.fill(Complex64::default());
+                self.spectrum = Spectrum::default();
             }
             if self.n_before > 1 {
                 self.n_before -= 1;
@@ -249,15 +249,36 @@ impl SlidingDft {
     }
 }
 
-/// Writes the even and odd parts of d = entering − leaving around its middle sample.
-fn fold(leaving: &[f32], entering: &[f32], even: &mut [f64], odd: &mut [f64]) {
-    let d = |n: usize| f64::from(entering[n]) - f64::from(leaving[n]);
-    even[0] = d(HALF);
-    odd[0] = 0.0;
-    for m in 1..=HALF {
-        let (after, before) = (d(HALF + m), d(HALF - m));
-        even[m] = after + before;
-        odd[m] = after - before;
+vectorized! {
+    /// Writes the even and odd parts of d = entering − leaving around its middle sample.
+    fn fold(leaving: &[f32], entering: &[f32], even: &mut [f64], odd: &mut [f64]) {
+        let d = |n: usize| f64::from(entering[n]) - f64::from(leaving[n]);
+        even[0] = d(HALF);
+        odd[0] = 0.0;
+        let (entering_before, entering_after) = (&entering[..HALF], &entering[HALF + 1..HOP]);
+        let (leaving_before, leaving_after) = (&leaving[..HALF], &leaving[HALF + 1..HOP]);
+        let (even, odd) = (&mut even[1..=HALF], &mut odd[1..=HALF]);
+        for m in 0..HALF {
+            let mirror = HALF - 1 - m;
+            let after = f64::from(entering_after[m]) - f64::from(leaving_after[m]);
+            let before = f64::from(entering_before[mirror]) - f64::from(leaving_before[mirror]);
+            even[m] = after + before;
+            odd[m] = after - before;
+        }
+    }
+
+    /// D ← e^(735iθ) · D + e^(368iθ) · (C − iS) with the sums C of cosines and S of sines.
+    fn turn(spectrum: &mut Spectrum, turns: &[Spectrum; 2], cosines: &[f64], sines: &[f64]) {
+        let [whole, half] = turns;
+        let (cosines, sines) = (&cosines[..N_DFT_BINS], &sines[..N_DFT_BINS]);
+        for i in 0..N_DFT_BINS {
+            let (re, im) = (spectrum.re[i], spectrum.im[i]);
+            let (c, s) = (cosines[i], -sines[i]);
+            spectrum.re[i] =
+                (re * whole.re[i] - im * whole.im[i]) + (half.re[i] * c - half.im[i] * s);
+            spectrum.im[i] =
+                (re * whole.im[i] + im * whole.re[i]) + (half.re[i] * s + half.im[i] * c);
+        }
     }
 }
 
@@ -265,25 +286,33 @@ fn fold(leaving: &[f32], entering: &[f32], even: &mut [f64], odd: &mut [f64]) {
 mod tests {
     use super::*;
     use crate::audio::framing::Framer;
-    use crate::audio::stft::Dft;
+    use crate::audio::stft::PairDft;
 
     fn check(y: &[f32], block: usize, tolerance: f64) {
         for octave in octaves().into_iter().skip(2) {
             let mut expected = Vec::new();
-            let (mut framer, mut dft) = (Framer::new(octave.n_fft, HOP), Dft::new(octave.n_fft));
-            let mut add = |frame: &[f32]| expected.push(dft.of(frame)[DFT_BINS].to_vec());
+            let mut framer = Framer::new(octave.n_fft, HOP);
+            let mut dft = PairDft::new(octave.n_fft);
+            let mut add = |frame: &[f32]| {
+                let mut bins = Spectrum::default();
+                dft.transform(frame, None);
+                dft.bins(0, *DFT_BINS.start(), &mut bins.re, &mut bins.im);
+                expected.push(bins);
+            };
             framer.push(y, &mut add);
             framer.finish(&mut add);
             let mut sliding = SlidingDft::new(octave).expect("a low octave");
             let mut found = Vec::new();
             for samples in y.chunks(block) {
-                sliding.push(samples, |spectrum| found.push(spectrum.to_vec()));
+                sliding.push(samples, |spectrum| found.push(spectrum.clone()));
             }
-            sliding.finish(|spectrum| found.push(spectrum.to_vec()));
+            sliding.finish(|spectrum| found.push(spectrum.clone()));
             assert_eq!(found.len(), expected.len(), "N {}", octave.n_fft);
             for (t, (found, expected)) in found.iter().zip(&expected).enumerate() {
-                for (f, e) in found.iter().zip(expected) {
-                    assert!((f - e).norm() <= tolerance, "N {}, frame {t}: {f} {e}", octave.n_fft);
+                let parts = |of: &Spectrum| of.re.into_iter().zip(of.im).collect::<Vec<_>>();
+                for (f, e) in parts(found).into_iter().zip(parts(expected)) {
+                    let error = (f.0 - e.0).hypot(f.1 - e.1);
+                    assert!(error <= tolerance, "N {}, frame {t}: {f:?} {e:?}", octave.n_fft);
                 }
             }
         }
@@ -308,10 +337,10 @@ mod tests {
         y.extend(vec![0.0; 140_000]);
         for octave in octaves().into_iter().skip(2) {
             let mut sliding = SlidingDft::new(octave).expect("a low octave");
-            let mut last = [Complex64::new(f64::NAN, 0.0); N_DFT_BINS];
-            sliding.push(&y, |spectrum| last = *spectrum);
-            sliding.finish(|spectrum| last = *spectrum);
-            assert_eq!(last, [Complex64::default(); N_DFT_BINS]);
+            let mut last = Spectrum { re: [f64::NAN; N_DFT_BINS], ..Spectrum::default() };
+            sliding.push(&y, |spectrum| last = spectrum.clone());
+            sliding.finish(|spectrum| last = spectrum.clone());
+            assert_eq!(last, Spectrum::default());
         }
     }
 

@@ -3,9 +3,10 @@
 use std::sync::LazyLock;
 
 use super::framing::Framer;
-use super::mel::{MelBank, N_MELS, power_to_db};
-use super::stft::{Dft, hann_power};
+use super::mel::{MelBank, powers_to_db};
+use super::stft::PairDft;
 use super::{HOP, N_FFT, SAMPLE_RATE_HZ};
+use crate::instructions::vectorized;
 
 /// Range of the mel bands that are features, in Hz.
 pub const MEL_RANGE_HZ: (f64, f64) = (20.0, 8000.0);
@@ -16,19 +17,59 @@ static MEL_BANK: LazyLock<MelBank> = LazyLock::new(|| MelBank::new(MEL_RANGE_HZ.
 static FULL_BANK: LazyLock<MelBank> =
     LazyLock::new(|| MelBank::new(FULL_RANGE_HZ.0, FULL_RANGE_HZ.1));
 
-/// Root mean square of a frame: √(Σ y² / N).
-pub fn rms(frame: &[f32]) -> f32 {
-    let energy: f64 = frame.iter().map(|&y| f64::from(y) * f64::from(y)).sum();
-    (energy / frame.len() as f64).sqrt() as f32
+/// Values that sums take side by side: as many f64 as the widest register holds.
+const LANES: usize = 8;
+
+vectorized! {
+    /// Root mean square of a frame: √(Σ y² / N).
+    pub fn rms(frame: &[f32]) -> f32 {
+        let (lots, rest) = frame.as_chunks::<LANES>();
+        let mut lanes = [0.0; LANES];
+        for lot in lots {
+            for l in 0..LANES {
+                lanes[l] += f64::from(lot[l]) * f64::from(lot[l]);
+            }
+        }
+        let rest: f64 = rest.iter().map(|&y| f64::from(y) * f64::from(y)).sum();
+        ((lanes.iter().sum::<f64>() + rest) / frame.len() as f64).sqrt() as f32
+    }
+
+    /// Takes the root of powers in place, rounded to single precision as librosa's magnitudes are, and
+    /// writes the squares of that, which librosa's powers are.
+    fn magnitudes(power: &mut [f64], magnitude: &mut [f64]) {
+        let n = power.len().min(magnitude.len());
+        let (power, magnitude) = (&mut power[..n], &mut magnitude[..n]);
+        for k in 0..n {
+            let rounded = power[k].sqrt() as f32;
+            magnitude[k] = f64::from(rounded);
+            power[k] = f64::from(rounded * rounded);
+        }
+    }
+
+    /// Returns Σ_k k S\[k\] and Σ_k S\[k\].
+    fn moments(magnitude: &[f64]) -> [f64; 2] {
+        let (lots, rest) = magnitude.as_chunks::<LANES>();
+        let (mut weighted, mut sums) = ([0.0; LANES], [0.0; LANES]);
+        let mut bins: [f64; LANES] = std::array::from_fn(|l| l as f64);
+        for lot in lots {
+            for l in 0..LANES {
+                weighted[l] += bins[l] * lot[l];
+                sums[l] += lot[l];
+                bins[l] += LANES as f64;
+            }
+        }
+        let mut moments = [weighted.iter().sum::<f64>(), sums.iter().sum::<f64>()];
+        for (bin, s) in bins.iter().zip(rest) {
+            moments[0] += bin * s;
+            moments[1] += s;
+        }
+        moments
+    }
 }
 
 /// Spectral centroid in Hz: Σ_k f_k S\[k\] / Σ_k S\[k\]; 0 for silence.
 pub fn centroid_hz(magnitude: &[f64]) -> f64 {
-    let (mut weighted, mut sum) = (0.0, 0.0);
-    for (k, s) in magnitude.iter().enumerate() {
-        weighted += k as f64 * s;
-        sum += s;
-    }
+    let [weighted, sum] = moments(magnitude);
     // librosa's `normalize` leaves columns below the smallest normal f32 as they are: nearly 0.
     if sum < f64::from(f32::MIN_POSITIVE) {
         return 0.0;
@@ -39,11 +80,19 @@ pub fn centroid_hz(magnitude: &[f64]) -> f64 {
 /// Collects what a stream's spectra tell, frame by frame.
 pub struct SpectralPass {
     framer: Framer,
-    dft: Dft,
-    power: Vec<f64>,
-    magnitude: Vec<f64>,
+    room: Room,
     pub found: Spectral,
 }
+
+/// Room for the spectra of two frames.
+struct Room {
+    dft: PairDft,
+    powers: [[f64; N_BINS]; 2],
+    magnitude: [f64; N_BINS],
+}
+
+/// Bins of a frame's spectrum.
+const N_BINS: usize = N_FFT / 2 + 1;
 
 /// What [`SpectralPass`] collected; T frames.
 #[derive(Clone, Debug, Default)]
@@ -58,25 +107,24 @@ pub struct Spectral {
 
 impl SpectralPass {
     pub fn new() -> Self {
+        let (powers, magnitude) = ([[0.0; N_BINS]; 2], [0.0; N_BINS]);
         Self {
             framer: Framer::new(N_FFT, HOP),
-            dft: Dft::new(N_FFT),
-            power: vec![0.0; N_FFT / 2 + 1],
-            magnitude: vec![0.0; N_FFT / 2 + 1],
+            room: Room { dft: PairDft::hann(N_FFT), powers, magnitude },
             found: Spectral::default(),
         }
     }
 
     /// Takes the next samples at 44.1 kHz.
     pub fn push(&mut self, samples: &[f32]) {
-        let Self { framer, dft, power, magnitude, found } = self;
-        framer.push(samples, |frame| found.add(frame, dft, power, magnitude));
+        let Self { framer, room, found } = self;
+        framer.push_pairs(samples, |first, second| found.add_pair(first, second, room));
     }
 
     /// Ends the signal.
     pub fn finish(mut self) -> Spectral {
-        let Self { framer, dft, power, magnitude, found } = &mut self;
-        framer.finish(|frame| found.add(frame, dft, power, magnitude));
+        let Self { framer, room, found } = &mut self;
+        framer.finish_pairs(|first, second| found.add_pair(first, second, room));
         self.found
     }
 }
@@ -88,19 +136,26 @@ impl Default for SpectralPass {
 }
 
 impl Spectral {
-    fn add(&mut self, frame: &[f32], dft: &mut Dft, power: &mut [f64], magnitude: &mut [f64]) {
-        hann_power(dft.of(frame), power);
-        for (s, p) in magnitude.iter_mut().zip(power.iter_mut()) {
-            // librosa squares the magnitude that it has rounded to f32.
-            let rounded = p.sqrt() as f32;
-            *s = f64::from(rounded);
-            *p = f64::from(rounded * rounded);
+    fn add_pair(&mut self, first: &[f32], second: Option<&[f32]>, room: &mut Room) {
+        let Room { dft, powers, magnitude } = room;
+        let [first_power, second_power] = powers;
+        dft.transform(first, second);
+        dft.powers(first_power, second_power);
+        self.add(first, first_power, magnitude);
+        if let Some(second) = second {
+            self.add(second, second_power, magnitude);
         }
+    }
+
+    fn add(&mut self, frame: &[f32], power: &mut [f64], magnitude: &mut [f64]) {
+        magnitudes(power, magnitude);
         self.rms.push(rms(frame));
         self.centroid_hz.push(centroid_hz(magnitude));
-        let db = |bank: &MelBank| -> [f32; N_MELS] { bank.apply(power).map(power_to_db) };
-        self.mel_db.extend(db(&MEL_BANK));
-        self.full_db.extend(db(&FULL_BANK));
+        for (bank, found) in [(&*MEL_BANK, &mut self.mel_db), (&*FULL_BANK, &mut self.full_db)] {
+            let mut db = bank.apply(power);
+            powers_to_db(&mut db);
+            found.extend(db);
+        }
     }
 }
 
@@ -112,6 +167,7 @@ mod tests {
     fn a_constant_has_its_own_rms() {
         assert_eq!(rms(&[-0.25; 9]), 0.25);
         assert_eq!(rms(&[3.0, 4.0, 0.0, 0.0]), 2.5);
+        assert_eq!(rms(&[1.5; 24]), 1.5);
     }
 
     #[test]
@@ -119,5 +175,7 @@ mod tests {
         let bin_hz = 44_100.0 / 2048.0;
         assert_eq!(centroid_hz(&[0.0, 0.0, 3.0, 0.0, 1.0]), 2.5 * bin_hz);
         assert_eq!(centroid_hz(&[0.0; 5]), 0.0);
+        // Σk/n = (n − 1)/2 of a flat spectrum, whatever part of it is summed side by side.
+        assert_eq!(centroid_hz(&[1.0; 17]), 8.0 * bin_hz);
     }
 }
