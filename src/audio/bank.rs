@@ -41,9 +41,9 @@ impl Bank {
         bank
     }
 
-    /// Writes the sum of every row over a spectrum, in f64 and rounded once.
-    pub fn apply(&self, spectrum: &[f64], sums: &mut [f32]) {
-        apply(&self.rows, &self.weights, spectrum, sums);
+    /// Writes the sum of every row over either of two spectra, in f64 and rounded once.
+    pub fn apply(&self, spectra: [&[f64]; 2], sums: [&mut [f32]; 2]) {
+        apply(&self.rows, &self.weights, spectra, sums);
     }
 
     /// Returns the first bin and the weights of every row, padding and all.
@@ -58,21 +58,40 @@ impl Bank {
     }
 }
 
+/// Rows whose lanes are kept before they are added up.
+const GROUP: usize = 32;
+
 vectorized! {
-    fn apply(rows: &[Row], weights: &[[f64; LANES]], spectrum: &[f64], sums: &mut [f32]) {
+    fn apply(rows: &[Row], weights: &[[f64; LANES]], spectra: [&[f64]; 2], sums: [&mut [f32]; 2]) {
         let mut rest = weights;
-        for (sum, row) in sums.iter_mut().zip(rows) {
-            let (weights, others) = rest.split_at(row.n_lots);
-            rest = others;
-            let bins = spectrum[row.first..row.first + LANES * row.n_lots].as_chunks::<LANES>().0;
-            let mut lanes = [0.0; LANES];
-            for (w, x) in weights.iter().zip(bins) {
-                for l in 0..LANES {
-                    lanes[l] += w[l] * x[l];
+        let [first_sums, second_sums] = sums;
+        let groups = first_sums.chunks_mut(GROUP).zip(second_sums.chunks_mut(GROUP));
+        for (rows, (first_sums, second_sums)) in rows.chunks(GROUP).zip(groups) {
+            // Lanes that lie in memory are added to as vectors; sums across them come after.
+            let mut lanes = [[[0.0; LANES]; GROUP]; 2];
+            let [first_lanes, second_lanes] = &mut lanes;
+            for ((row, first), second) in rows.iter().zip(first_lanes).zip(second_lanes) {
+                let (weights, others) = rest.split_at(row.n_lots);
+                rest = others;
+                let bins = row.first..row.first + LANES * row.n_lots;
+                let [x, y] = spectra.map(|spectrum| spectrum[bins.clone()].as_chunks::<LANES>().0);
+                let (mut x_lanes, mut y_lanes) = ([0.0; LANES], [0.0; LANES]);
+                for ((w, x), y) in weights.iter().zip(x).zip(y) {
+                    for l in 0..LANES {
+                        x_lanes[l] += w[l] * x[l];
+                    }
+                    for l in 0..LANES {
+                        y_lanes[l] += w[l] * y[l];
+                    }
+                }
+                *first = x_lanes;
+                *second = y_lanes;
+            }
+            for (sums, lanes) in [first_sums, second_sums].into_iter().zip(&lanes) {
+                for (sum, [a, b, c, d]) in sums.iter_mut().zip(lanes) {
+                    *sum = ((a + b) + (c + d)) as f32;
                 }
             }
-            let [a, b, c, d] = lanes;
-            *sum = ((a + b) + (c + d)) as f32;
         }
     }
 }
@@ -88,12 +107,16 @@ mod tests {
             .map(|(first, n)| (first, (0..n).map(|i| 0.5 + (i * i) as f64).collect()))
             .to_vec();
         let spectrum: Vec<f64> = (0..n_bins).map(|k| 1.0 + (k % 5) as f64).collect();
-        let mut sums = [f32::NAN; 6];
-        Bank::new(n_bins, rows.clone()).apply(&spectrum, &mut sums);
-        for (found, (first, weights)) in sums.into_iter().zip(rows) {
-            let terms = weights.iter().zip(&spectrum[first..]).map(|(w, x)| w * x);
-            // Halves of small integers: sums are exact in any order.
-            assert_eq!(f64::from(found), terms.sum::<f64>());
+        let other: Vec<f64> = spectrum.iter().rev().map(|x| 3.0 * x).collect();
+        let mut sums = [[f32::NAN; 6]; 2];
+        let [a, b] = &mut sums;
+        Bank::new(n_bins, rows.clone()).apply([&spectrum, &other], [a, b]);
+        for (spectrum, sums) in [spectrum, other].iter().zip(sums) {
+            for (found, (first, weights)) in sums.into_iter().zip(&rows) {
+                let terms = weights.iter().zip(&spectrum[*first..]).map(|(w, x)| w * x);
+                // Halves of small integers: sums are exact in any order.
+                assert_eq!(f64::from(found), terms.sum::<f64>());
+            }
         }
     }
 }

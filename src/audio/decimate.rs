@@ -20,7 +20,7 @@ pub const BETA: f64 = 13.040_03;
 pub const HALF_LENGTH: f64 = CENTRE as f64 + 0.5;
 
 /// Length of one block's transform; a block has this many samples less the filter's overlap.
-const N_FFT: usize = 8192;
+const N_FFT: usize = 4096;
 const OVERLAP: usize = N_TAPS - 1;
 /// Even, so that every block starts on a sample that is kept.
 const BLOCK: usize = N_FFT - OVERLAP;

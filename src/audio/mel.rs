@@ -84,11 +84,10 @@ impl MelBank {
         Self { bands: Bank::new(N_FFT / 2 + 1, (0..N_MELS).map(band)) }
     }
 
-    /// Returns the power in every band: M = W·P for the power P of the bins.
-    pub fn apply(&self, power: &[f64]) -> [f32; N_MELS] {
-        let mut mel = [0.0; N_MELS];
-        self.bands.apply(power, &mut mel);
-        mel
+    /// Writes the power in every band, for two frames: M = W·P for the power P of the bins.
+    pub fn apply(&self, powers: &[[f64; N_FFT / 2 + 1]; 2], mel: &mut [[f32; N_MELS]; 2]) {
+        let ([first, second], [first_mel, second_mel]) = (powers, mel);
+        self.bands.apply([first, second], [first_mel, second_mel]);
     }
 }
 
@@ -102,10 +101,10 @@ vectorized! {
     }
 }
 
-/// log₁₀ x of a normal number, rounded from an approximation that is good to 10⁻¹³ of itself or 10⁻¹⁴.
+/// log₁₀ x of a normal number, rounded from an approximation that is good to 10⁻¹² of itself.
 ///
-/// x = 2ᵉ m, √½ ≤ m < √2; ln m = 2(s + s³/3 + s⁵/5 + …), s = (m − 1)/(m + 1), |s| < 0.172. Ten terms
-/// leave s²¹/21 · 2 < 10⁻¹⁷.
+/// x = 2ᵉ m, √½ ≤ m < √2; ln m = 2(s + s³/3 + s⁵/5 + …), s = (m − 1)/(m + 1), |s| < 0.172. Seven terms
+/// leave less than 2s¹⁵/15 · 1.04 < 5·10⁻¹³.
 #[inline(always)]
 fn log10(x: f32) -> f32 {
     /// The bits of √½: numbers from here to twice that have the exponent 0.
@@ -115,8 +114,8 @@ fn log10(x: f32) -> f32 {
     let m = f64::from(f32::from_bits(((bits & 0x7f_ffff) + START).cast_unsigned()));
     let s = (m - 1.0) / (m + 1.0);
     let square = s * s;
-    let mut series = 1.0 / 19.0;
-    for n in [17.0, 15.0, 13.0, 11.0, 9.0, 7.0, 5.0, 3.0, 1.0] {
+    let mut series = 1.0 / 13.0;
+    for n in [11.0, 9.0, 7.0, 5.0, 3.0, 1.0] {
         series = series * square + 1.0 / n;
     }
     (f64::from(exponent) * LOG10_2 + s * series * (2.0 * LOG10_E)) as f32
@@ -177,7 +176,7 @@ mod tests {
         for x in spread.chain(near).map(f32::from_bits) {
             let (found, expected) = (log10(x), f64::from(x).log10());
             // Half a unit of the last place, and what the approximation adds to it.
-            let tolerance = expected.abs() * (2f64.powi(-24) + 1e-13) + 1e-14;
+            let tolerance = expected.abs() * (2f64.powi(-24) + 1e-11);
             assert!((f64::from(found) - expected).abs() <= tolerance, "{x:e}: {found} {expected}");
         }
     }

@@ -128,11 +128,15 @@ impl Recording {
         let (encoding, loss) = decode(input, extension_hint, options, |samples| {
             first.push(samples);
             meter.push(samples);
-            digest.add(samples);
-            let fits = |kept: &Vec<f32>| kept.len() + samples.len() <= options.max_held_samples;
-            held = held.take().filter(fits);
-            if let Some(kept) = &mut held {
-                kept.extend_from_slice(samples);
+            match &mut held {
+                Some(kept) if kept.len() + samples.len() <= options.max_held_samples => {
+                    kept.extend_from_slice(samples);
+                }
+                _ => {
+                    // Samples that are read twice are compared.
+                    digest.add(&held.take().unwrap_or_default());
+                    digest.add(samples);
+                }
             }
         })?;
         let mut second = first.finish()?;

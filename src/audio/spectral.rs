@@ -3,7 +3,7 @@
 use std::sync::LazyLock;
 
 use super::framing::Framer;
-use super::mel::{MelBank, powers_to_db};
+use super::mel::{MelBank, N_MELS, powers_to_db};
 use super::stft::PairDft;
 use super::{HOP, N_FFT, SAMPLE_RATE_HZ};
 use crate::instructions::vectorized;
@@ -34,42 +34,49 @@ vectorized! {
         ((lanes.iter().sum::<f64>() + rest) / frame.len() as f64).sqrt() as f32
     }
 
-    /// Takes the root of powers in place, rounded to single precision as librosa's magnitudes are, and
-    /// writes the squares of that, which librosa's powers are.
-    fn magnitudes(power: &mut [f64], magnitude: &mut [f64]) {
-        let n = power.len().min(magnitude.len());
-        let (power, magnitude) = (&mut power[..n], &mut magnitude[..n]);
-        for k in 0..n {
-            let rounded = power[k].sqrt() as f32;
-            magnitude[k] = f64::from(rounded);
-            power[k] = f64::from(rounded * rounded);
-        }
-    }
-
-    /// Returns Σ_k k S\[k\] and Σ_k S\[k\].
-    fn moments(magnitude: &[f64]) -> [f64; 2] {
-        let (lots, rest) = magnitude.as_chunks::<LANES>();
-        let (mut weighted, mut sums) = ([0.0; LANES], [0.0; LANES]);
+    /// Replaces powers by the squares of their roots S rounded to single precision, which librosa's powers are;
+    /// adds up k S\[k\] and S\[k\] side by side.
+    fn round_roots(power: &mut [f64], weighted: &mut [f64; LANES], sums: &mut [f64; LANES]) {
+        let round = |power: &mut f64| {
+            let root = power.sqrt() as f32;
+            *power = f64::from(root * root);
+            f64::from(root)
+        };
+        let (lots, rest) = power.as_chunks_mut::<LANES>();
         let mut bins: [f64; LANES] = std::array::from_fn(|l| l as f64);
+        // Lanes that lie in memory are added to as vectors.
+        let (mut weighted_lanes, mut lanes) = (*weighted, *sums);
         for lot in lots {
+            let roots = lot.each_mut().map(round);
             for l in 0..LANES {
-                weighted[l] += bins[l] * lot[l];
-                sums[l] += lot[l];
-                bins[l] += LANES as f64;
+                weighted_lanes[l] += bins[l] * roots[l];
+            }
+            for l in 0..LANES {
+                lanes[l] += roots[l];
+            }
+            for bin in &mut bins {
+                *bin += LANES as f64;
             }
         }
-        let mut moments = [weighted.iter().sum::<f64>(), sums.iter().sum::<f64>()];
-        for (bin, s) in bins.iter().zip(rest) {
-            moments[0] += bin * s;
-            moments[1] += s;
+        for (l, power) in rest.iter_mut().enumerate() {
+            let root = round(power);
+            weighted_lanes[l] += bins[l] * root;
+            lanes[l] += root;
         }
-        moments
+        *weighted = weighted_lanes;
+        *sums = lanes;
     }
 }
 
-/// Spectral centroid in Hz: Σ_k f_k S\[k\] / Σ_k S\[k\]; 0 for silence.
-pub fn centroid_hz(magnitude: &[f64]) -> f64 {
-    let [weighted, sum] = moments(magnitude);
+/// Rounds roots as [`round_roots`] and returns Σ_k k S\[k\] and Σ_k S\[k\].
+fn moments(power: &mut [f64]) -> [f64; 2] {
+    let (mut weighted, mut sums) = ([0.0; LANES], [0.0; LANES]);
+    round_roots(power, &mut weighted, &mut sums);
+    [weighted.iter().sum(), sums.iter().sum()]
+}
+
+/// Spectral centroid in Hz: Σ_k f_k S\[k\] / Σ_k S\[k\], given Σ_k k S\[k\] and Σ_k S\[k\]; 0 for silence.
+fn centroid_hz([weighted, sum]: [f64; 2]) -> f64 {
     // librosa's `normalize` leaves columns below the smallest normal f32 as they are: nearly 0.
     if sum < f64::from(f32::MIN_POSITIVE) {
         return 0.0;
@@ -88,7 +95,7 @@ pub struct SpectralPass {
 struct Room {
     dft: PairDft,
     powers: [[f64; N_BINS]; 2],
-    magnitude: [f64; N_BINS],
+    mel: [[f32; N_MELS]; 2],
 }
 
 /// Bins of a frame's spectrum.
@@ -107,10 +114,10 @@ pub struct Spectral {
 
 impl SpectralPass {
     pub fn new() -> Self {
-        let (powers, magnitude) = ([[0.0; N_BINS]; 2], [0.0; N_BINS]);
+        let (powers, mel) = ([[0.0; N_BINS]; 2], [[0.0; N_MELS]; 2]);
         Self {
             framer: Framer::new(N_FFT, HOP),
-            room: Room { dft: PairDft::hann(N_FFT), powers, magnitude },
+            room: Room { dft: PairDft::hann(N_FFT), powers, mel },
             found: Spectral::default(),
         }
     }
@@ -137,24 +144,21 @@ impl Default for SpectralPass {
 
 impl Spectral {
     fn add_pair(&mut self, first: &[f32], second: Option<&[f32]>, room: &mut Room) {
-        let Room { dft, powers, magnitude } = room;
+        let Room { dft, powers, mel } = room;
         let [first_power, second_power] = powers;
         dft.transform(first, second);
         dft.powers(first_power, second_power);
-        self.add(first, first_power, magnitude);
-        if let Some(second) = second {
-            self.add(second, second_power, magnitude);
+        for (frame, power) in [Some(first), second].into_iter().zip(powers.iter_mut()) {
+            let Some(frame) = frame else { continue };
+            self.rms.push(rms(frame));
+            self.centroid_hz.push(centroid_hz(moments(power)));
         }
-    }
-
-    fn add(&mut self, frame: &[f32], power: &mut [f64], magnitude: &mut [f64]) {
-        magnitudes(power, magnitude);
-        self.rms.push(rms(frame));
-        self.centroid_hz.push(centroid_hz(magnitude));
+        let n_frames = 1 + usize::from(second.is_some());
         for (bank, found) in [(&*MEL_BANK, &mut self.mel_db), (&*FULL_BANK, &mut self.full_db)] {
-            let mut db = bank.apply(power);
-            powers_to_db(&mut db);
-            found.extend(db);
+            bank.apply(powers, mel);
+            let db = &mut mel.as_flattened_mut()[..n_frames * N_MELS];
+            powers_to_db(db);
+            found.extend_from_slice(db);
         }
     }
 }
@@ -172,10 +176,25 @@ mod tests {
 
     #[test]
     fn the_centroid_is_the_mean_frequency() {
+        let centroid = |magnitudes: &[f64]| {
+            let mut powers: Vec<f64> = magnitudes.iter().map(|s| s * s).collect();
+            let found = centroid_hz(moments(&mut powers));
+            // Small integers are rounded to themselves.
+            assert!(powers.iter().zip(magnitudes).all(|(p, s)| *p == s * s));
+            found
+        };
         let bin_hz = 44_100.0 / 2048.0;
-        assert_eq!(centroid_hz(&[0.0, 0.0, 3.0, 0.0, 1.0]), 2.5 * bin_hz);
-        assert_eq!(centroid_hz(&[0.0; 5]), 0.0);
+        assert_eq!(centroid(&[0.0, 0.0, 3.0, 0.0, 1.0]), 2.5 * bin_hz);
+        assert_eq!(centroid(&[0.0; 5]), 0.0);
         // Σk/n = (n − 1)/2 of a flat spectrum, whatever part of it is summed side by side.
-        assert_eq!(centroid_hz(&[1.0; 17]), 8.0 * bin_hz);
+        assert_eq!(centroid(&[1.0; 17]), 8.0 * bin_hz);
+    }
+
+    #[test]
+    fn powers_are_squares_of_rounded_roots() {
+        let mut powers = [2.0; 11];
+        moments(&mut powers);
+        let root = 2f32.sqrt();
+        assert_eq!(powers, [f64::from(root * root); 11]);
     }
 }

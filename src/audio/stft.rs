@@ -78,16 +78,22 @@ impl PairDft {
     pub fn transform(&mut self, first: &[f32], second: Option<&[f32]>) {
         let Self { fft, window, silence, z, spectrum, scratch, scales } = self;
         let second = second.unwrap_or(silence);
-        let peaks = load(z, window, first, second, [1.0; 2]);
+        // What the window leaves nothing of is no peak.
+        let n_unheard = window.iter().take_while(|w| **w == 0.0).count();
+        let peaks = [first, second].map(|frame| f64::from(peak(&frame[n_unheard..])));
         let [low, high] = if peaks[0] < peaks[1] { peaks } else { [peaks[1], peaks[0]] };
-        *scales = peaks.map(|peak| if peak == 0.0 { 0.0 } else { 0.5 });
         if high == 0.0 {
+            *scales = [0.0; 2];
             return;
         }
         if low != 0.0 && low * MAX_RATIO < high {
             let powers = peaks.map(power_of_two_below);
-            load(z, window, first, second, powers.map(|power| 1.0 / power));
+            load(z, window, first, second);
+            level(z, powers.map(|power| 1.0 / power));
             *scales = powers.map(|power| 0.5 * power);
+        } else {
+            load(z, window, first, second);
+            *scales = peaks.map(|peak| if peak == 0.0 { 0.0 } else { 0.5 });
         }
         fft.process_outofplace_with_scratch(z, spectrum, scratch);
     }
@@ -132,37 +138,45 @@ fn power_of_two_below(x: f64) -> f64 {
 }
 
 vectorized! {
-    /// Writes z = w (g a + i h b) and returns the largest |w a| and |w b|.
-    fn load(
-        z: &mut [Complex64], window: &[f64], first: &[f32], second: &[f32], gains: [f64; 2],
-    ) -> [f64; 2] {
-        let n = z.len();
-        let (window, first, second) = (&window[..n], &first[..n], &second[..n]);
+    /// Returns the largest magnitude.
+    fn peak(frame: &[f32]) -> f32 {
         // Magnitudes are ordered as the integers that their bits are, and maxima of integers vectorise.
-        let magnitude = |x: f64| x.abs().to_bits().cast_signed();
-        let mut peaks = [0; 2];
-        for i in 0..n {
-            let (a, b) = (window[i] * f64::from(first[i]), window[i] * f64::from(second[i]));
-            z[i] = Complex64::new(a * gains[0], b * gains[1]);
-            peaks = [peaks[0].max(magnitude(a)), peaks[1].max(magnitude(b))];
-        }
-        peaks.map(|bits| f64::from_bits(bits.cast_unsigned()))
+        f32::from_bits(frame.iter().fold(0, |peak, y| peak.max(y.abs().to_bits())))
     }
 
+    /// Writes z = w (a + ib).
+    fn load(z: &mut [Complex64], window: &[f64], first: &[f32], second: &[f32]) {
+        let n = z.len();
+        let (window, first, second) = (&window[..n], &first[..n], &second[..n]);
+        for i in 0..n {
+            let (a, b) = (f64::from(first[i]), f64::from(second[i]));
+            z[i] = Complex64::new(window[i] * a, window[i] * b);
+        }
+    }
+
+    /// Multiplies the real parts by g, the imaginary ones by h.
+    fn level(z: &mut [Complex64], gains: [f64; 2]) {
+        for z in z {
+            *z = Complex64::new(gains[0] * z.re, gains[1] * z.im);
+        }
+    }
+
+    /// Writes |A|² and |B|²; powers of two may be multiplied after rounding.
     fn pair_powers(
         spectrum: &[Complex64], scales: [f64; 2], first: &mut [f64], second: &mut [f64],
     ) {
-        let rounded = |re: f64, im: f64| {
+        let rounded = |re: f64, im: f64, scale: f64| {
             let (re, im) = (f64::from(re as f32), f64::from(im as f32));
-            re * re + im * im
+            (re * re + im * im) * scale
         };
+        let scales = scales.map(|scale| scale * scale);
         let n = spectrum.len();
         let half = n / 2;
         // The ends are their own mirror images.
         for k in [0, half] {
             let z = spectrum[k];
-            first[k] = rounded(2.0 * scales[0] * z.re, 0.0);
-            second[k] = rounded(2.0 * scales[1] * z.im, 0.0);
+            first[k] = rounded(2.0 * z.re, 0.0, scales[0]);
+            second[k] = rounded(2.0 * z.im, 0.0, scales[1]);
         }
         let n_inner = half - 1;
         let (front, back) = (&spectrum[1..half], &spectrum[half + 1..]);
@@ -171,8 +185,8 @@ vectorized! {
             let (z, mirror) = (front[i], back[n_inner - 1 - i]);
             let (a_re, a_im) = (z.re + mirror.re, z.im - mirror.im);
             let (b_re, b_im) = (z.im + mirror.im, mirror.re - z.re);
-            first[i] = rounded(scales[0] * a_re, scales[0] * a_im);
-            second[i] = rounded(scales[1] * b_re, scales[1] * b_im);
+            first[i] = rounded(a_re, a_im, scales[0]);
+            second[i] = rounded(b_re, b_im, scales[1]);
         }
     }
 

@@ -85,6 +85,8 @@ pub struct BandPass {
 struct Hearing {
     /// One row per band, whose weights sum to 1.
     bank: Bank,
+    /// Bins up to the highest that is heard.
+    n_bins: usize,
     /// First bin of the notes; of every bin the note below and the share of the note above.
     notes: (usize, Vec<(usize, f64)>),
 }
@@ -116,10 +118,8 @@ impl BandPass {
         pairs(framer, &mut |first, second| {
             dft.transform(first, second);
             dft.powers(first_power, second_power);
-            hearing.add(first_power, found);
-            if second.is_some() {
-                hearing.add(second_power, found);
-            }
+            let n_frames = 1 + usize::from(second.is_some());
+            hearing.add([first_power, second_power], n_frames, found);
         });
     }
 }
@@ -145,22 +145,29 @@ impl Hearing {
             (pitch.floor() as usize % N_NOTES, pitch.fract())
         };
         let notes = (first..N_FFT / 2).take_while(is_note).map(note).collect();
-        Self { bank: Bank::new(N_BINS, (0..N_BANDS).map(band)), notes: (first, notes) }
+        let bands: Vec<(usize, Vec<f64>)> = (0..N_BANDS).map(band).collect();
+        let n_bins = bands.iter().map(|(first, w)| first + w.len()).max().unwrap_or(0);
+        Self { bank: Bank::new(N_BINS, bands), n_bins, notes: (first, notes) }
     }
 
-    /// Adds what is heard of a frame, given |X\[k\]|², of which the root is taken in place.
-    fn add(&self, power: &mut [f64; N_BINS], found: &mut Spectra) {
-        take_roots(power);
-        let magnitude = &power[..];
-        let mut bands = [0.0; N_BANDS];
-        self.bank.apply(magnitude, &mut bands);
-        found.bands.extend(bands);
-        let mut strengths = [0.0; N_NOTES];
-        for (m, &(note, share)) in magnitude[self.notes.0..].iter().zip(&self.notes.1) {
-            strengths[note] += m * (1.0 - share);
-            strengths[(note + 1) % N_NOTES] += m * share;
+    /// Adds what is heard of a frame or two, given |X\[k\]|², of which the roots are taken in place.
+    fn add(&self, powers: [&mut [f64; N_BINS]; 2], n_frames: usize, found: &mut Spectra) {
+        let [first, second] = powers.map(|power| {
+            take_roots(&mut power[..self.n_bins]);
+            &power[..]
+        });
+        let mut bands = [[0.0; N_BANDS]; 2];
+        let [first_bands, second_bands] = &mut bands;
+        self.bank.apply([first, second], [first_bands, second_bands]);
+        found.bands.extend_from_slice(bands[..n_frames].as_flattened());
+        for magnitude in [first, second].into_iter().take(n_frames) {
+            let mut strengths = [0.0; N_NOTES];
+            for (m, &(note, share)) in magnitude[self.notes.0..].iter().zip(&self.notes.1) {
+                strengths[note] += m * (1.0 - share);
+                strengths[(note + 1) % N_NOTES] += m * share;
+            }
+            found.notes.extend(strengths.map(|x| x as f32));
         }
-        found.notes.extend(strengths.map(|x| x as f32));
     }
 }
 

@@ -66,6 +66,14 @@ fn silence_beside_sound_is_exactly_silent_and_a_last_frame_may_stand_alone() {
 }
 
 #[test]
+fn a_sample_that_the_window_leaves_nothing_of_is_silence() {
+    let mut edge = vec![0.0; N];
+    edge[0] = 0.5;
+    let [first, _] = powers(&edge, Some(&chirp(1.0)));
+    assert!(first.iter().all(|&p| p == 0.0));
+}
+
+#[test]
 fn bins_are_those_of_the_frame_as_it_is() {
     let frames = [chirp(0.3), tone(0.5)];
     let mut dft = PairDft::new(N);
