@@ -21,6 +21,7 @@ pub mod meter;
 pub mod mfcc;
 pub mod onset;
 mod pcm;
+mod peak;
 pub mod recording;
 pub mod resample;
 mod scale;

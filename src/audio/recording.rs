@@ -6,6 +6,7 @@ use super::SAMPLE_RATE_HZ;
 use super::decode::{DecodeError, Decoder, Loss};
 use super::features::{FeatureError, FirstPass, RawFeatures};
 use super::meter::{Meter, MeterPass};
+use super::peak::peak;
 use super::resample::Resampler;
 use super::tuning::Tuning;
 
@@ -184,7 +185,9 @@ fn decode(
     loop {
         packet.clear();
         let goes_on = decoder.next_block(&mut packet)?;
-        if let Some(i) = packet.iter().position(|y| y.abs() > MAX_SAMPLE) {
+        if peak(&packet) > MAX_SAMPLE
+            && let Some(i) = packet.iter().position(|y| y.abs() > MAX_SAMPLE)
+        {
             let time_s = (n_samples + i as u64) as f64 / f64::from(rate_hz);
             return Err(RecordingError::TooLarge { time_s, value: packet[i] });
         }

@@ -7,6 +7,7 @@ use realfft::RealFftPlanner;
 use realfft::num_complex::Complex64;
 use rustfft::{Fft, FftPlanner};
 
+use super::peak::peak;
 use crate::instructions::vectorized;
 
 /// Returns the planner of this process, which keeps its plans: short files spend more on planning
@@ -138,12 +139,6 @@ fn power_of_two_below(x: f64) -> f64 {
 }
 
 vectorized! {
-    /// Returns the largest magnitude.
-    fn peak(frame: &[f32]) -> f32 {
-        // Magnitudes are ordered as the integers that their bits are, and maxima of integers vectorise.
-        f32::from_bits(frame.iter().fold(0, |peak, y| peak.max(y.abs().to_bits())))
-    }
-
     /// Writes z = w (a + ib).
     fn load(z: &mut [Complex64], window: &[f64], first: &[f32], second: &[f32]) {
         let n = z.len();
