@@ -22,6 +22,7 @@ pub mod mfcc;
 pub mod onset;
 mod pcm;
 mod peak;
+mod product;
 pub mod recording;
 pub mod resample;
 mod scale;
