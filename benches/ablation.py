@@ -52,6 +52,8 @@ NUMBERS = [
     ("sound as decoded", "pass_rate", "strict_raw", "{:.0%}"),
     ("sound", "pass_rate", "strict", "{:.0%}"),
 ]
+# What a network hears by itself: its clock withheld.
+DEAF = ("R², clock withheld", "locking_r2", "per_song", "{:.2f}")
 
 
 def run(*command: object) -> str:
@@ -132,16 +134,30 @@ class Bench:
         if not done.exists():
             self.stage("export", "--store", store, "--run", name, "--model", model, "--force",
                        *([] if row.fuse else ["--no-fusion"]))
-            self.stage("generate", "--store", store, "--model", model, "--samples", self.args.samples,
-                       "--overlap", "30", "--coherence", "fuse" if row.fuse else "derive")
-            self.stage("evaluate", "--store", store, "--run", model)
+            self.evaluated(row, store, model, model)
             done.touch()
-        query = f"select metric, variant, value from metrics where run = '{model}' " \
+        numbers = self.numbers(store, model, NUMBERS)
+        if not row.clock:
+            return [*numbers, numbers[0]]
+        done = store / f"measure-{model}-withheld.done"
+        if not done.exists():
+            self.evaluated(row, store, model, f"{model}-withheld", "--no-clock")
+            done.touch()
+        return [*numbers, *self.numbers(store, f"{model}-withheld", [DEAF])]
+
+    def evaluated(self, row: Row, store: pathlib.Path, model: str, name: str, *flags: str) -> None:
+        self.stage("generate", "--store", store, "--model", model, "--run", name, "--samples", self.args.samples,
+                   "--overlap", "30", "--coherence", "fuse" if row.fuse else "derive", *flags)
+        # Baselines are no part of the table, and take longer than all else.
+        self.stage("evaluate", "--store", store, "--run", name, "--baseline-windows", "0")
+
+    def numbers(self, store: pathlib.Path, name: str, wanted: list[tuple]) -> list[float]:
+        query = f"select metric, variant, value from metrics where run = '{name}' " \
                 "and split = 'held_out' and subject = 'generated'"
         answer = self.stage("query", "--store", store, "--format", "csv", "--limit", "0", query)
         values = {(r["metric"], r["variant"]): r["value"] for r in csv.DictReader(io.StringIO(answer))}
         # A number that could not be measured is null.
-        return [float(values[metric, variant] or "nan") for _, metric, variant, _ in NUMBERS]
+        return [float(values[metric, variant] or "nan") for _, metric, variant, _ in wanted]
 
 
 def main() -> None:
@@ -166,16 +182,17 @@ def main() -> None:
         for name, row in rows.items():
             numbers = bench.measure(row, seed)
             measured[name].append(numbers)
-            shown = ", ".join(f"{h} {f.format(x)}" for (h, *_, f), x in zip(NUMBERS, numbers))
+            shown = ", ".join(f"{h} {f.format(x)}" for (h, *_, f), x in zip([*NUMBERS, DEAF], numbers))
             print(f"seed {seed}, {name}: {shown}", file=sys.stderr, flush=True)
     facts = [f"{args.steps} steps of `tiny`, {args.decoder_steps} of the decoder", f"seeds {args.seeds}",
              f"{args.samples} samples", f"{args.compose} composed songs", f"{args.tunes} tunes"]
     print(heading("ablation, held-out songs, mean (least to greatest)", facts))
-    print("| | " + " | ".join(h for h, *_ in NUMBERS) + " |")
-    print("|---" * (len(NUMBERS) + 1) + "|")
+    columns = [*NUMBERS, DEAF]
+    print("| | " + " | ".join(h for h, *_ in columns) + " |")
+    print("|---" * (len(columns) + 1) + "|")
     for name, runs in measured.items():
         cells = []
-        for (*_, form), column in zip(NUMBERS, zip(*runs)):
+        for (*_, form), column in zip(columns, zip(*runs)):
             ends = "" if len(column) == 1 else f" ({form.format(min(column))} to {form.format(max(column))})"
             cells.append(form.format(statistics.fmean(column)) + ends)
         print(f"| {name} | " + " | ".join(cells) + " |")

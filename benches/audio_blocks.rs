@@ -135,8 +135,8 @@ fn main() {
     let low = best_s(|| {
         for mut sliding in octaves().into_iter().filter_map(SlidingDft::new) {
             let mut sum = 0.0;
-            halved.chunks(BLOCK).for_each(|block| sliding.push(block, |d| sum += d[0].re));
-            sliding.finish(|d| sum += d[0].re);
+            halved.chunks(BLOCK).for_each(|block| sliding.push(block, |d| sum += d.re[0]));
+            sliding.finish(|d| sum += d.re[0]);
             black_box(sum);
         }
     });

@@ -19,6 +19,7 @@ cases of tests/data/audio_cases; and the samples of mutagen (its source package)
 
 import argparse
 import collections
+import concurrent.futures
 import json
 import pathlib
 import shutil
@@ -215,10 +216,12 @@ def by_ffmpeg(path: pathlib.Path) -> tuple[np.ndarray, int, str] | None:
         rate, channels = int(stream["sample_rate"]), int(stream["channels"])
     except (ValueError, KeyError, IndexError):
         return None
+    if rate < 1 or channels < 1:
+        return None
     done = ffmpeg("-i", path, "-map", "a:0", "-f", "f32le", "-c:a", "pcm_f32le", "-ar", rate, "-ac", channels, "-",
                   allow=True)
     samples = np.frombuffer(done.stdout[: len(done.stdout) // (4 * channels) * 4 * channels], dtype="<f4")
-    if channels < 1 or len(samples) == 0:
+    if len(samples) == 0:
         return None
     return samples.reshape(-1, channels).astype(np.float64).mean(axis=1), rate, stream["codec_name"]
 
@@ -289,10 +292,13 @@ def main() -> None:
         files = sorted(group.iterdir())
         samples.mkdir(exist_ok=True)
         lines = run(args.bin, samples, *files).stdout.decode().splitlines()
-        for i, (path, line) in enumerate(zip(files, lines, strict=True)):
-            kind, what = judge(path, json.loads(line), samples / f"{i}.f32")
+        with concurrent.futures.ThreadPoolExecutor() as pool:
+            told = map(json.loads, lines)
+            judged = list(pool.map(judge, files, told, (samples / f"{i}.f32" for i in range(len(files)))))
+        for path, (kind, what) in zip(files, judged, strict=True):
             counts[group.name][kind] += 1
             notes.append((kind, f"{group.name}/{path.name}", what))
+        print(f"{group.name}: {len(files)} files", file=sys.stderr, flush=True)
         shutil.rmtree(samples)
     version = run("ffmpeg", "-version").stdout.decode().split()[2]
     print(heading("inputs", [f"FFmpeg {version}", f"libsndfile {soundfile.__libsndfile_version__}"]))

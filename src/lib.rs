@@ -9,6 +9,7 @@ pub mod cli;
 pub mod diffusion;
 pub mod evaluation;
 pub mod generation;
+mod instructions;
 pub mod model;
 pub mod motion;
 pub mod music;

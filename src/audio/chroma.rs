@@ -2,13 +2,11 @@
 
 use std::sync::Arc;
 
-use realfft::num_complex::Complex64;
-
-use super::cqt::{DFT_BINS, N_DFT_BINS, OctaveKernels, Spectrum, kernels, octaves};
+use super::cqt::{DFT_BINS, OctaveKernels, Spectrum, kernels, magnitudes, octaves};
 use super::decimate::Halver;
 use super::framing::Framer;
 use super::sliding_dft::SlidingDft;
-use super::stft::Dft;
+use super::stft::PairDft;
 use super::tuning::{BINS_PER_OCTAVE, Tuning};
 
 /// Pitch classes, C first.
@@ -22,10 +20,10 @@ fn pitch_class(bin: usize) -> usize {
 /// Sums a stream's constant-Q magnitudes into pitch classes.
 pub struct ChromaPass {
     kernels: Arc<Vec<OctaveKernels>>,
-    highest: (Framer, Dft),
+    highest: (Framer, PairDft),
     halver: Halver,
     halved: Vec<f32>,
-    second: (Framer, Dft),
+    second: (Framer, PairDft),
     low: Vec<SlidingDft>,
     /// Sums of the frames so far, [T, 12] row by row.
     sums: Vec<[f64; N_CHROMA]>,
@@ -36,8 +34,10 @@ pub struct ChromaPass {
 impl ChromaPass {
     pub fn new(tuning: Tuning) -> Self {
         let octaves = octaves();
-        let frames =
-            |i: usize| (Framer::new(octaves[i].n_fft, octaves[i].hop), Dft::new(octaves[i].n_fft));
+        let frames = |i: usize| {
+            let octave = octaves[i];
+            (Framer::new(octave.n_fft, octave.hop), PairDft::new(octave.n_fft))
+        };
         Self {
             kernels: kernels(tuning),
             highest: frames(0),
@@ -55,11 +55,11 @@ impl ChromaPass {
         let mut adder =
             Adder { kernels: &self.kernels, sums: &mut self.sums, n_done: &mut self.n_done };
         let (framer, dft) = &mut self.highest;
-        framer.push(samples, |frame| adder.add_frame(0, frame, dft));
+        framer.push_pairs(samples, |a, b| adder.add_pair(0, a, b, dft));
         self.halved.clear();
         self.halver.push(samples, &mut self.halved);
         let (framer, dft) = &mut self.second;
-        framer.push(&self.halved, |frame| adder.add_frame(1, frame, dft));
+        framer.push_pairs(&self.halved, |a, b| adder.add_pair(1, a, b, dft));
         for (octave, sliding) in (2..).zip(&mut self.low) {
             sliding.push(&self.halved, |spectrum| adder.add(octave, spectrum));
         }
@@ -72,12 +72,12 @@ impl ChromaPass {
         let mut adder =
             Adder { kernels: &self.kernels, sums: &mut self.sums, n_done: &mut self.n_done };
         let (framer, dft) = &mut self.highest;
-        framer.finish(|frame| adder.add_frame(0, frame, dft));
+        framer.finish_pairs(|a, b| adder.add_pair(0, a, b, dft));
         self.halved.clear();
         self.halver.finish(&mut self.halved);
         let (framer, dft) = &mut self.second;
-        framer.push(&self.halved, |frame| adder.add_frame(1, frame, dft));
-        framer.finish(|frame| adder.add_frame(1, frame, dft));
+        framer.push_pairs(&self.halved, |a, b| adder.add_pair(1, a, b, dft));
+        framer.finish_pairs(|a, b| adder.add_pair(1, a, b, dft));
         for (octave, sliding) in (2..).zip(&mut self.low) {
             sliding.push(&self.halved, |spectrum| adder.add(octave, spectrum));
             sliding.finish(|spectrum| adder.add(octave, spectrum));
@@ -95,23 +95,33 @@ struct Adder<'a> {
 }
 
 impl Adder<'_> {
-    /// Transforms and adds the next frame of an octave.
-    fn add_frame(&mut self, octave: usize, frame: &[f32], dft: &mut Dft) {
-        let spectrum = dft.of(frame);
-        let bins = std::array::from_fn(|i| spectrum[DFT_BINS.start() + i]);
-        self.add(octave, &bins);
+    /// Transforms and adds the next frame of an octave, or two.
+    fn add_pair(
+        &mut self,
+        octave: usize,
+        first: &[f32],
+        second: Option<&[f32]>,
+        dft: &mut PairDft,
+    ) {
+        dft.transform(first, second);
+        for i in 0..=usize::from(second.is_some()) {
+            let mut spectrum = Spectrum::default();
+            dft.bins(i, *DFT_BINS.start(), &mut spectrum.re, &mut spectrum.im);
+            self.add(octave, &spectrum);
+        }
     }
 
     /// Adds the next frame of an octave.
-    fn add(&mut self, octave: usize, bins: &[Complex64; N_DFT_BINS]) {
-        let spectrum = Spectrum::new(bins);
+    fn add(&mut self, octave: usize, spectrum: &Spectrum) {
         let frame = self.n_done[octave];
         self.n_done[octave] += 1;
         if frame == self.sums.len() {
             self.sums.push([0.0; N_CHROMA]);
         }
-        for (bin, kernel) in self.kernels[octave].iter().enumerate() {
-            self.sums[frame][pitch_class(bin)] += kernel.magnitude(&spectrum);
+        let mut strengths = [0.0; BINS_PER_OCTAVE];
+        magnitudes(&self.kernels[octave], spectrum, &mut strengths);
+        for (bin, strength) in strengths.into_iter().enumerate() {
+            self.sums[frame][pitch_class(bin)] += strength;
         }
     }
 }

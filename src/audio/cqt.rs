@@ -13,6 +13,7 @@ use realfft::num_complex::Complex64;
 
 use super::tuning::{BINS_PER_OCTAVE, Tuning};
 use super::{HOP, SAMPLE_RATE_HZ};
+use crate::instructions::vectorized;
 
 /// Octaves from C1 on.
 pub const N_OCTAVES: usize = 7;
@@ -72,14 +73,13 @@ pub fn octaves() -> [Octave; N_OCTAVES] {
 /// The bins [`DFT_BINS`] of one frame, real and imaginary parts apart so that sums vectorise.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Spectrum {
-    re: [f64; N_DFT_BINS],
-    im: [f64; N_DFT_BINS],
+    pub re: [f64; N_DFT_BINS],
+    pub im: [f64; N_DFT_BINS],
 }
 
-impl Spectrum {
-    /// Takes the bins in order.
-    pub fn new(bins: &[Complex64; N_DFT_BINS]) -> Self {
-        Self { re: bins.map(|d| d.re), im: bins.map(|d| d.im) }
+impl Default for Spectrum {
+    fn default() -> Self {
+        Self { re: [0.0; N_DFT_BINS], im: [0.0; N_DFT_BINS] }
     }
 }
 
@@ -112,20 +112,23 @@ impl Kernel {
         Self { first: first_padded, re: lanes(|w| w.re), im: lanes(|w| w.im) }
     }
 
-    /// Returns the bin's magnitude in a frame of its octave.
-    pub fn magnitude(&self, spectrum: &Spectrum) -> f64 {
+    /// Writes the lanes of the bin's real and imaginary part in a frame of its octave.
+    #[inline(always)]
+    fn add_up(&self, spectrum: &Spectrum, re: &mut [f64; LANES], im: &mut [f64; LANES]) {
         let bins = self.first..self.first + self.re.len() * LANES;
-        let d_re = spectrum.re[bins.clone()].chunks_exact(LANES);
-        let d_im = spectrum.im[bins].chunks_exact(LANES);
-        let (mut re, mut im) = ([0.0; LANES], [0.0; LANES]);
+        let d_re = spectrum.re[bins.clone()].as_chunks::<LANES>().0;
+        let d_im = spectrum.im[bins].as_chunks::<LANES>().0;
+        let (mut re_lanes, mut im_lanes) = ([0.0; LANES], [0.0; LANES]);
         for (((b_re, b_im), d_re), d_im) in self.re.iter().zip(&self.im).zip(d_re).zip(d_im) {
             for l in 0..LANES {
-                re[l] += b_re[l] * d_re[l] - b_im[l] * d_im[l];
-                im[l] += b_re[l] * d_im[l] + b_im[l] * d_re[l];
+                re_lanes[l] += b_re[l] * d_re[l] - b_im[l] * d_im[l];
+            }
+            for l in 0..LANES {
+                im_lanes[l] += b_re[l] * d_im[l] + b_im[l] * d_re[l];
             }
         }
-        let (re, im) = (re.iter().sum::<f64>(), im.iter().sum::<f64>());
-        (re * re + im * im).sqrt()
+        *re = re_lanes;
+        *im = im_lanes;
     }
 
     /// Returns the weights with their DFT bins.
@@ -139,6 +142,25 @@ impl Kernel {
 
 /// The kernels of one octave, lowest first.
 pub type OctaveKernels = Vec<Kernel>;
+
+vectorized! {
+    /// Writes the magnitudes of an octave's bins in one of its frames, lowest first.
+    pub fn magnitudes(
+        kernels: &[Kernel], spectrum: &Spectrum, magnitudes: &mut [f64; BINS_PER_OCTAVE],
+    ) {
+        // Lanes that lie in memory are added to as vectors; sums across them come after.
+        let mut re = [[0.0; LANES]; BINS_PER_OCTAVE];
+        let mut im = [[0.0; LANES]; BINS_PER_OCTAVE];
+        for ((kernel, re), im) in kernels.iter().zip(&mut re).zip(&mut im) {
+            kernel.add_up(spectrum, re, im);
+        }
+        for ((magnitude, re), im) in magnitudes.iter_mut().zip(re).zip(im) {
+            let sum = |[a, b, c, d]: [f64; LANES]| a + b + c + d;
+            let (re, im) = (sum(re), sum(im));
+            *magnitude = (re * re + im * im).sqrt();
+        }
+    }
+}
 
 /// Returns the kernels of all octaves for a tuning, highest octave first.
 ///

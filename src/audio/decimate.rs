@@ -4,9 +4,10 @@ use std::f64::consts::PI;
 use std::sync::{Arc, OnceLock};
 
 use realfft::num_complex::Complex64;
-use realfft::{ComplexToReal, RealToComplex};
+use rustfft::Fft;
 
-use super::stft::planner;
+use super::stft::complex_planner;
+use crate::instructions::vectorized;
 
 /// Taps of the filter, symmetric around the middle one.
 pub const N_TAPS: usize = 389;
@@ -19,7 +20,7 @@ pub const BETA: f64 = 13.040_03;
 pub const HALF_LENGTH: f64 = CENTRE as f64 + 0.5;
 
 /// Length of one block's transform; a block has this many samples less the filter's overlap.
-const N_FFT: usize = 8192;
+const N_FFT: usize = 4096;
 const OVERLAP: usize = N_TAPS - 1;
 /// Even, so that every block starts on a sample that is kept.
 const BLOCK: usize = N_FFT - OVERLAP;
@@ -73,51 +74,59 @@ fn bessel_i0(x: f64) -> f64 {
 
 /// Halves the rate of a stream: y₂\[m\] = √2 · Σᵢ h\[i\] · y\[2m + 194 − i\], ⌈n/2⌉ samples.
 ///
-/// Blocks are convolved by overlap-save; the spectrum is folded at half the rate, so the inverse
-/// transform is half as long. Where the filter sees nothing but zeros the result is exactly 0.
+/// Blocks are convolved by overlap-save, two at once: the filter is real, so that of the complex signal
+/// z = a + ib it makes h∗a + i h∗b. The spectrum is folded at half the rate,
+/// Y\[k\] = Z\[k\] H\[k\] + Z\[k + N/2\] H\[k + N/2\], so the inverse transform is half as long. H is real,
+/// because the taps are symmetric around sample 0 of the transform. Where the filter sees nothing but
+/// zeros the result is exactly 0.
 pub struct Halver {
-    forward: Arc<dyn RealToComplex<f64>>,
-    inverse: Arc<dyn ComplexToReal<f64>>,
-    response: &'static [Complex64],
+    forward: Arc<dyn Fft<f64>>,
+    inverse: Arc<dyn Fft<f64>>,
+    /// H.
+    response: &'static [f64],
     /// The last samples that were not yet filtered, after the overlap with the block before.
     pending: Vec<f32>,
-    time: Vec<f64>,
+    time: Vec<Complex64>,
     spectrum: Vec<Complex64>,
     folded: Vec<Complex64>,
-    halved: Vec<f64>,
+    halved: Vec<Complex64>,
     scratch: Vec<Complex64>,
     n_in: usize,
     n_out: usize,
 }
 
+/// Samples that two blocks take.
+const PAIR: usize = N_FFT + BLOCK;
+
 /// Returns the transform of the taps, scaled by √2 and the transforms' own factor.
-fn response(forward: &dyn RealToComplex<f64>) -> Vec<Complex64> {
-    let mut time = forward.make_input_vec();
+fn response(forward: &dyn Fft<f64>) -> Vec<f64> {
+    let mut h = vec![Complex64::default(); N_FFT];
     // √2 keeps the energy; 1/N_FFT undoes the two transforms' gain of N_FFT/2 and the fold of 2.
     let scale = 2f64.sqrt() / N_FFT as f64;
-    for (t, h) in time.iter_mut().zip(taps()) {
-        *t = h * scale;
+    for (i, tap) in taps().into_iter().enumerate() {
+        h[(N_FFT + i - CENTRE) % N_FFT].re = tap * scale;
     }
-    let mut response = forward.make_output_vec();
-    forward.process(&mut time, &mut response).expect("invariant: buffers of the plan");
-    response
+    forward.process(&mut h);
+    h.into_iter().map(|h| h.re).collect()
 }
 
 impl Halver {
     pub fn new() -> Self {
-        static RESPONSE: OnceLock<Vec<Complex64>> = OnceLock::new();
+        static RESPONSE: OnceLock<Vec<f64>> = OnceLock::new();
         let (forward, inverse) = {
-            let mut planner = planner();
+            let mut planner = complex_planner();
             (planner.plan_fft_forward(N_FFT), planner.plan_fft_inverse(N_FFT / 2))
         };
-        let n_scratch = forward.get_scratch_len().max(inverse.get_scratch_len());
+        let n_scratch =
+            forward.get_outofplace_scratch_len().max(inverse.get_outofplace_scratch_len());
+        let room = |n: usize| vec![Complex64::default(); n];
         Self {
             response: RESPONSE.get_or_init(|| response(forward.as_ref())),
-            spectrum: forward.make_output_vec(),
-            folded: inverse.make_input_vec(),
-            halved: inverse.make_output_vec(),
-            scratch: vec![Complex64::default(); n_scratch],
-            time: forward.make_input_vec(),
+            time: room(N_FFT),
+            spectrum: room(N_FFT),
+            folded: room(N_FFT / 2),
+            halved: room(N_FFT / 2),
+            scratch: room(n_scratch),
             // The filter's centre lies 194 taps behind its end: that much zero signal comes first.
             pending: vec![0.0; OVERLAP - CENTRE],
             n_in: 0,
@@ -138,7 +147,7 @@ impl Halver {
     pub fn finish(&mut self, halved: &mut Vec<f32>) {
         let total = self.n_in.div_ceil(2);
         while self.n_out < total {
-            let missing = N_FFT.saturating_sub(self.pending.len());
+            let missing = PAIR.saturating_sub(self.pending.len());
             self.pending.resize(self.pending.len() + missing, 0.0);
             let first = halved.len();
             let before = self.n_out;
@@ -150,50 +159,82 @@ impl Halver {
     fn filter(&mut self, halved: &mut Vec<f32>) {
         let pending = std::mem::take(&mut self.pending);
         let mut start = 0;
-        while let Some(block) = pending.get(start..start + N_FFT) {
-            for (t, &y) in self.time.iter_mut().zip(block) {
-                *t = f64::from(y);
-            }
+        while let Some(pair) = pending.get(start..start + PAIR) {
+            let (first, second) = (&pair[..N_FFT], &pair[BLOCK..]);
+            join(first, second, &mut self.time);
             self.convolve();
-            // Output m of the block sees its samples 2m … 2m + 388; the newest decides last.
-            let mut n_zeros = 0;
-            let mut seen = 0;
-            for m in 0..BLOCK / 2 {
-                let end = 2 * m + N_TAPS;
-                for &y in &block[seen..end] {
-                    n_zeros = if y == 0.0 { n_zeros + 1 } else { 0 };
-                }
-                seen = end;
-                // Results of circular convolution are valid behind the overlap.
-                let value = self.halved[OVERLAP / 2 + m] as f32;
-                halved.push(if n_zeros >= N_TAPS { 0.0 } else { value });
-            }
-            self.n_out += BLOCK / 2;
-            start += BLOCK;
+            let kept = &self.halved[CENTRE / 2..CENTRE / 2 + BLOCK / 2];
+            let before = halved.len();
+            halved.extend(kept.iter().map(|y| y.re as f32));
+            silence(first, &mut halved[before..]);
+            let before = halved.len();
+            halved.extend(kept.iter().map(|y| y.im as f32));
+            silence(second, &mut halved[before..]);
+            self.n_out += BLOCK;
+            start += 2 * BLOCK;
         }
         self.pending = pending;
         self.pending.drain(..start);
     }
 
-    /// Filters `time` into `halved`.
+    /// Filters `time` into `halved`. Results of circular convolution are valid where no tap reaches over
+    /// an end.
     fn convolve(&mut self) {
-        self.forward
-            .process_with_scratch(&mut self.time, &mut self.spectrum, &mut self.scratch)
-            .expect("invariant: buffers of the plan");
-        for (x, h) in self.spectrum.iter_mut().zip(self.response) {
-            *x *= h;
+        let Self { forward, inverse, response, time, spectrum, folded, halved, scratch, .. } = self;
+        forward.process_outofplace_with_scratch(time, spectrum, scratch);
+        fold(spectrum, response, folded);
+        inverse.process_outofplace_with_scratch(folded, halved, scratch);
+    }
+}
+
+vectorized! {
+    /// Writes z = a + ib.
+    fn join(a: &[f32], b: &[f32], z: &mut [Complex64]) {
+        let n = z.len();
+        let (a, b) = (&a[..n], &b[..n]);
+        for i in 0..n {
+            z[i] = Complex64::new(f64::from(a[i]), f64::from(b[i]));
         }
-        // Keeping every second sample folds bin k onto bin N/2 − k.
-        let half = N_FFT / 2;
-        for (k, folded) in self.folded.iter_mut().enumerate() {
-            *folded = self.spectrum[k] + self.spectrum[half - k].conj();
+    }
+
+    /// Keeping every second sample folds bin k + N/2 onto bin k.
+    fn fold(spectrum: &[Complex64], response: &[f64], folded: &mut [Complex64]) {
+        let half = folded.len();
+        let (low, high) = spectrum.split_at(half);
+        let (response_low, response_high) = response.split_at(half);
+        let (high, response_high) = (&high[..half], &response_high[..half]);
+        for k in 0..half {
+            folded[k] = low[k] * response_low[k] + high[k] * response_high[k];
         }
-        // The ends are real but for rounding.
-        self.folded[0].im = 0.0;
-        self.folded[half / 2].im = 0.0;
-        self.inverse
-            .process_with_scratch(&mut self.folded, &mut self.halved, &mut self.scratch)
-            .expect("invariant: buffers of the plan with real ends");
+    }
+
+    /// Returns whether any whole lot of samples is nothing but zeros.
+    fn has_silent_lot(block: &[f32]) -> bool {
+        block.as_chunks::<LOT>().0.iter().any(|lot| {
+            lot.iter().fold(0, |bits, y| bits | (y.to_bits() << 1)) == 0
+        })
+    }
+}
+
+/// Any run of zeros that fills the filter has a whole lot of this many samples in it.
+const LOT: usize = 128;
+
+/// Sets to 0 what the filter makes of nothing but zeros: output m sees samples 2m … 2m + 388.
+fn silence(block: &[f32], halved: &mut [f32]) {
+    if !has_silent_lot(block) {
+        return;
+    }
+    let mut n_zeros = 0;
+    let mut seen = 0;
+    for (m, value) in halved.iter_mut().enumerate() {
+        let end = 2 * m + N_TAPS;
+        for &y in &block[seen..end] {
+            n_zeros = if y == 0.0 { n_zeros + 1 } else { 0 };
+        }
+        seen = end;
+        if n_zeros >= N_TAPS {
+            *value = 0.0;
+        }
     }
 }
 
@@ -204,64 +245,4 @@ impl Default for Halver {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn halve(y: &[f32], block: usize) -> Vec<f32> {
-        let mut halver = Halver::new();
-        let mut halved = Vec::new();
-        for samples in y.chunks(block) {
-            halver.push(samples, &mut halved);
-        }
-        halver.finish(&mut halved);
-        halved
-    }
-
-    /// The definition, tap by tap.
-    fn naive(y: &[f32]) -> Vec<f32> {
-        let h = taps();
-        let at = |i: isize| usize::try_from(i).ok().and_then(|i| y.get(i)).copied().unwrap_or(0.0);
-        (0..y.len().div_ceil(2))
-            .map(|m| {
-                let tap = |i: usize| h[i] * f64::from(at((2 * m + CENTRE) as isize - i as isize));
-                (2f64.sqrt() * (0..N_TAPS).map(tap).sum::<f64>()) as f32
-            })
-            .collect()
-    }
-
-    #[test]
-    fn blocks_are_filtered_as_the_whole() {
-        let noise = |i: usize| ((i as f64 * 12.9898).sin() * 43_758.547).fract() as f32;
-        for n in [0, 1, 2, 387, 4001, 8191, 15_608, 20_011] {
-            let y: Vec<f32> = (0..n).map(noise).collect();
-            let (found, expected) = (halve(&y, 777), naive(&y));
-            assert_eq!(found.len(), expected.len());
-            for (i, (f, e)) in found.iter().zip(&expected).enumerate() {
-                // Both are f64 sums rounded to f32: one unit in the last place of values up to 2.
-                assert!((f - e).abs() <= 2.4e-7, "n {n}, sample {i}: {f} != {e}");
-            }
-        }
-    }
-
-    #[test]
-    fn silence_stays_exactly_silent() {
-        let mut y = vec![0.0; 12_000];
-        y[5000..5100].fill(0.5);
-        let halved = halve(&y, 4096);
-        let is_zero = |m: usize| halved[m] == 0.0;
-        // Sample 2m sees 2m − 194 … 2m + 194.
-        assert!((0..2403).all(is_zero) && (2647..6000).all(is_zero));
-        assert!((2404..2640).all(|m| !is_zero(m)));
-    }
-
-    #[test]
-    fn the_bessel_function_is_its_integral() {
-        // I₀(x) = 1/π ∫₀^π e^(x cos θ) dθ; the midpoint rule converges geometrically.
-        for x in [0.0, 0.5, 1.0, 13.040_03, 17.0] {
-            let n = 64;
-            let angle = |i: usize| PI * (i as f64 + 0.5) / n as f64;
-            let integral = (0..n).map(|i| (x * angle(i).cos()).exp()).sum::<f64>() / n as f64;
-            assert!((bessel_i0(x) / integral - 1.0).abs() < 1e-14, "{x}");
-        }
-    }
-}
+mod tests;

@@ -31,11 +31,39 @@ impl Framer {
         self.visit_complete(visit);
     }
 
+    /// As [`Framer::push`], with frames 2t and 2t + 1 at once.
+    pub fn push_pairs(&mut self, samples: &[f32], mut visit: impl FnMut(&[f32], Option<&[f32]>)) {
+        self.buffer.extend_from_slice(samples);
+        self.visit_pairs(&mut visit);
+    }
+
+    /// As [`Framer::finish`], with frames 2t and 2t + 1 at once; the last of an odd number is alone.
+    pub fn finish_pairs(&mut self, mut visit: impl FnMut(&[f32], Option<&[f32]>)) {
+        self.buffer.resize(self.buffer.len() + self.n / 2, 0.0);
+        self.visit_pairs(&mut visit);
+        self.visit_complete(|last| visit(last, None));
+    }
+
+    fn visit_pairs(&mut self, visit: &mut impl FnMut(&[f32], Option<&[f32]>)) {
+        let frame = |start: usize| start..start + self.n;
+        let mut start = self.start;
+        while let Some(second) = self.buffer.get(frame(start + self.hop)) {
+            visit(&self.buffer[frame(start)], Some(second));
+            start += 2 * self.hop;
+        }
+        self.start = start;
+        self.forget();
+    }
+
     fn visit_complete(&mut self, mut visit: impl FnMut(&[f32])) {
         while let Some(frame) = self.buffer.get(self.start..self.start + self.n) {
             visit(frame);
             self.start += self.hop;
         }
+        self.forget();
+    }
+
+    fn forget(&mut self) {
         // A hop longer than the frame may start the next one behind the buffer's end.
         let used = self.start.min(self.buffer.len());
         self.buffer.drain(..used);
@@ -71,6 +99,28 @@ mod tests {
             }
             framer.finish(|frame| found.push(frame.to_vec()));
             prop_assert_eq!(found, frames(&y, 2 * half, hop));
+        }
+
+        #[test]
+        fn pairs_are_frames_two_by_two_whatever_the_blocks(
+            n_samples in 0usize..90,
+            half in 1usize..20,
+            hop in 1usize..50,
+            block in 1usize..33,
+        ) {
+            let y: Vec<f32> = (0..n_samples).map(|i| (i + 1) as f32).collect();
+            let mut framer = Framer::new(2 * half, hop);
+            let mut found: Vec<Vec<Vec<f32>>> = Vec::new();
+            let mut add = |a: &[f32], b: Option<&[f32]>| {
+                found.push([Some(a), b].into_iter().flatten().map(<[f32]>::to_vec).collect());
+            };
+            for samples in y.chunks(block) {
+                framer.push_pairs(samples, &mut add);
+            }
+            framer.finish_pairs(&mut add);
+            let expected: Vec<Vec<Vec<f32>>> =
+                frames(&y, 2 * half, hop).chunks(2).map(<[Vec<f32>]>::to_vec).collect();
+            prop_assert_eq!(found, expected);
         }
     }
 }

@@ -5,6 +5,7 @@
 //! and beats follow from the mel bands of the whole file. Apart from them, `meter` finds the beats and bars that motion
 //! follows.
 
+mod bank;
 pub mod beat;
 pub mod chroma;
 mod container;
@@ -20,6 +21,8 @@ pub mod meter;
 pub mod mfcc;
 pub mod onset;
 mod pcm;
+mod peak;
+mod product;
 pub mod recording;
 pub mod resample;
 mod scale;

@@ -6,6 +6,7 @@ use super::SAMPLE_RATE_HZ;
 use super::decode::{DecodeError, Decoder, Loss};
 use super::features::{FeatureError, FirstPass, RawFeatures};
 use super::meter::{Meter, MeterPass};
+use super::peak::peak;
 use super::resample::Resampler;
 use super::tuning::Tuning;
 
@@ -128,11 +129,15 @@ impl Recording {
         let (encoding, loss) = decode(input, extension_hint, options, |samples| {
             first.push(samples);
             meter.push(samples);
-            digest.add(samples);
-            let fits = |kept: &Vec<f32>| kept.len() + samples.len() <= options.max_held_samples;
-            held = held.take().filter(fits);
-            if let Some(kept) = &mut held {
-                kept.extend_from_slice(samples);
+            match &mut held {
+                Some(kept) if kept.len() + samples.len() <= options.max_held_samples => {
+                    kept.extend_from_slice(samples);
+                }
+                _ => {
+                    // Samples that are read twice are compared.
+                    digest.add(&held.take().unwrap_or_default());
+                    digest.add(samples);
+                }
             }
         })?;
         let mut second = first.finish()?;
@@ -180,7 +185,9 @@ fn decode(
     loop {
         packet.clear();
         let goes_on = decoder.next_block(&mut packet)?;
-        if let Some(i) = packet.iter().position(|y| y.abs() > MAX_SAMPLE) {
+        if peak(&packet) > MAX_SAMPLE
+            && let Some(i) = packet.iter().position(|y| y.abs() > MAX_SAMPLE)
+        {
             let time_s = (n_samples + i as u64) as f64 / f64::from(rate_hz);
             return Err(RecordingError::TooLarge { time_s, value: packet[i] });
         }

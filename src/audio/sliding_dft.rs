@@ -15,11 +15,11 @@
 use std::f64::consts::TAU;
 use std::sync::{Arc, LazyLock};
 
-use ndarray::linalg::general_mat_mul;
-use ndarray::{Array1, Array2, ArrayView1, s};
-use realfft::num_complex::Complex64;
+use ndarray::{Array1, Array2, ArrayView1};
 
-use super::cqt::{DFT_BINS, N_DFT_BINS, Octave, octaves};
+use super::cqt::{DFT_BINS, N_DFT_BINS, Octave, Spectrum, octaves};
+use super::product::Panels;
+use crate::instructions::vectorized;
 
 /// Samples by which a frame advances.
 const HOP: usize = 735;
@@ -34,10 +34,12 @@ const RANK_TOLERANCE: f64 = 1e-13;
 /// A table of cosines or sines, one row per sample and one column per frequency, as basis · weights.
 #[derive(Debug)]
 struct Factors {
+    #[cfg(test)]
+    rank: usize,
     /// [HALF + 1, rank], orthonormal columns.
-    basis: Array2<f64>,
+    basis: Panels,
     /// [rank, N_DFT_BINS].
-    weights: Array2<f64>,
+    weights: Panels,
 }
 
 impl Factors {
@@ -71,9 +73,12 @@ impl Factors {
         }
         let basis = Array2::from_shape_fn((waves.ncols(), basis.len()), |(m, r)| basis[r][m]);
         let weights = basis.t().dot(&waves.t());
-        // Products below run faster over rows.
-        let weights = weights.as_standard_layout().into_owned();
-        Self { basis, weights }
+        Self {
+            #[cfg(test)]
+            rank: basis.ncols(),
+            basis: Panels::new(basis.nrows(), basis.ncols(), |m, r| basis[[m, r]]),
+            weights: Panels::new(weights.nrows(), weights.ncols(), |r, i| weights[[r, i]]),
+        }
     }
 }
 
@@ -84,7 +89,7 @@ struct Plan {
     cosines: Factors,
     sines: Factors,
     /// e^(735iθ) and e^(368iθ).
-    turns: [(Complex64, Complex64); N_DFT_BINS],
+    turns: [Spectrum; 2],
 }
 
 impl Plan {
@@ -93,15 +98,18 @@ impl Plan {
         let waves = |wave: fn(f64) -> f64| {
             Array2::from_shape_fn((N_DFT_BINS, HALF + 1), |(i, m)| wave(theta(i) * m as f64))
         };
-        let turn = |i: usize| {
-            let by = |samples: usize| Complex64::from_polar(1.0, theta(i) * samples as f64);
-            (by(HOP), by(HOP - HALF))
+        let turn = |samples: usize| {
+            let angle = |i: usize| theta(i) * samples as f64;
+            Spectrum {
+                re: std::array::from_fn(|i| angle(i).cos()),
+                im: std::array::from_fn(|i| angle(i).sin()),
+            }
         };
         Self {
             n_fft,
             cosines: Factors::of(&waves(f64::cos)),
             sines: Factors::of(&waves(f64::sin)),
-            turns: std::array::from_fn(turn),
+            turns: [turn(HOP), turn(HOP - HALF)],
         }
     }
 
@@ -118,7 +126,7 @@ impl Plan {
 pub struct SlidingDft {
     plan: Arc<Plan>,
     /// D of the latest frame.
-    spectrum: [Complex64; N_DFT_BINS],
+    spectrum: Spectrum,
     /// Samples from the start of the latest frame on.
     buffer: Vec<f32>,
     /// Samples at the buffer's start that the latest frame has left behind.
@@ -132,12 +140,14 @@ pub struct SlidingDft {
     work: Work,
 }
 
+/// Matrices of [`BATCH`] rows; those of sums are padded.
 struct Work {
-    even: Array2<f64>,
-    odd: Array2<f64>,
-    projected: Array2<f64>,
-    cosine_sums: Array2<f64>,
-    sine_sums: Array2<f64>,
+    /// Rows of HALF + 1.
+    even: Vec<f64>,
+    odd: Vec<f64>,
+    projected: Vec<f64>,
+    cosine_sums: Vec<f64>,
+    sine_sums: Vec<f64>,
 }
 
 impl SlidingDft {
@@ -146,9 +156,10 @@ impl SlidingDft {
         let plan = Plan::of(octave)?;
         let half = plan.n_fft / 2;
         let n_before = half.div_ceil(HOP);
-        let rank = plan.cosines.weights.nrows().max(plan.sines.weights.nrows());
+        let n_projected = plan.cosines.basis.n_columns().max(plan.sines.basis.n_columns());
+        let n_sums = plan.cosines.weights.n_columns();
         Some(Self {
-            spectrum: [Complex64::default(); N_DFT_BINS],
+            spectrum: Spectrum::default(),
             // Frame −n_before ends at or before sample 0.
             buffer: vec![0.0; HOP * n_before + half],
             start: 0,
@@ -157,18 +168,18 @@ impl SlidingDft {
             n_in: 0,
             n_out: 0,
             work: Work {
-                even: Array2::zeros((BATCH, HALF + 1)),
-                odd: Array2::zeros((BATCH, HALF + 1)),
-                projected: Array2::zeros((BATCH, rank)),
-                cosine_sums: Array2::zeros((BATCH, N_DFT_BINS)),
-                sine_sums: Array2::zeros((BATCH, N_DFT_BINS)),
+                even: vec![0.0; BATCH * (HALF + 1)],
+                odd: vec![0.0; BATCH * (HALF + 1)],
+                projected: vec![0.0; BATCH * n_projected],
+                cosine_sums: vec![0.0; BATCH * n_sums],
+                sine_sums: vec![0.0; BATCH * n_sums],
             },
             plan,
         })
     }
 
     /// Takes the next samples and calls `visit` with the spectra that are ready, frame by frame.
-    pub fn push(&mut self, samples: &[f32], mut visit: impl FnMut(&[Complex64; N_DFT_BINS])) {
+    pub fn push(&mut self, samples: &[f32], mut visit: impl FnMut(&Spectrum)) {
         self.n_in += samples.len();
         self.buffer.extend_from_slice(samples);
         while self.buffer.len() - self.start >= self.plan.n_fft + HOP * BATCH {
@@ -178,7 +189,7 @@ impl SlidingDft {
     }
 
     /// Ends the signal and calls `visit` with the rest of its 1 + ⌊n/735⌋ spectra.
-    pub fn finish(&mut self, mut visit: impl FnMut(&[Complex64; N_DFT_BINS])) {
+    pub fn finish(&mut self, mut visit: impl FnMut(&Spectrum)) {
         let n_frames = 1 + self.n_in / HOP;
         while self.n_out < n_frames {
             let n_steps = (n_frames - self.n_out + self.n_before.saturating_sub(1)).min(BATCH);
@@ -197,28 +208,25 @@ impl SlidingDft {
     }
 
     /// Advances by `n_steps` frames, at most [`BATCH`].
-    fn advance(&mut self, n_steps: usize, visit: &mut impl FnMut(&[Complex64; N_DFT_BINS])) {
+    fn advance(&mut self, n_steps: usize, visit: &mut impl FnMut(&Spectrum)) {
         let Self { plan, work, buffer, start, .. } = self;
         let n_fft = plan.n_fft;
-        for step in 0..n_steps {
+        let rows = work.even.chunks_exact_mut(HALF + 1).zip(work.odd.chunks_exact_mut(HALF + 1));
+        for (step, (even, odd)) in rows.take(n_steps).enumerate() {
             let at = *start + HOP * step;
             let leaving = &buffer[at..at + HOP];
             let entering = &buffer[at + n_fft..at + n_fft + HOP];
-            let (mut even, mut odd) = (work.even.row_mut(step), work.odd.row_mut(step));
-            let (even, odd) = (even.as_slice_mut(), odd.as_slice_mut());
-            if let (Some(even), Some(odd)) = (even, odd) {
-                fold(leaving, entering, even, odd);
-            }
+            fold(leaving, entering, even, odd);
         }
-        let rows = s![..n_steps, ..];
         for (parts, factors, sums) in [
             (&work.even, &plan.cosines, &mut work.cosine_sums),
             (&work.odd, &plan.sines, &mut work.sine_sums),
         ] {
-            let mut projected = work.projected.slice_mut(s![..n_steps, ..factors.weights.nrows()]);
-            general_mat_mul(1.0, &parts.slice(rows), &factors.basis, 0.0, &mut projected);
-            general_mat_mul(1.0, &projected, &factors.weights, 0.0, &mut sums.slice_mut(rows));
+            let Factors { basis, weights, .. } = factors;
+            basis.multiply(parts, HALF + 1, n_steps, &mut work.projected);
+            weights.multiply(&work.projected, basis.n_columns(), n_steps, sums);
         }
+        let n_sums = plan.cosines.weights.n_columns();
         for step in 0..n_steps {
             let at = self.start + HOP * step;
             let entering = &self.buffer[at + n_fft..at + n_fft + HOP];
@@ -226,16 +234,13 @@ impl SlidingDft {
                 Some(last) => HOP - 1 - last,
                 None => self.n_zeros + HOP,
             };
-            let sums =
-                self.work.cosine_sums.row(step).into_iter().zip(self.work.sine_sums.row(step));
-            for ((d, (whole, half)), (&cos, &sin)) in
-                self.spectrum.iter_mut().zip(&self.plan.turns).zip(sums)
-            {
-                *d = *d * whole + half * Complex64::new(cos, -sin);
-            }
+            let sums = n_sums * step..n_sums * (step + 1);
+            let (cosines, sines) =
+                (&self.work.cosine_sums[sums.clone()], &self.work.sine_sums[sums]);
+            turn(&mut self.spectrum, &self.plan.turns, cosines, sines);
             if self.n_zeros >= n_fft {
                 // Of silence nothing remains, not even rounding.
-                self.spectrum.fill(Complex64::default());
+                self.spectrum = Spectrum::default();
             }
             if self.n_before > 1 {
                 self.n_before -= 1;
@@ -249,78 +254,37 @@ impl SlidingDft {
     }
 }
 
-/// Writes the even and odd parts of d = entering − leaving around its middle sample.
-fn fold(leaving: &[f32], entering: &[f32], even: &mut [f64], odd: &mut [f64]) {
-    let d = |n: usize| f64::from(entering[n]) - f64::from(leaving[n]);
-    even[0] = d(HALF);
-    odd[0] = 0.0;
-    for m in 1..=HALF {
-        let (after, before) = (d(HALF + m), d(HALF - m));
-        even[m] = after + before;
-        odd[m] = after - before;
+vectorized! {
+    /// Writes the even and odd parts of d = entering − leaving around its middle sample.
+    fn fold(leaving: &[f32], entering: &[f32], even: &mut [f64], odd: &mut [f64]) {
+        even[0] = f64::from(entering[HALF]) - f64::from(leaving[HALF]);
+        odd[0] = 0.0;
+        let (entering_before, entering_after) = (&entering[..HALF], &entering[HALF + 1..HOP]);
+        let (leaving_before, leaving_after) = (&leaving[..HALF], &leaving[HALF + 1..HOP]);
+        let (even, odd) = (&mut even[1..=HALF], &mut odd[1..=HALF]);
+        for m in 0..HALF {
+            let mirror = HALF - 1 - m;
+            let after = f64::from(entering_after[m]) - f64::from(leaving_after[m]);
+            let before = f64::from(entering_before[mirror]) - f64::from(leaving_before[mirror]);
+            even[m] = after + before;
+            odd[m] = after - before;
+        }
+    }
+
+    /// D ← e^(735iθ) · D + e^(368iθ) · (C − iS) with the sums C of cosines and S of sines.
+    fn turn(spectrum: &mut Spectrum, turns: &[Spectrum; 2], cosines: &[f64], sines: &[f64]) {
+        let [whole, half] = turns;
+        let (cosines, sines) = (&cosines[..N_DFT_BINS], &sines[..N_DFT_BINS]);
+        for i in 0..N_DFT_BINS {
+            let (re, im) = (spectrum.re[i], spectrum.im[i]);
+            let (c, s) = (cosines[i], -sines[i]);
+            spectrum.re[i] =
+                (re * whole.re[i] - im * whole.im[i]) + (half.re[i] * c - half.im[i] * s);
+            spectrum.im[i] =
+                (re * whole.im[i] + im * whole.re[i]) + (half.re[i] * s + half.im[i] * c);
+        }
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::audio::framing::Framer;
-    use crate::audio::stft::Dft;
-
-    fn check(y: &[f32], block: usize, tolerance: f64) {
-        for octave in octaves().into_iter().skip(2) {
-            let mut expected = Vec::new();
-            let (mut framer, mut dft) = (Framer::new(octave.n_fft, HOP), Dft::new(octave.n_fft));
-            let mut add = |frame: &[f32]| expected.push(dft.of(frame)[DFT_BINS].to_vec());
-            framer.push(y, &mut add);
-            framer.finish(&mut add);
-            let mut sliding = SlidingDft::new(octave).expect("a low octave");
-            let mut found = Vec::new();
-            for samples in y.chunks(block) {
-                sliding.push(samples, |spectrum| found.push(spectrum.to_vec()));
-            }
-            sliding.finish(|spectrum| found.push(spectrum.to_vec()));
-            assert_eq!(found.len(), expected.len(), "N {}", octave.n_fft);
-            for (t, (found, expected)) in found.iter().zip(&expected).enumerate() {
-                for (f, e) in found.iter().zip(expected) {
-                    assert!((f - e).norm() <= tolerance, "N {}, frame {t}: {f} {e}", octave.n_fft);
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn spectra_are_those_of_whole_frames() {
-        let noise = |i: usize| ((i as f64 * 78.233).sin() * 43_758.547).fract() as f32;
-        for n in [0, 1, 734, 735, 50_001, 120_000] {
-            let y: Vec<f32> = (0..n).map(noise).collect();
-            // |D| is about √N = 256; the basis is good to 10⁻¹³ of it, and 160 frames add up.
-            check(&y, 10_007, 1e-9);
-        }
-    }
-
-    #[test]
-    fn quiet_after_loud_is_still_exact_and_silence_is_zero() {
-        let mut y: Vec<f32> = (0..60_000).map(|i| (i as f32 * 0.01).sin()).collect();
-        y.extend((0..80_000).map(|i| 1e-7 * (i as f32 * 0.013).sin()));
-        check(&y, 65_536, 1e-9);
-        y.truncate(60_000);
-        y.extend(vec![0.0; 140_000]);
-        for octave in octaves().into_iter().skip(2) {
-            let mut sliding = SlidingDft::new(octave).expect("a low octave");
-            let mut last = [Complex64::new(f64::NAN, 0.0); N_DFT_BINS];
-            sliding.push(&y, |spectrum| last = *spectrum);
-            sliding.finish(|spectrum| last = *spectrum);
-            assert_eq!(last, [Complex64::default(); N_DFT_BINS]);
-        }
-    }
-
-    #[test]
-    fn ranks_are_low_enough_to_pay() {
-        for octave in octaves().into_iter().skip(2) {
-            let plan = Plan::of(octave).expect("a low octave");
-            let rank = plan.cosines.weights.nrows().max(plan.sines.weights.nrows());
-            assert!(rank <= 64, "N {}: {rank}", octave.n_fft);
-        }
-    }
-}
+mod tests;

@@ -7,8 +7,9 @@ use std::fmt;
 use std::ops::Range;
 
 use super::framing::Framer;
-use super::stft::{Dft, hann_power};
+use super::stft::PairDft;
 use super::{N_FFT, SAMPLE_RATE_HZ};
+use crate::instructions::vectorized;
 
 /// Bins of the constant-Q transform per octave.
 pub const BINS_PER_OCTAVE: usize = 36;
@@ -75,8 +76,8 @@ impl std::str::FromStr for Tuning {
 /// Collects spectral peaks from a stream at 44.1 kHz.
 pub struct TuningPass {
     framer: Framer,
-    dft: Dft,
-    power: Vec<f64>,
+    dft: PairDft,
+    powers: [[f64; N_FFT / 2 + 1]; 2],
     peaks: Peaks,
 }
 
@@ -91,24 +92,24 @@ impl TuningPass {
     pub fn new() -> Self {
         Self {
             framer: Framer::new(N_FFT, HOP),
-            dft: Dft::new(N_FFT),
-            power: vec![0.0; N_FFT / 2 + 1],
+            dft: PairDft::hann(N_FFT),
+            powers: [[0.0; N_FFT / 2 + 1]; 2],
             peaks: Peaks::default(),
         }
     }
 
     /// Takes the next samples.
     pub fn push(&mut self, samples: &[f32]) {
-        let Self { framer, dft, power, peaks } = self;
-        framer.push(samples, |frame| peaks.add(frame, dft, power));
+        let Self { framer, dft, powers, peaks } = self;
+        framer.push_pairs(samples, |first, second| peaks.add_pair(first, second, dft, powers));
     }
 
     /// Ends the signal and returns the most frequent tuning, [`Tuning::STANDARD`] without peaks.
     ///
     /// Peaks below the median magnitude have no vote; ties go to the lowest tuning.
     pub fn finish(mut self) -> Tuning {
-        let Self { framer, dft, power, peaks } = &mut self;
-        framer.finish(|frame| peaks.add(frame, dft, power));
+        let Self { framer, dft, powers, peaks } = &mut self;
+        framer.finish_pairs(|first, second| peaks.add_pair(first, second, dft, powers));
         self.peaks.tuning()
     }
 }
@@ -120,15 +121,29 @@ impl Default for TuningPass {
 }
 
 impl Peaks {
+    fn add_pair(
+        &mut self,
+        first: &[f32],
+        second: Option<&[f32]>,
+        dft: &mut PairDft,
+        powers: &mut [[f64; N_FFT / 2 + 1]; 2],
+    ) {
+        let [first_power, second_power] = powers;
+        dft.transform(first, second);
+        dft.powers(first_power, second_power);
+        self.add(first_power);
+        if second.is_some() {
+            self.add(second_power);
+        }
+    }
+
     /// Adds the peaks of one frame, interpolated by a parabola through three bins.
-    fn add(&mut self, frame: &[f32], dft: &mut Dft, power: &mut [f64]) {
-        hann_power(dft.of(frame), power);
+    fn add(&mut self, power: &[f64]) {
         let highest = highest(power).sqrt() as f32;
         let threshold = THRESHOLD * highest;
         let mut s = [0f32; PITCH_BINS.end + 1];
-        for (s, p) in s.iter_mut().zip(&*power).skip(PITCH_BINS.start - 1) {
-            *s = p.sqrt() as f32;
-        }
+        let bins = PITCH_BINS.start - 1..PITCH_BINS.end + 1;
+        roots(&power[bins.clone()], &mut s[bins]);
         // Magnitudes at or below the threshold count as 0 when maxima are sought.
         let z = |k: usize| if s[k] > threshold { s[k] } else { 0.0 };
         for k in PITCH_BINS {
@@ -166,24 +181,29 @@ impl Peaks {
     }
 }
 
-/// Returns the largest of some values that are not NaN, by partial maxima that vectorise.
-fn highest(values: &[f64]) -> f64 {
-    let mut lanes = [0f64; 8];
-    let chunks = values.chunks_exact(lanes.len());
-    let rest = chunks.remainder().iter().copied().fold(0.0, f64::max);
-    for chunk in chunks {
-        for (lane, &value) in lanes.iter_mut().zip(chunk) {
-            *lane = if value > *lane { value } else { *lane };
+vectorized! {
+    /// Returns the largest of some values that are neither negative nor NaN.
+    fn highest(values: &[f64]) -> f64 {
+        // They are ordered as the integers that their bits are, and maxima of integers vectorise.
+        let bits = values.iter().fold(0, |highest, x| x.to_bits().cast_signed().max(highest));
+        f64::from_bits(bits.cast_unsigned())
+    }
+
+    /// Writes √p, rounded to single precision.
+    fn roots(powers: &[f64], roots: &mut [f32]) {
+        for (root, p) in roots.iter_mut().zip(powers) {
+            *root = p.sqrt() as f32;
         }
     }
-    lanes.into_iter().fold(rest, f64::max)
 }
 
 /// Returns the histogram bin of a pitch: r = 36·log₂(f/27.5) mod 1, from −½ to ½, in f32.
 fn candidate(pitch_hz: f32) -> u8 {
     // Rounded from f64: within one unit of the last place of any f32 logarithm.
     let octaves = f64::from(pitch_hz / A0_HZ).log2() as f32;
-    let mut r = (BINS_PER_OCTAVE as f32 * octaves).rem_euclid(1.0);
+    // Pitches above A0: what lies behind the point, exactly.
+    let bins = BINS_PER_OCTAVE as f32 * octaves;
+    let mut r = bins - bins as i32 as f32;
     if r >= 0.5 {
         r -= 1.0;
     }
@@ -214,60 +234,4 @@ fn median(values: &mut [f32]) -> f32 {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use std::f64::consts::TAU;
-
-    fn tuning_of(y: &[f32]) -> Tuning {
-        let mut pass = TuningPass::new();
-        pass.push(y);
-        pass.finish()
-    }
-
-    #[test]
-    fn a_detuned_tone_shows_its_deviation() {
-        // 35 cents are 1.05 bins of 33.3 cents, that is 0.05 bins above the next bin.
-        let hz = 440.0 * 2f64.powf(35.0 / 1200.0);
-        let y: Vec<f32> = (0..44_100)
-            .map(|i| (0.5 * (TAU * hz * f64::from(i) / 44_100.0).sin()) as f32)
-            .collect();
-        let bins = tuning_of(&y).bins();
-        // Parabolic interpolation under a Hann window is biased by up to 0.05 DFT bins of 21.5 Hz,
-        // which are 4 cents here: 0.12 bins of 33.3 cents.
-        assert!((bins - 0.05).abs() <= 0.12, "{bins}");
-    }
-
-    #[test]
-    fn silence_has_the_standard_tuning() {
-        assert_eq!(tuning_of(&[0.0; 5000]), Tuning::STANDARD);
-        assert_eq!(tuning_of(&[]), Tuning::STANDARD);
-    }
-
-    #[test]
-    fn candidates_are_closed_on_the_left() {
-        assert_eq!(candidate(27.5), 50);
-        assert_eq!(candidate(440.0), 50);
-        // Just below and above half a bin over A440.
-        let hz = |bins: f64| (440.0 * 2f64.powf(bins / 36.0)) as f32;
-        assert_eq!((candidate(hz(0.4951)), candidate(hz(0.5049))), (99, 0));
-        assert_eq!((candidate(hz(0.0149)), candidate(hz(-0.0149))), (51, 48));
-    }
-
-    #[test]
-    fn medians_of_odd_and_even_counts() {
-        assert_eq!(median(&mut [3.0, 1.0, 2.0]), 2.0);
-        assert_eq!(median(&mut [4.0, 1.0, 3.0, 2.0]), 2.5);
-    }
-
-    #[test]
-    fn tunings_of_other_bins_are_refused() {
-        let error = "0.5".parse::<Tuning>().expect_err("half a bin is the next bin's");
-        assert_eq!(
-            error,
-            "tuning 0.5 is outside -0.5 <= tuning < 0.5 (in bins of 1/36 octave); give the \
-             nearest bin's"
-        );
-        assert_eq!("-0.5".parse::<Tuning>().map(Tuning::bins), Ok(-0.5));
-        assert!("x".parse::<Tuning>().is_err());
-    }
-}
+mod tests;

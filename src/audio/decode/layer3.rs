@@ -112,7 +112,7 @@ impl Layer3 {
             self.spectra = [[0.0; 576]; 2];
             self.decode_granule(header, &mut bits, granules, n_channels);
             let Self { filter, spectra, rows, .. } = self;
-            synthesis::synthesize_granule(filter, spectra, 18, n_channels, part, rows);
+            synthesis::synthesize_granule(filter, spectra, n_channels, part, rows);
         }
         self.main_data = main_data;
         self.keep(own);

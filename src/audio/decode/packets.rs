@@ -14,6 +14,7 @@ use super::{DecodeError, Decoder, MAX_PLAUSIBLE, mix};
 use crate::audio::container::media::codec_name;
 use crate::audio::container::mpeg::FrameHeader;
 use crate::audio::container::{Stream, audio_track, possible_frame};
+use crate::audio::peak::peak;
 
 /// Samples of the longest Vorbis block are 8,192, of the usual one 2,048: positions of pages that
 /// jump by less are an encoder's, not a page's that is missing.
@@ -233,7 +234,7 @@ impl Decoder<'_> {
         if self.n_decoded == 0 {
             self.n_channels = header.n_channels;
         }
-        let is_plausible = self.values.iter().all(|x| x.abs() <= MAX_PLAUSIBLE);
+        let is_plausible = peak(&self.values) <= MAX_PLAUSIBLE;
         if outcome.is_err() || !is_plausible {
             self.values.fill(0.0);
             let is_cut = outcome == Err(Fault::Reservoir);

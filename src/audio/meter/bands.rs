@@ -1,10 +1,15 @@
 //! What a song sounds like at 100 frames per second: magnitudes in 36 mel bands, and of the 12 notes.
 
+use super::super::bank::Bank;
 use super::super::framing::Framer;
 use super::super::mel::{hz_to_mel, mel_to_hz};
-use super::super::stft::{Dft, hann_power};
+use super::super::stft::PairDft;
 use super::super::{N_FFT, SAMPLE_RATE_HZ};
 use super::HOP;
+use crate::instructions::vectorized;
+
+/// Bins of a frame's spectrum.
+const N_BINS: usize = N_FFT / 2 + 1;
 
 /// Bands of the spectrum.
 pub const N_BANDS: usize = 36;
@@ -70,17 +75,57 @@ impl Spectra {
 /// Collects the spectra of a stream.
 pub struct BandPass {
     framer: Framer,
-    dft: Dft,
-    power: Vec<f64>,
-    /// First bin and weights of every band; the weights of a band sum to 1.
-    bank: Vec<(usize, Vec<f64>)>,
+    dft: PairDft,
+    powers: [[f64; N_BINS]; 2],
+    hearing: Hearing,
+    found: Spectra,
+}
+
+/// What is heard of a spectrum.
+struct Hearing {
+    /// One row per band, whose weights sum to 1.
+    bank: Bank,
+    /// Bins up to the highest that is heard.
+    n_bins: usize,
     /// First bin of the notes; of every bin the note below and the share of the note above.
     notes: (usize, Vec<(usize, f64)>),
-    found: Spectra,
 }
 
 impl BandPass {
     pub fn new() -> Self {
+        Self {
+            framer: Framer::new(N_FFT, HOP),
+            dft: PairDft::hann(N_FFT),
+            powers: [[0.0; N_BINS]; 2],
+            hearing: Hearing::new(),
+            found: Spectra { bands: Vec::new(), notes: Vec::new() },
+        }
+    }
+
+    /// Takes the next samples at 44.1 kHz.
+    pub fn push(&mut self, samples: &[f32]) {
+        self.with(|framer, visit| framer.push_pairs(samples, visit));
+    }
+
+    /// Ends the signal.
+    pub fn finish(mut self) -> Spectra {
+        self.with(|framer, visit| framer.finish_pairs(visit));
+        self.found
+    }
+
+    fn with(&mut self, pairs: impl FnOnce(&mut Framer, &mut dyn FnMut(&[f32], Option<&[f32]>))) {
+        let Self { framer, dft, powers: [first_power, second_power], hearing, found } = self;
+        pairs(framer, &mut |first, second| {
+            dft.transform(first, second);
+            dft.powers(first_power, second_power);
+            let n_frames = 1 + usize::from(second.is_some());
+            hearing.add([first_power, second_power], n_frames, found);
+        });
+    }
+}
+
+impl Hearing {
+    fn new() -> Self {
         let e = edges_hz();
         let band = |i: usize| {
             let weight = |k: usize| {
@@ -100,45 +145,36 @@ impl BandPass {
             (pitch.floor() as usize % N_NOTES, pitch.fract())
         };
         let notes = (first..N_FFT / 2).take_while(is_note).map(note).collect();
-        Self {
-            framer: Framer::new(N_FFT, HOP),
-            dft: Dft::new(N_FFT),
-            power: vec![0.0; N_FFT / 2 + 1],
-            bank: (0..N_BANDS).map(band).collect(),
-            notes: (first, notes),
-            found: Spectra { bands: Vec::new(), notes: Vec::new() },
-        }
+        let bands: Vec<(usize, Vec<f64>)> = (0..N_BANDS).map(band).collect();
+        let n_bins = bands.iter().map(|(first, w)| first + w.len()).max().unwrap_or(0);
+        Self { bank: Bank::new(N_BINS, bands), n_bins, notes: (first, notes) }
     }
 
-    /// Takes the next samples at 44.1 kHz.
-    pub fn push(&mut self, samples: &[f32]) {
-        self.with(|framer, visit| framer.push(samples, visit));
-    }
-
-    /// Ends the signal.
-    pub fn finish(mut self) -> Spectra {
-        self.with(|framer, visit| framer.finish(visit));
-        self.found
-    }
-
-    fn with(&mut self, frames: impl FnOnce(&mut Framer, &mut dyn FnMut(&[f32]))) {
-        let Self { framer, dft, power, bank, notes, found } = self;
-        let n_bins = bank.iter().map(|(first, w)| first + w.len()).max().unwrap_or(0);
-        frames(framer, &mut |frame| {
-            hann_power(dft.of(frame), power);
-            let magnitude = &mut power[..n_bins];
-            magnitude.iter_mut().for_each(|p| *p = p.sqrt());
-            for (first, weights) in bank.iter() {
-                let bins = &magnitude[*first..];
-                let sum: f64 = bins.iter().zip(weights).map(|(m, w)| m * w).sum();
-                found.bands.push(sum as f32);
-            }
+    /// Adds what is heard of a frame or two, given |X\[k\]|², of which the roots are taken in place.
+    fn add(&self, powers: [&mut [f64; N_BINS]; 2], n_frames: usize, found: &mut Spectra) {
+        let [first, second] = powers.map(|power| {
+            take_roots(&mut power[..self.n_bins]);
+            &power[..]
+        });
+        let mut bands = [[0.0; N_BANDS]; 2];
+        let [first_bands, second_bands] = &mut bands;
+        self.bank.apply([first, second], [first_bands, second_bands]);
+        found.bands.extend_from_slice(bands[..n_frames].as_flattened());
+        for magnitude in [first, second].into_iter().take(n_frames) {
             let mut strengths = [0.0; N_NOTES];
-            for (m, &(note, share)) in magnitude[notes.0..].iter().zip(&notes.1) {
+            for (m, &(note, share)) in magnitude[self.notes.0..].iter().zip(&self.notes.1) {
                 strengths[note] += m * (1.0 - share);
                 strengths[(note + 1) % N_NOTES] += m * share;
             }
             found.notes.extend(strengths.map(|x| x as f32));
-        });
+        }
+    }
+}
+
+vectorized! {
+    fn take_roots(values: &mut [f64]) {
+        for x in values {
+            *x = x.sqrt();
+        }
     }
 }

@@ -1,4 +1,4 @@
-//! The only code with `unsafe`: tiles of matrix products, and the choice of instructions.
+//! The only code with `unsafe` but for the choice of instructions (`instructions`): tiles of matrix products.
 //!
 //! Why here: the tile with AVX-512 runs at 95 % of the machine's peak; what the compiler makes of the
 //! same loops keeps sums in memory and runs at a third of it at best (`docs/benchmarks.md`). Written in
@@ -15,7 +15,6 @@
 
 mod few_rows;
 mod gather;
-mod level;
 mod pack;
 mod product;
 mod small;
@@ -26,9 +25,9 @@ mod weight_gradient;
 #[cfg(target_arch = "x86_64")]
 mod x86;
 
+pub(super) use crate::instructions::vectorized;
+pub use crate::instructions::{Level, level};
 pub use gather::Conv;
-pub(super) use level::vectorized;
-pub use level::{Level, level};
 pub use pack::{PANEL, pack_weight, packed_len, transpose_f32, transpose_portable, unpack_weight};
 pub use product::{input_gradient, product};
 pub use small::{Matrix, MatrixMut, matmul};

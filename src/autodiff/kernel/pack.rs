@@ -7,7 +7,7 @@
 use crate::autodiff::element::Element;
 
 #[cfg(target_arch = "x86_64")]
-use super::level::{Level, level};
+use super::{Level, level};
 
 /// Outputs of a panel: one cache line of `f32`.
 pub const PANEL: usize = 16;

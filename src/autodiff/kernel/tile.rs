@@ -3,8 +3,8 @@
 use crate::autodiff::arena::Arena;
 use crate::autodiff::element::Element;
 
-use super::level::{Level, level};
 use super::pack::PANEL;
+use super::{Level, level};
 
 /// Rows of a tile at most.
 pub const MAX_ROWS: usize = 8;

@@ -19,45 +19,60 @@ fn pow_4_3(mut x: i32) -> f32 {
         * mult as f32
 }
 
-/// The Huffman decoder's 32-bit look-ahead cache. Bytes past the end of the
-/// buffer read as zero: a corrupt `big_values` can make the decoder run past
-/// the granule's data, which C tolerates by reading neighbouring memory.
+/// The next bits of the main data, the first one highest. Bytes past the end of the buffer read as
+/// zero: a corrupt `big_values` can make the decoder run past the granule's data, which C tolerates
+/// by reading neighbouring memory.
 struct BitCache<'a> {
     buf: &'a [u8],
+    /// The first byte that is not whole in the cache.
     next: usize,
-    cache: u32,
-    sh: i32,
+    cache: u64,
+    /// Bits of the cache that are in use; those below may be right already.
+    n_bits: u32,
 }
 
-impl BitCache<'_> {
-    #[inline(always)]
-    fn byte(&self, i: usize) -> u32 {
-        self.buf.get(i).copied().map_or(0, u32::from)
+impl<'a> BitCache<'a> {
+    /// Starts at a bit of the buffer.
+    fn new(buf: &'a [u8], pos: i32) -> Self {
+        let mut bits = Self { buf, next: (pos / 8) as usize, cache: 0, n_bits: 0 };
+        bits.check();
+        bits.flush(pos & 7);
+        bits
     }
 
     #[inline(always)]
     fn peek(&self, n: i32) -> u32 {
-        self.cache >> (32 - n)
+        (self.cache >> (64 - n)) as u32
+    }
+
+    #[inline(always)]
+    fn is_negative(&self) -> bool {
+        self.cache.cast_signed() < 0
     }
 
     #[inline(always)]
     fn flush(&mut self, n: i32) {
         self.cache <<= n;
-        self.sh += n;
+        self.n_bits = self.n_bits.wrapping_sub(n.cast_unsigned());
     }
 
+    /// Fills the cache with 56 bits or more; a pair takes at most 19 + 2 · (13 + 1), and a start 7.
     #[inline(always)]
     fn check(&mut self) {
-        while self.sh >= 0 {
-            self.cache |= self.byte(self.next) << self.sh;
-            self.next += 1;
-            self.sh -= 8;
-        }
+        let rest = self.buf.get(self.next..).unwrap_or_default();
+        let bytes = match rest.first_chunk() {
+            Some(bytes) => *bytes,
+            None => std::array::from_fn(|i| rest.get(i).copied().unwrap_or(0)),
+        };
+        // What is there already is the same bits.
+        self.cache |= u64::from_be_bytes(bytes) >> self.n_bits;
+        self.next += ((63 - self.n_bits) / 8) as usize;
+        self.n_bits |= 56;
     }
 
     /// Current bit position in the buffer.
     fn pos(&self) -> i32 {
-        self.next as i32 * 8 - 24 + self.sh
+        self.next as i32 * 8 - self.n_bits.cast_signed()
     }
 }
 
@@ -85,10 +100,9 @@ fn decode_pairs<const LINBITS: bool>(
             if LINBITS && lsb == 15 {
                 lsb += br.peek(linbits) as i32;
                 br.flush(linbits);
-                br.check();
-                *v = one * pow_4_3(lsb) * if (br.cache as i32) < 0 { -1.0 } else { 1.0 };
+                *v = one * pow_4_3(lsb) * if br.is_negative() { -1.0 } else { 1.0 };
             } else {
-                *v = POW_4_3[(16 + lsb) as usize - 16 * (br.cache >> 31) as usize] * one;
+                *v = POW_4_3[(16 + lsb) as usize - 16 * (br.cache >> 63) as usize] * one;
             }
             br.flush((lsb != 0) as i32);
             leaf >>= 4;
@@ -112,11 +126,7 @@ pub(super) fn decode_spectrum(
     let mut scf_idx = 0;
     let mut d = 0;
 
-    let start = (bs.pos / 8) as usize;
-    let mut br = BitCache { buf: bs.buf, next: start + 4, cache: 0, sh: (bs.pos & 7) - 8 };
-    br.cache = (((br.byte(start) * 256 + br.byte(start + 1)) * 256 + br.byte(start + 2)) * 256
-        + br.byte(start + 3))
-        << (bs.pos & 7);
+    let mut br = BitCache::new(bs.buf, bs.pos);
 
     while big_val_cnt > 0 {
         let tab_num = granule.table_select[ireg] as usize;
@@ -158,7 +168,7 @@ pub(super) fn decode_spectrum(
         if leaf & 8 == 0 {
             leaf = i32::from(
                 codebook_count1
-                    [(leaf >> 3) as usize + (br.cache << 4 >> (32 - (leaf & 3))) as usize],
+                    [(leaf >> 3) as usize + (br.cache << 4 >> (64 - (leaf & 3))) as usize],
             );
         }
         br.flush(leaf & 7);
@@ -178,7 +188,7 @@ pub(super) fn decode_spectrum(
             }
             for s in 2 * half..2 * half + 2 {
                 if leaf & (128 >> s) != 0 {
-                    dst[d + s] = if (br.cache as i32) < 0 { -one } else { one };
+                    dst[d + s] = if br.is_negative() { -one } else { one };
                     br.flush(1);
                 }
             }
@@ -187,4 +197,32 @@ pub(super) fn decode_spectrum(
         d += 4;
     }
     bs.pos = layer3gr_limit;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bits_come_in_order_and_are_zeros_behind_the_end() {
+        let buf: Vec<u8> = (0..23).map(|i: u8| i.wrapping_mul(89).wrapping_add(41)).collect();
+        let bit = |at: usize| buf.get(at / 8).map_or(0, |byte| u32::from(byte >> (7 - at % 8)) & 1);
+        for start in [0, 3, 8, 21] {
+            let mut bits = BitCache::new(&buf, start);
+            let mut at = start as usize;
+            // Pairs of codes and signs, up to the most that a pair takes.
+            for (i, n) in [5, 1, 19, 13, 1, 7, 2, 4, 11, 6].into_iter().cycle().take(40).enumerate()
+            {
+                if i % 3 == 0 {
+                    bits.check();
+                }
+                assert_eq!(bits.pos(), at as i32);
+                let expected = (at..at + n).fold(0, |value, at| 2 * value + bit(at));
+                assert_eq!(bits.peek(n as i32), expected, "{n} bits at {at}");
+                assert_eq!(bits.is_negative(), bit(at) == 1);
+                bits.flush(n as i32);
+                at += n;
+            }
+        }
+    }
 }

@@ -4,9 +4,10 @@
 use std::f64::consts::PI;
 use std::sync::LazyLock;
 
-use super::lanes::{F4, Lanes};
+use super::lanes::{F4, F8, Lanes};
 use super::side_info::SHORT_BLOCK;
 use super::tables::{ANTIALIAS, TWIDDLE_36};
+use crate::instructions::{Level, level, vectorized};
 
 pub(super) fn reorder(grbuf: &mut [f32], scratch: &mut [f32], sfb: &[u8]) {
     let mut src = 0;
@@ -122,16 +123,42 @@ fn imdct36_bands<T: Lanes>(spectrum: &mut [f32], overlap: &mut [f32], window: &W
     }
 }
 
-fn imdct36(spectrum: &mut [f32], overlap: &mut [f32], window: &Window, n_bands: usize) {
-    let mut j = 0;
-    while j + 4 <= n_bands {
-        imdct36_bands::<F4>(&mut spectrum[18 * j..], &mut overlap[18 * j..], window);
-        j += 4;
+/// Transforms bands; `is_wide` says that registers hold eight of them.
+fn imdct36(spectrum: &mut [f32], overlap: &mut [f32], window: &Window) {
+    imdct36_all(spectrum, overlap, window, level() != Level::Portable);
+}
+
+vectorized! {
+    fn imdct36_all(spectrum: &mut [f32], overlap: &mut [f32], window: &Window, is_wide: bool) {
+        if is_wide {
+            let (spectrum, overlap) = imdct36_groups::<F8>(spectrum, overlap, window);
+            imdct36_groups::<f32>(spectrum, overlap, window);
+        } else {
+            let (spectrum, overlap) = imdct36_groups::<F4>(spectrum, overlap, window);
+            imdct36_groups::<f32>(spectrum, overlap, window);
+        }
     }
-    while j < n_bands {
-        imdct36_bands::<f32>(&mut spectrum[18 * j..], &mut overlap[18 * j..], window);
-        j += 1;
+}
+
+/// Transforms as many bands at a time as `T` has lanes and returns the bands that are left.
+#[inline(always)]
+fn imdct36_groups<'a, T: Lanes>(
+    spectrum: &'a mut [f32],
+    overlap: &'a mut [f32],
+    window: &Window,
+) -> (&'a mut [f32], &'a mut [f32]) {
+    let (mut spectra, mut overlaps) =
+        (spectrum.chunks_exact_mut(18 * T::N), overlap.chunks_exact_mut(18 * T::N));
+    for (spectrum, overlap) in spectra.by_ref().zip(overlaps.by_ref()) {
+        if spectrum.iter().fold(0, |bits, x| bits | x.abs().to_bits()) == 0 {
+            // The transform of nothing is nothing: only what the block before left sounds.
+            spectrum.copy_from_slice(overlap);
+            overlap.fill(0.0);
+        } else {
+            imdct36_bands::<T>(spectrum, overlap, window);
+        }
     }
+    (spectra.into_remainder(), overlaps.into_remainder())
 }
 
 /// The transforms of a short block's three windows, which start 6, 12 and 18 samples in.
@@ -160,12 +187,12 @@ pub(super) fn imdct(
 ) {
     let (long, rest) = spectrum.split_at_mut(18 * n_long);
     let (long_overlap, rest_overlap) = overlap.split_at_mut(18 * n_long);
-    imdct36(long, long_overlap, &TABLES.windows[0], n_long);
+    imdct36(long, long_overlap, &TABLES.windows[0]);
     if block_type == SHORT_BLOCK {
         imdct_short(rest, rest_overlap);
     } else {
         let window = &TABLES.windows[usize::from(block_type)];
-        imdct36(rest, rest_overlap, window, 32 - n_long);
+        imdct36(rest, rest_overlap, window);
     }
 }
 
@@ -252,5 +279,17 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn bands_of_silence_leave_what_the_block_before_left() {
+        let before: [f32; 576] = std::array::from_fn(|i| ((i * 31) % 17) as f32 - 8.0);
+        // Bands 9 to 31 are silent: with eight or four at a time and one by one.
+        let mut out: [f32; 576] = std::array::from_fn(|i| if i < 18 * 9 { 0.25 } else { 0.0 });
+        let mut overlap = before;
+        imdct(&mut out, &mut overlap, 0, 1);
+        assert_eq!(out[18 * 17..], before[18 * 17..]);
+        assert!(overlap[18 * 17..].iter().all(|&x| x == 0.0));
+        assert!(out[..18].iter().zip(&before).all(|(x, y)| x != y));
     }
 }

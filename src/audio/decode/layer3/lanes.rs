@@ -1,4 +1,4 @@
-//! One float or four, so that each kernel is written once for both; lane by lane, nothing is fused
+//! One float or several, so that each kernel is written once for all; lane by lane, nothing is fused
 //! or reordered.
 
 use std::ops::{Add, AddAssign, Mul, Neg, Sub, SubAssign};
@@ -12,6 +12,8 @@ pub(super) trait Lanes:
     + AddAssign
     + SubAssign
 {
+    /// How many floats.
+    const N: usize;
     fn splat(x: f32) -> Self;
     /// Loads the first `N` floats of `s`.
     fn load(s: &[f32]) -> Self;
@@ -26,6 +28,7 @@ pub(super) trait Lanes:
 }
 
 impl Lanes for f32 {
+    const N: usize = 1;
     #[inline(always)]
     fn splat(x: f32) -> Self {
         x
@@ -52,79 +55,76 @@ impl Lanes for f32 {
     }
 }
 
-/// Four floats; LLVM turns these element-wise loops into SIMD on its own.
+/// Floats side by side; LLVM turns these element-wise loops into SIMD on its own.
 #[derive(Copy, Clone)]
-#[repr(align(16))]
-pub(super) struct F4([f32; 4]);
+pub(super) struct Floats<const N: usize>([f32; N]);
 
-impl F4 {
-    #[inline(always)]
-    pub(super) fn to_array(self) -> [f32; 4] {
-        self.0
-    }
-}
+pub(super) type F4 = Floats<4>;
+pub(super) type F8 = Floats<8>;
 
 macro_rules! binop {
-    ($trait:ident, $f:ident, $op:tt, $atrait:ident, $af:ident) => {
-        impl $trait for F4 {
-            type Output = F4;
+    ($trait:ident, $f:ident, $op:tt) => {
+        impl<const N: usize> $trait for Floats<N> {
+            type Output = Self;
             #[inline(always)]
-            fn $f(self, o: F4) -> F4 {
-                F4(std::array::from_fn(|i| self.0[i] $op o.0[i]))
-            }
-        }
-        impl $atrait for F4 {
-            #[inline(always)]
-            fn $af(&mut self, o: F4) {
-                *self = *self $op o;
+            fn $f(self, o: Self) -> Self {
+                Self(std::array::from_fn(|i| self.0[i] $op o.0[i]))
             }
         }
     };
 }
-binop!(Add, add, +, AddAssign, add_assign);
-binop!(Sub, sub, -, SubAssign, sub_assign);
-impl Mul for F4 {
-    type Output = F4;
+binop!(Add, add, +);
+binop!(Sub, sub, -);
+binop!(Mul, mul, *);
+impl<const N: usize> AddAssign for Floats<N> {
     #[inline(always)]
-    fn mul(self, o: F4) -> F4 {
-        F4(std::array::from_fn(|i| self.0[i] * o.0[i]))
+    fn add_assign(&mut self, o: Self) {
+        *self = *self + o;
     }
 }
-impl Neg for F4 {
-    type Output = F4;
+impl<const N: usize> SubAssign for Floats<N> {
     #[inline(always)]
-    fn neg(self) -> F4 {
-        F4(self.0.map(|x| -x))
+    fn sub_assign(&mut self, o: Self) {
+        *self = *self - o;
+    }
+}
+impl<const N: usize> Neg for Floats<N> {
+    type Output = Self;
+    #[inline(always)]
+    fn neg(self) -> Self {
+        Self(self.0.map(|x| -x))
     }
 }
 
-impl Lanes for F4 {
+impl<const N: usize> Lanes for Floats<N> {
+    const N: usize = N;
     #[inline(always)]
     fn splat(x: f32) -> Self {
-        F4([x; 4])
+        Self([x; N])
     }
     #[inline(always)]
     fn load(s: &[f32]) -> Self {
-        F4(s[..4].try_into().unwrap())
+        let s = &s[..N];
+        Self(std::array::from_fn(|i| s[i]))
     }
     #[inline(always)]
     fn store(self, s: &mut [f32]) {
-        s[..4].copy_from_slice(&self.0);
+        s[..N].copy_from_slice(&self.0);
     }
     #[inline(always)]
     fn gather(s: &[f32], stride: usize) -> Self {
-        F4([s[0], s[stride], s[2 * stride], s[3 * stride]])
+        let s = &s[..=stride * (N - 1)];
+        Self(std::array::from_fn(|i| s[stride * i]))
     }
     #[inline(always)]
     fn scatter(self, s: &mut [f32], stride: usize) {
-        s[3 * stride] = self.0[3];
-        s[2 * stride] = self.0[2];
-        s[stride] = self.0[1];
-        s[0] = self.0[0];
+        let s = &mut s[..=stride * (N - 1)];
+        for (i, x) in self.0.into_iter().enumerate() {
+            s[stride * i] = x;
+        }
     }
     #[inline(always)]
     fn rev(self) -> Self {
-        let [a, b, c, d] = self.0;
-        F4([d, c, b, a])
+        Self(std::array::from_fn(|i| self.0[N - 1 - i]))
     }
 }

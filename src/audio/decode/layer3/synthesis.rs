@@ -1,7 +1,10 @@
 //! The polyphase filter bank (ISO/IEC 11172-3 section 2.4.3.2.2).
 
-use super::lanes::{F4, Lanes};
+use std::sync::LazyLock;
+
+use super::lanes::{F4, F8, Lanes};
 use super::tables::{SECANTS, SYNTHESIS_WINDOW};
+use crate::instructions::{Level, level, vectorized};
 
 /// From the scale of the tables, that of 16-bit integers, to 1.
 const SCALE: f32 = 1.0 / 32_768.0;
@@ -14,16 +17,17 @@ const SYNTH_ROWS: usize = ZLIN + 2 * 16;
 /// Rows in the whole buffer.
 pub(super) const SYN_ROWS: usize = (18 + 15) * 2 * 32 / 4;
 
-/// DCT-II over columns `k..k + T::N` of the 18x32 subband matrix.
+/// DCT-II over as many columns from `k` on as `T` has lanes, of a matrix of 32 rows `stride` apart.
 #[inline(always)]
-fn dct_ii_columns<T: Lanes>(grbuf: &mut [f32; 576], k: usize) {
+fn dct_ii_columns<T: Lanes>(grbuf: &mut [f32], stride: usize, k: usize) {
+    let grbuf = &mut grbuf[..32 * stride];
     let c = T::splat;
     let mut t = [[c(0.0); 8]; 4];
     for i in 0..8 {
-        let x0 = T::load(&grbuf[k + i * 18..]);
-        let x1 = T::load(&grbuf[k + (15 - i) * 18..]);
-        let x2 = T::load(&grbuf[k + (16 + i) * 18..]);
-        let x3 = T::load(&grbuf[k + (31 - i) * 18..]);
+        let x0 = T::load(&grbuf[k + i * stride..]);
+        let x1 = T::load(&grbuf[k + (15 - i) * stride..]);
+        let x2 = T::load(&grbuf[k + (16 + i) * stride..]);
+        let x3 = T::load(&grbuf[k + (31 - i) * stride..]);
         let t0 = x0 + x3;
         let t1 = x1 + x2;
         let t2 = (x1 - x2) * c(SECANTS[3 * i]);
@@ -66,29 +70,94 @@ fn dct_ii_columns<T: Lanes>(grbuf: &mut [f32; 576], k: usize) {
         x[7] = (xt - x7) * c(2.56291556);
     }
     for i in 0..7 {
-        let y = k + i * 4 * 18;
+        let y = k + i * 4 * stride;
         t[0][i].store(&mut grbuf[y..]);
-        (t[2][i] + t[3][i] + t[3][i + 1]).store(&mut grbuf[y + 18..]);
-        (t[1][i] + t[1][i + 1]).store(&mut grbuf[y + 2 * 18..]);
-        (t[2][i + 1] + t[3][i] + t[3][i + 1]).store(&mut grbuf[y + 3 * 18..]);
+        (t[2][i] + t[3][i] + t[3][i + 1]).store(&mut grbuf[y + stride..]);
+        (t[1][i] + t[1][i + 1]).store(&mut grbuf[y + 2 * stride..]);
+        (t[2][i + 1] + t[3][i] + t[3][i + 1]).store(&mut grbuf[y + 3 * stride..]);
     }
-    let y = k + 7 * 4 * 18;
+    let y = k + 7 * 4 * stride;
     t[0][7].store(&mut grbuf[y..]);
-    (t[2][7] + t[3][7]).store(&mut grbuf[y + 18..]);
-    t[1][7].store(&mut grbuf[y + 2 * 18..]);
-    t[3][7].store(&mut grbuf[y + 3 * 18..]);
+    (t[2][7] + t[3][7]).store(&mut grbuf[y + stride..]);
+    t[1][7].store(&mut grbuf[y + 2 * stride..]);
+    t[3][7].store(&mut grbuf[y + 3 * stride..]);
 }
 
-fn dct_ii(grbuf: &mut [f32; 576], n: usize) {
-    let mut k = 0;
-    while k + 4 <= n {
-        dct_ii_columns::<F4>(grbuf, k);
-        k += 4;
+/// DCT-II over the 18 columns of every channel's subband matrix; `is_wide` says that registers hold
+/// eight of them.
+#[inline(always)]
+fn dct_ii(spectra: &mut [[f32; 576]], is_wide: bool) {
+    for spectrum in &mut *spectra {
+        if is_wide {
+            dct_ii_columns::<F8>(spectrum, 18, 0);
+            dct_ii_columns::<F8>(spectrum, 18, 8);
+        } else {
+            for k in [0, 4, 8, 12] {
+                dct_ii_columns::<F4>(spectrum, 18, k);
+            }
+        }
     }
-    while k < n {
-        dct_ii_columns::<f32>(grbuf, k);
-        k += 1;
+    // The last two columns of both channels side by side.
+    let mut rest = [[0.0; 4]; 32];
+    for (ch, spectrum) in spectra.iter().enumerate() {
+        for (to, from) in rest.iter_mut().zip(spectrum.as_chunks::<18>().0) {
+            to[2 * ch..2 * ch + 2].copy_from_slice(&from[16..]);
+        }
     }
+    dct_ii_columns::<F4>(rest.as_flattened_mut(), 4, 0);
+    for (ch, spectrum) in spectra.iter_mut().enumerate() {
+        for (to, from) in spectrum.as_chunks_mut::<18>().0.iter_mut().zip(&rest) {
+            to[16..].copy_from_slice(&from[2 * ch..2 * ch + 2]);
+        }
+    }
+}
+
+/// Floats of the 16 rows of 4 that the window is applied to side by side; nothing is made of the last.
+const SPAN: usize = 16 * 4;
+/// Of these, how many at once: they stay in registers.
+const LOT: usize = 16;
+
+/// The window, the two factors of each of 8 steps, spread over the rows and scaled by [`SCALE`].
+///
+/// A power of two may be multiplied before a sum or after it.
+static SPREAD_WINDOW: LazyLock<[[[f32; SPAN]; 2]; 8]> = LazyLock::new(|| {
+    let factor = |k: usize, which: usize, at: usize| {
+        let row = at / 4;
+        if row == 15 { 0.0 } else { SCALE * SYNTHESIS_WINDOW[(14 - row) * 16 + 2 * k + which] }
+    };
+    std::array::from_fn(|k| {
+        std::array::from_fn(|which| std::array::from_fn(|at| factor(k, which, at)))
+    })
+});
+
+/// Returns the sums a and b of all rows under the window.
+#[inline(always)]
+fn windowed(lins: &[[f32; 4]; SYNTH_ROWS], window: &[[[f32; SPAN]; 2]; 8]) -> [[f32; SPAN]; 2] {
+    let rows = lins.as_flattened();
+    let (mut a_sums, mut b_sums) = ([0.0; SPAN], [0.0; SPAN]);
+    for at in (0..SPAN).step_by(LOT) {
+        let (mut a, mut b) = ([0.0; LOT], [0.0; LOT]);
+        for (k, [w0, w1]) in window.iter().enumerate() {
+            let vz = &rows[4 * (ZLIN - 16 * k) + at..][..LOT];
+            let vy = &rows[4 * 16 * k + at..][..LOT];
+            let (w0, w1) = (&w0[at..at + LOT], &w1[at..at + LOT]);
+            for l in 0..LOT {
+                b[l] += vz[l] * w1[l] + vy[l] * w0[l];
+            }
+            if k % 2 == 0 {
+                for l in 0..LOT {
+                    a[l] += vz[l] * w0[l] - vy[l] * w1[l];
+                }
+            } else {
+                for l in 0..LOT {
+                    a[l] += vy[l] * w1[l] - vz[l] * w0[l];
+                }
+            }
+        }
+        a_sums[at..at + LOT].copy_from_slice(&a);
+        b_sums[at..at + LOT].copy_from_slice(&b);
+    }
+    [a_sums, b_sums]
 }
 
 /// `centre_pair`: the two samples C writes to `pcm[0]` and `pcm[16*nch]`,
@@ -119,14 +188,15 @@ fn centre_pair(z: &[[f32; 4]; SYNTH_ROWS], row: usize, lane: usize) -> (f32, f32
     (first, a)
 }
 
+#[inline(always)]
 fn synthesize<const NCH: usize>(
     xl: &[f32],
     xr: &[f32],
     dst: &mut [f32],
     lins: &mut [[f32; 4]; SYNTH_ROWS],
+    window: &[[[f32; SPAN]; 2]; 8],
 ) {
-    let xl: &[f32; 560] = xl[..560].try_into().unwrap();
-    let xr: &[f32; 560] = xr[..560].try_into().unwrap();
+    let (Some(xl), Some(xr)) = (xl.first_chunk::<560>(), xr.first_chunk::<560>()) else { return };
     let dst = &mut dst[..64 * NCH];
     let r = NCH - 1;
 
@@ -154,79 +224,47 @@ fn synthesize<const NCH: usize>(
         lins[ZLIN + 16 + i][1] = xr[1 + 18 * (1 + i)];
         lins[ZLIN - 16 + i][2] = xl[18 * (1 + i)];
         lins[ZLIN - 16 + i][3] = xr[18 * (1 + i)];
-
-        let w: &[f32; 16] = SYNTHESIS_WINDOW[(14 - i) * 16..][..16].try_into().unwrap();
-        let vz = |k: usize| F4::load(&lins[ZLIN + i - 16 * k]);
-        let vy = |k: usize| F4::load(&lins[i + 16 * k]);
-        let w0 = |k: usize| F4::splat(w[2 * k]);
-        let w1 = |k: usize| F4::splat(w[2 * k + 1]);
-        let mut b = vz(0) * w1(0) + vy(0) * w0(0);
-        let mut a = vz(0) * w0(0) - vy(0) * w1(0);
-        for k in [1, 3, 5, 7] {
-            b += vz(k) * w1(k) + vy(k) * w0(k);
-            a += vy(k) * w1(k) - vz(k) * w0(k);
-            if k < 7 {
-                let k = k + 1;
-                b += vz(k) * w1(k) + vy(k) * w0(k);
-                a += vz(k) * w0(k) - vy(k) * w1(k);
-            }
-        }
-        let (a, b) = (a.to_array(), b.to_array());
-
-        if NCH == 2 {
-            dst[r + (15 - i) * NCH] = a[1] * SCALE;
-            dst[r + (17 + i) * NCH] = b[1] * SCALE;
-        }
-        dst[(15 - i) * NCH] = a[0] * SCALE;
-        dst[(17 + i) * NCH] = b[0] * SCALE;
-        if NCH == 2 {
-            dst[r + (47 - i) * NCH] = a[3] * SCALE;
-            dst[r + (49 + i) * NCH] = b[3] * SCALE;
-        }
-        dst[(47 - i) * NCH] = a[2] * SCALE;
-        dst[(49 + i) * NCH] = b[2] * SCALE;
+    }
+    let [a, b] = windowed(lins, window);
+    for (i, (a, b)) in a.as_chunks::<4>().0.iter().zip(b.as_chunks::<4>().0).take(15).enumerate() {
+        dst[(15 - i) * NCH..][..NCH].copy_from_slice(&a[..NCH]);
+        dst[(17 + i) * NCH..][..NCH].copy_from_slice(&b[..NCH]);
+        dst[(47 - i) * NCH..][..NCH].copy_from_slice(&a[2..2 + NCH]);
+        dst[(49 + i) * NCH..][..NCH].copy_from_slice(&b[2..2 + NCH]);
     }
 }
 
+/// Synthesizes a granule of `NCH` channels from their subbands; the rows of `lins` are the filter's memory.
+#[inline(always)]
 fn synthesize_all<const NCH: usize>(
-    grbuf: &[f32],
-    nbands: usize,
+    spectra: &[f32],
     pcm: &mut [f32],
     lins: &mut [[f32; 4]; SYN_ROWS],
+    window: &[[[f32; SPAN]; 2]; 8],
 ) {
-    for i in (0..nbands).step_by(2) {
-        synthesize::<NCH>(
-            &grbuf[i..],
-            &grbuf[576 * (NCH - 1) + i..],
-            &mut pcm[32 * NCH * i..],
-            (&mut lins[16 * i..16 * i + SYNTH_ROWS]).try_into().unwrap(),
-        );
+    for i in (0..N_STEPS).step_by(2) {
+        let Some(rows) = lins[16 * i..].first_chunk_mut() else { return };
+        let right = &spectra[576 * (NCH - 1) + i..];
+        synthesize::<NCH>(&spectra[i..], right, &mut pcm[32 * NCH * i..], rows, window);
     }
 }
 
+/// Samples of a subband in a granule.
+const N_STEPS: usize = 18;
+
+/// Synthesizes a granule of one or two channels, interleaved into `pcm`.
 pub(super) fn synthesize_granule(
     qmf_state: &mut [f32; 960],
-    grbuf: &mut [[f32; 576]; 2],
-    nbands: usize,
-    nch: usize,
+    spectra: &mut [[f32; 576]; 2],
+    n_channels: usize,
     pcm: &mut [f32],
     lins: &mut [[f32; 4]; SYN_ROWS],
 ) {
-    for ch in &mut grbuf[..nch] {
-        dct_ii(ch, nbands);
-    }
-
     lins.as_flattened_mut()[..15 * 64].copy_from_slice(qmf_state);
-
-    let grbuf = grbuf.as_flattened();
-    if nch == 1 {
-        synthesize_all::<1>(grbuf, nbands, pcm, lins);
-    } else {
-        synthesize_all::<2>(grbuf, nbands, pcm, lins);
-    }
-
-    let tail = &lins.as_flattened()[nbands * 64..nbands * 64 + 15 * 64];
-    if nch == 1 {
+    let is_wide = level() != Level::Portable;
+    synthesize_rows(spectra, n_channels, pcm, lins, &SPREAD_WINDOW, is_wide);
+    let tail = &lins.as_flattened()[N_STEPS * 64..N_STEPS * 64 + 15 * 64];
+    if n_channels == 1 {
         // Standard (not MINIMP3_NONSTANDARD_BUT_LOGICAL) behavior: a mono frame
         // only advances the left channel's filterbank history, so a later
         // switch to stereo starts the right channel from its old state.
@@ -237,3 +275,20 @@ pub(super) fn synthesize_granule(
         qmf_state.copy_from_slice(tail);
     }
 }
+
+vectorized! {
+    fn synthesize_rows(
+        spectra: &mut [[f32; 576]; 2], n_channels: usize, pcm: &mut [f32],
+        lins: &mut [[f32; 4]; SYN_ROWS], window: &[[[f32; SPAN]; 2]; 8], is_wide: bool,
+    ) {
+        dct_ii(&mut spectra[..n_channels], is_wide);
+        if n_channels == 1 {
+            synthesize_all::<1>(spectra.as_flattened(), pcm, lins, window);
+        } else {
+            synthesize_all::<2>(spectra.as_flattened(), pcm, lins, window);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

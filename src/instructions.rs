@@ -1,4 +1,6 @@
 //! Which vector instructions this machine has, and loops compiled for each.
+//!
+//! Invariant of every `unsafe` call here: code for an instruction set runs only where [`level`] found it.
 
 use std::sync::LazyLock;
 
@@ -49,31 +51,32 @@ fn detect(_asked: &str) -> Level {
 /// Compiles a function for each level and calls the widest that the machine has.
 ///
 /// The body is plain safe code; its loops become vector code. No product is fused with a sum, so
-/// that all levels give the same bits.
+/// that all levels give the same bits. What the body calls is compiled along with it only where it is
+/// inlined.
 macro_rules! vectorized {
     ($(
         $(#[$meta:meta])*
-        $vis:vis fn $name:ident<$E:ident: Element $(, $F:ident: $bound:path)?>(
+        $vis:vis fn $name:ident $(<$E:ident: Element $(, $F:ident: $bound:path)?>)? (
             $($arg:ident: $type:ty),* $(,)?
         ) $(-> $result:ty)? $body:block
     )*) => {$(
         $(#[$meta])*
         #[allow(unsafe_code, reason = "calls code for instructions that were found on this machine")]
-        $vis fn $name<$E: Element $(, $F: $bound)?>($($arg: $type),*) $(-> $result)? {
+        $vis fn $name $(<$E: Element $(, $F: $bound)?>)? ($($arg: $type),*) $(-> $result)? {
             #[inline(always)]
-            fn body<$E: Element $(, $F: $bound)?>($($arg: $type),*) $(-> $result)? $body
+            fn body $(<$E: Element $(, $F: $bound)?>)? ($($arg: $type),*) $(-> $result)? $body
 
             #[cfg(target_arch = "x86_64")]
             {
                 #[target_feature(enable = "avx512f,avx512vl,avx512bw,avx512dq,avx2,fma")]
-                fn avx512<$E: Element $(, $F: $bound)?>($($arg: $type),*) $(-> $result)? {
+                fn avx512 $(<$E: Element $(, $F: $bound)?>)? ($($arg: $type),*) $(-> $result)? {
                     body($($arg),*)
                 }
                 #[target_feature(enable = "avx2,fma")]
-                fn avx2<$E: Element $(, $F: $bound)?>($($arg: $type),*) $(-> $result)? {
+                fn avx2 $(<$E: Element $(, $F: $bound)?>)? ($($arg: $type),*) $(-> $result)? {
                     body($($arg),*)
                 }
-                use $crate::autodiff::kernel::{Level, level};
+                use $crate::instructions::{Level, level};
                 match level() {
                     // SAFETY: `level` found these instructions.
                     Level::Avx512 => return unsafe { avx512($($arg),*) },
