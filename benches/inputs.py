@@ -10,7 +10,7 @@ formats and containers; the same files cut in the middle, with tags, garbage or 
 cases of tests/data/audio_cases; and the samples of mutagen (its source package) and of the crate hound. A file counts as
 
   same       every sample as one of the references has it, or both refuse it
-  length     the samples agree where both have some, and one has more of them
+  length     the samples agree where both have some, and one has more of them at its start or end
   told       samples are missing, and `lost_s` and the summary say so
   refused    a codec or container that is not supported, named, with the way out: convert it
   refused, read by the reference   something else is said to be wrong with it
@@ -218,7 +218,9 @@ def by_ffmpeg(path: pathlib.Path) -> tuple[np.ndarray, int, str] | None:
         return None
     if rate < 1 or channels < 1:
         return None
-    done = ffmpeg("-i", path, "-map", "a:0", "-f", "f32le", "-c:a", "pcm_f32le", "-ar", rate, "-ac", channels, "-",
+    # FFmpeg's own decoder of Opus rounds and resamples speech in its own way; libopus is the reference.
+    decoder = ["-c:a", "libopus"] if stream["codec_name"] == "opus" else []
+    done = ffmpeg(*decoder, "-i", path, "-map", "a:0", "-f", "f32le", "-c:a", "pcm_f32le", "-ar", rate, "-ac", channels, "-",
                   allow=True)
     samples = np.frombuffer(done.stdout[: len(done.stdout) // (4 * channels) * 4 * channels], dtype="<f4")
     if len(samples) == 0:
@@ -238,9 +240,27 @@ def differs(own: np.ndarray, reference: np.ndarray, tolerance: float) -> str:
     """Returns how two signals differ: `same`, `length`, or by how much."""
     n = min(len(own), len(reference))
     worst = float(np.abs(own[:n] - reference[:n]).max()) if n else 0.0
-    if worst > tolerance:
-        return f"by {worst:.2g}"
-    return "same" if len(own) == len(reference) else "length"
+    if worst <= tolerance:
+        return "same" if len(own) == len(reference) else "length"
+    start = shift(own, reference)
+    a, b = own[max(-start, 0):], reference[max(start, 0):]
+    n = min(len(a), len(b))
+    if start and n > len(own) // 2 and float(np.abs(a[:n] - b[:n]).max()) <= tolerance:
+        return "length"
+    return f"by {worst:.2g}"
+
+
+def shift(own: np.ndarray, reference: np.ndarray) -> int:
+    """Returns by how many samples a signal's start lies behind that of another, at most 8,192 either way."""
+    at = len(own) // 2
+    part = own[at:at + 4096]
+    low = max(0, at - 8192)
+    around = reference[low:at + 4096 + 8192]
+    if len(part) < 4096 or len(around) <= len(part):
+        return 0
+    n = 1 << (len(around) + len(part)).bit_length()
+    match = np.fft.irfft(np.fft.rfft(around, n) * np.conj(np.fft.rfft(part, n)), n)[:len(around) - len(part) + 1]
+    return int(np.argmax(match)) + low - at
 
 
 def judge(path: pathlib.Path, told: dict, samples: pathlib.Path) -> tuple[str, str]:

@@ -65,7 +65,8 @@ fn differences(wanted: &Crates, described: &Crates) -> Vec<String> {
 #[test]
 fn the_page_of_dependencies_has_every_crate_in_its_version() {
     let read = |path: &str| std::fs::read_to_string(path).expect(path);
-    let found = differences(&wanted(&read("Cargo.toml")), &described(&read("docs/dependencies.md")));
+    let found =
+        differences(&wanted(&read("Cargo.toml")), &described(&read("docs/dependencies.md")));
     assert!(found.is_empty(), "docs/dependencies.md: {found:#?}");
 }
 

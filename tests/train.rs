@@ -85,7 +85,7 @@ pub fn make_store(dir: &Dir) -> PathBuf {
 }
 
 /// Returns `motiongen train` of the small network, not yet run.
-fn train_command(store: &Path, run: &str, more: &[&str]) -> Command {
+pub fn train_command(store: &Path, run: &str, more: &[&str]) -> Command {
     let mut command = motiongen();
     let flag = |argument: &str| argument.split('=').next().unwrap_or_default().to_owned();
     let given: Vec<_> = more.iter().map(|argument| flag(argument)).collect();

@@ -217,12 +217,21 @@ fn packets<'a>(
         if mpeg::is_layer_2(&survey.marker) {
             return AudioHeaderError::UnsupportedCodec { name, extension };
         }
+        if survey.marker == b"OggS" && survey.head.get(28..36) == Some(b"Speex   ") {
+            return AudioHeaderError::UnsupportedCodec {
+                name: "Speex".to_owned(),
+                extension: "spx",
+            };
+        }
         error
     })?;
     let info = reader.format_info();
     let (format, container) = (info.format, container_name(info.short_name));
     let (track, mut params) =
         audio_track(reader.as_ref()).ok_or(AudioHeaderError::NoAudioTrack { container })?;
+    if format == FORMAT_ID_ISOMP4 && edits.is_big_endian(track.id) {
+        params.codec = high_byte_first(params.codec);
+    }
     let codec = codec_name(params.codec);
     let extension = extension(container);
     if !is_supported(params.codec) {
@@ -254,6 +263,9 @@ fn packets<'a>(
         if aac::has_spectral_band_replication(params.extra_data.as_deref(), &frames) {
             return Err(AudioHeaderError::HighEfficiency { extension });
         }
+        // An MP4 header has 16 bits for it, so that 96 kHz are written as 0.
+        params.sample_rate =
+            params.extra_data.as_deref().and_then(aac::configured_rate_hz).or(params.sample_rate);
         n_coded = aac::simplify(&mut params);
     }
     // Not every container says it, or says it truly.
@@ -303,6 +315,17 @@ fn packets<'a>(
         stream: Stream::Packets(Box::new(Packets { reader, track, params, peeked })),
         n_bytes,
     })
+}
+
+/// Returns the codec of the same samples with their high byte first.
+fn high_byte_first(id: AudioCodecId) -> AudioCodecId {
+    match id {
+        codec::CODEC_ID_PCM_S24LE => codec::CODEC_ID_PCM_S24BE,
+        codec::CODEC_ID_PCM_S32LE => codec::CODEC_ID_PCM_S32BE,
+        codec::CODEC_ID_PCM_F32LE => codec::CODEC_ID_PCM_F32BE,
+        codec::CODEC_ID_PCM_F64LE => codec::CODEC_ID_PCM_F64BE,
+        other => other,
+    }
 }
 
 /// Refuses what no file can have.

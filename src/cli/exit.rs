@@ -7,6 +7,7 @@ use std::process::ExitCode;
 use serde_json::{Value, json};
 
 use super::escaped::Escaped;
+use super::progress::tell;
 use crate::stages::{Summary, lines, one_line, redacted};
 
 /// Done, but some items failed; they are in the `failures` table.
@@ -42,13 +43,12 @@ impl Form {
 }
 
 /// Prints what a stage did, or why it could not run, and returns the exit code.
-#[expect(clippy::print_stderr, reason = "this is where errors are printed")]
 pub fn report(stage: &str, form: Form, outcome: anyhow::Result<Box<dyn Summary>>) -> ExitCode {
     let mut summary = match outcome {
         Ok(summary) => summary,
         Err(error) => {
             let error = chain(&error);
-            eprintln!("error: {error}");
+            tell(&format!("error: {error}"));
             if form == Form::Json {
                 // Standard error has the sentence already.
                 print_object(&could_not_run(stage, &error)).ok();
@@ -80,16 +80,15 @@ pub fn report(stage: &str, form: Form, outcome: anyhow::Result<Box<dyn Summary>>
             Some(cause) => on_one_line(&cause.to_string()),
             None => format!("could not write to standard output: {error}"),
         };
-        eprintln!("error: {said}");
+        tell(&format!("error: {said}"));
         return ExitCode::from(COULD_NOT_RUN);
     }
     ExitCode::from(code)
 }
 
 /// Says that the stage was stopped before anything was under way that could be finished.
-#[expect(clippy::print_stderr, reason = "this is where errors are printed")]
 pub fn stopped(stage: &str, form: Form) {
-    eprintln!("stopped as asked; the same command goes on with what is missing");
+    tell("stopped as asked; the same command goes on with what is missing");
     if form == Form::Json {
         // Nobody is left to be told that it could not be written.
         print_object(&outcome_of(stage, STOPPED, 0)).ok();
@@ -97,7 +96,6 @@ pub fn stopped(stage: &str, form: Form) {
 }
 
 /// Prints clap's own words: help and version end well, a wrong flag could not run.
-#[expect(clippy::print_stderr, reason = "this is where errors are printed")]
 pub fn usage(
     stage: &str,
     form: Form,
@@ -110,7 +108,8 @@ pub fn usage(
         return ExitCode::SUCCESS;
     }
     if let Some(file) = configuration {
-        eprintln!("hint: values that were not typed may come from {}", file.to_string_lossy());
+        let file = file.to_string_lossy();
+        tell(&format!("hint: values that were not typed may come from {file}"));
     }
     if form == Form::Json {
         let text = error.to_string();

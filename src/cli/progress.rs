@@ -1,6 +1,6 @@
 //! Progress: a bar with rate and ETA on a terminal, a plain line every 10 s elsewhere.
 
-use std::io::IsTerminal as _;
+use std::io::{IsTerminal as _, Write as _};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -11,6 +11,12 @@ use crate::stages::{Progress, one_line, redacted};
 
 /// Time between plain lines.
 const LINE_EVERY: Duration = Duration::from_secs(10);
+
+/// Writes a line to standard error. One that nobody can read, because the reader of the pipe has gone or the disk is full,
+/// does not stop the work: `eprintln!` would panic.
+pub fn tell(line: &str) {
+    writeln!(std::io::stderr(), "{line}").ok();
+}
 
 /// Draws the progress of a stage on standard error.
 #[derive(Clone)]
@@ -126,7 +132,6 @@ impl Progress for Bars {
         }
     }
 
-    #[expect(clippy::print_stderr, reason = "progress is for people, data for standard output")]
     fn advance(&self, n: u64) {
         let mut state = self.lock();
         if let Some(bar) = &state.bar {
@@ -136,7 +141,9 @@ impl Progress for Bars {
             count.done += n;
             if count.last_line.elapsed() >= LINE_EVERY {
                 count.last_line = Instant::now();
-                eprintln!("{}", count.line(count.started.elapsed()));
+                let line = count.line(count.started.elapsed());
+                drop(state);
+                tell(&line);
             }
         }
     }
@@ -151,10 +158,9 @@ impl Progress for Bars {
         }
     }
 
-    #[expect(clippy::print_stderr, reason = "notes are for people, data for standard output")]
     fn note(&self, line: &str) {
         if self.mode != Mode::Silent {
-            self.suspend(|| eprintln!("{}", one_line(&redacted(line))));
+            self.suspend(|| tell(&one_line(&redacted(line))));
         }
     }
 

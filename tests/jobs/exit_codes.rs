@@ -6,6 +6,7 @@ use super::{end, object, signal, stage, start, succeed, wait_until};
 use crate::generate::modelled;
 use crate::support::files::{coherent, trajectory, wav};
 use crate::support::{Dir, finish, ingest_command, motiongen, phrases, run};
+use crate::train::{make_store, train_command};
 
 fn commits(store: &Path, stage: &str) -> usize {
     std::fs::read_dir(store.join("commits").join(stage)).map_or(0, Iterator::count)
@@ -191,4 +192,16 @@ fn a_stream_and_a_summary_do_not_share_standard_output() {
     );
     assert_eq!(object(&output.stdout)["outcome"], "could_not_run");
     assert!(!dir.at("out").exists());
+}
+
+#[test]
+fn work_goes_on_when_nobody_reads_what_is_told_of_it() {
+    let dir = Dir::new();
+    let store = make_store(&dir);
+    // Every validation is told on standard error, a pipe whose reader is gone.
+    let mut child = start(train_command(&store, "r", &["--steps=6", "--decoder-steps=5"]));
+    drop(child.stderr.take());
+    let (code, stdout, _) = end(child);
+    assert_eq!(code, Some(0), "{stdout}");
+    assert!(stdout.contains("best validation loss"), "{stdout}");
 }

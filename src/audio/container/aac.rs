@@ -54,6 +54,25 @@ impl Bits<'_> {
     }
 }
 
+/// Sample rates by their index (ISO/IEC 14496-3 table 1.18), in Hz.
+const RATES_HZ: [u32; 13] = [
+    96_000, 88_200, 64_000, 48_000, 44_100, 32_000, 24_000, 22_050, 16_000, 12_000, 11_025, 8_000,
+    7_350,
+];
+
+/// Returns the sample rate that a configuration states, in Hz.
+pub(super) fn configured_rate_hz(config: &[u8]) -> Option<u32> {
+    if config.len() < 2 {
+        return None;
+    }
+    let mut bits = Bits { bytes: config, at: 0 };
+    bits.object_type();
+    match bits.rate() {
+        (_, Some(rate_hz)) => Some(rate_hz).filter(|&rate_hz| rate_hz > 0),
+        (index, None) => RATES_HZ.get(index as usize).copied(),
+    }
+}
+
 /// Whether a stream is HE-AAC: by its configuration (ISO/IEC 14496-3 section 1.6.2.1), explicitly
 /// or behind the sync extension, or by what its frames hold.
 pub(super) fn has_spectral_band_replication(config: Option<&[u8]>, frames: &[&[u8]]) -> bool {

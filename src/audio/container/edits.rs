@@ -1,4 +1,5 @@
-//! The part of an MP4 track that its edit list or iTunes' tag asks to play.
+//! What symphonia does not tell of an MP4 track: the part that its edit list or iTunes' tag asks to play, and the
+//! byte order of uncompressed samples.
 //!
 //! Encoders put a delay before the first sample and fill the last packet up. Symphonia 0.6.1 reads
 //! the edit list (ISO/IEC 14496-12 section 8.6.6) and ignores it. Of several edits, as in a video
@@ -8,6 +9,9 @@ use std::io::{self, Read, Seek, SeekFrom};
 
 /// Bytes of a text that are read: iTunes' has 130.
 const MAX_TEXT_BYTES: u64 = 256;
+
+/// Bytes of a sample description that are read: a sound description with its extensions has some 150.
+const MAX_DESCRIPTION_BYTES: u64 = 1024;
 
 /// Levels of nesting that are read: moov, udta, meta, ilst and the tag are five.
 const MAX_DEPTH: u32 = 8;
@@ -32,6 +36,8 @@ struct TrackEdit {
     timescale: u32,
     /// Start in the media and duration in the movie; duration 0 means to the end.
     edit: Option<(u64, u64)>,
+    /// Whether samples of 24, 32 or 64 bits have their high byte first.
+    is_big_endian: bool,
 }
 
 impl Edits {
@@ -40,6 +46,14 @@ impl Edits {
         let mut edits = Self::default();
         visit(input, 0, n_bytes, MAX_DEPTH, &mut edits)?;
         Ok(edits)
+    }
+
+    /// Returns whether the samples of a track of 24, 32 or 64 bits each have their high byte first.
+    ///
+    /// QuickTime's `in24`, `in32`, `fl32` and `fl64` have, unless an atom `enda` holds 1 (QuickTime File Format,
+    /// "Sound sample description extensions"). Symphonia 0.6.1 takes them all for little-endian.
+    pub fn is_big_endian(&self, id: u32) -> bool {
+        self.tracks.iter().any(|track| track.id == id && track.is_big_endian)
     }
 
     /// Returns the first sample to play and the one after the last, as far as they are stated.
@@ -100,11 +114,12 @@ fn visit(
                 edits.tracks.push(TrackEdit::default());
                 visit(input, content, next, depth, edits)?;
             }
-            b"moov" | b"edts" | b"mdia" | b"udta" | b"ilst" => {
+            b"moov" | b"edts" | b"mdia" | b"minf" | b"stbl" | b"udta" | b"ilst" => {
                 visit(input, content, next, depth, edits)?;
             }
             b"meta" if next - content >= 4 => visit(input, content + 4, next, depth, edits)?,
             b"----" => itunes_tag(input, content, next, edits)?,
+            b"stsd" => byte_order(input, next - content, edits)?,
             b"mvhd" | b"tkhd" | b"mdhd" | b"elst" if next - content >= 16 => {
                 number(input, &name, next - content, edits)?;
             }
@@ -153,6 +168,18 @@ fn number(
         (b"tkhd", Some(track)) => track.id = value,
         (b"mdhd", Some(track)) => track.timescale = value,
         _ => {}
+    }
+    Ok(())
+}
+
+/// Reads the byte order out of a sample description: version and flags, a count, and the first entry.
+fn byte_order(input: &mut impl Read, n_bytes: u64, edits: &mut Edits) -> io::Result<()> {
+    let mut entry = Vec::new();
+    input.take(n_bytes.min(MAX_DESCRIPTION_BYTES)).read_to_end(&mut entry)?;
+    let is_wide = matches!(entry.get(12..16), Some(b"in24" | b"in32" | b"fl32" | b"fl64"));
+    let enda = entry.windows(6).find(|bytes| bytes.starts_with(b"enda"));
+    if let Some(track) = edits.tracks.last_mut() {
+        track.is_big_endian = is_wide && enda.is_none_or(|enda| enda[4..] == [0, 0]);
     }
     Ok(())
 }

@@ -89,8 +89,62 @@ const OTHER_FORMATS: [(&[u8], &str); 13] = [
     (b"glTF", "it is a glTF model"),
 ];
 
+/// Starts of audio files, and of containers with audio, that nothing here reads: where the mark is, the mark, what the
+/// audio is, and the usual extension.
+const UNSUPPORTED: [(usize, &[u8], &str, &str); 26] = [
+    (0, b"wvpk", "WavPack", "wv"),
+    (0, b"TTA1", "True Audio (TTA)", "tta"),
+    (0, b"tBaK", "TAK", "tak"),
+    (0, b"MAC ", "Monkey's Audio", "ape"),
+    (0, b"MPCK", "Musepack", "mpc"),
+    (0, b"MP+", "Musepack", "mpc"),
+    (0, b"OFR ", "OptimFROG", "ofr"),
+    (0, b"DSD ", "DSD", "dsf"),
+    (0, b"FRM8", "DSD", "dff"),
+    (0, b"#!AMR", "AMR", "amr"),
+    (0, b"#!SILK", "SILK", "silk"),
+    (0, b".RMF", "RealMedia", "rm"),
+    (0, b".ra\xfd", "RealAudio", "ra"),
+    (0, b"\x7f\xfe\x80\x01", "DTS", "dts"),
+    (0, b"\xfe\x7f\x01\x80", "DTS", "dts"),
+    (0, b"\x1f\xff\xe8\x00", "DTS", "dts"),
+    (0, b"\xff\x1f\x00\xe8", "DTS", "dts"),
+    (4, b"\xf8\x72\x6f\xba", "TrueHD", "thd"),
+    (0, b"Creative Voice File", "in a Creative Voice File", "voc"),
+    (0, b" paf", "in an Ensoniq PARIS file", "paf"),
+    (0, b"fap ", "in an Ensoniq PARIS file", "paf"),
+    (0, b"\x64\xa3\x01\x00", "in an IRCAM file", "sf"),
+    (8, b"8SVX", "in an 8SVX file", "svx"),
+    (0, b"FLV\x01", "in a Flash video", "flv"),
+    (8, b"AVI ", "in an AVI video", "avi"),
+    (0, b"\x00\x00\x01\xba", "in an MPEG program stream", "mpg"),
+];
+/// Bytes of a packet of an MPEG transport stream, each of which begins with 47.
+const TRANSPORT_PACKET_BYTES: usize = 188;
+
+/// The error for audio that begins as a format that nothing here reads.
+fn unsupported(bytes: &[u8]) -> Option<AudioHeaderError> {
+    let has = |at: usize, mark: &[u8]| bytes.get(at..).is_some_and(|rest| rest.starts_with(mark));
+    let found = UNSUPPORTED.iter().find(|(at, mark, ..)| has(*at, mark));
+    let found = found.map(|(_, _, name, extension)| (*name, *extension)).or_else(|| {
+        let is_transport = (0..3).all(|i| bytes.get(i * TRANSPORT_PACKET_BYTES) == Some(&0x47));
+        // AC-3 has a bit stream identification of at most 10, E-AC-3 of at most 16.
+        let is_ac3 = has(0, b"\x0b\x77") && bytes.get(5).is_some_and(|byte| byte >> 3 <= 16);
+        is_transport
+            .then_some(("in an MPEG transport stream", "ts"))
+            .or(is_ac3.then_some(("AC-3", "ac3")))
+    });
+    found.map(|(name, extension)| {
+        let name = name.to_owned();
+        AudioHeaderError::UnsupportedCodec { name, extension }
+    })
+}
+
 /// The error for bytes that are surely of another format.
 pub(in crate::audio) fn other_format(bytes: &[u8]) -> Option<AudioHeaderError> {
+    if let Some(error) = unsupported(bytes) {
+        return Some(error);
+    }
     let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes).trim_ascii_start();
     let way_out = match text.first() {
         Some(b'<') => "was an error page saved as audio?",
@@ -123,7 +177,7 @@ pub(in crate::audio) fn unreadable(
     extension: &str,
     error: &Error,
 ) -> AudioHeaderError {
-    let known = [&b"RIFF"[..], b"FORM", b"fLaC", b"OggS", b"ID3"];
+    let known = [&b"RIFF"[..], b"FORM", b"fLaC", b"OggS", b"ID3", b"caff"];
     let mp4 = bytes.get(4..8) == Some(b"ftyp");
     // The bare start of a marker is a header cut short, too.
     let audio = mp4

@@ -1,4 +1,4 @@
-"""Writes the Opus and ALAC files beside it, with opusenc 1.4 (opus-tools 0.2) and FFmpeg 5.1.
+"""Writes the Opus, ALAC, AAC and QuickTime files beside it, with opusenc 1.4 (opus-tools 0.2) and FFmpeg 5.1.
 
     venv/bin/python encode.py
 """
@@ -65,3 +65,10 @@ with tempfile.TemporaryDirectory() as folder:
     soundfile.write(wav, music(1.01, 22_050, 2), 22_050, subtype="PCM_16")
     for name in ["alac.m4a", "alac.caf"]:
         run("ffmpeg", "-y", "-i", wav, "-c:a", "alac", "-bitexact", HERE / name)
+    # QuickTime's samples of more than 16 bits, high byte first unless the file says otherwise.
+    soundfile.write(wav, music(0.101, 8_000, 2), 8_000, subtype="FLOAT")
+    for name in ["s24be", "s32be", "f32be", "f64be", "f32le"]:
+        run("ffmpeg", "-y", "-i", wav, "-c:a", f"pcm_{name}", "-bitexact", HERE / f"mov_{name}.mov")
+    # A sample rate for which an MP4 header has no room.
+    soundfile.write(wav, music(0.31, 96_000, 1), 96_000, subtype="PCM_16")
+    run("ffmpeg", "-y", "-i", wav, "-c:a", "aac", "-aac_pns", "0", "-bitexact", HERE / "aac_96k.m4a")

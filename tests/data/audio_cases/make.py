@@ -19,7 +19,8 @@ HERE = pathlib.Path(__file__).parent
 WITH_FFMPEG = {
     "a03b_lame_without_frames.mp3", "a04_concatenated.mp3", "a12_data_size_0.wav",
     "a12b_riff36_data0.wav", "a31_adts.aac", "a33c_mp3.m4a",
-    "a47_asc_core_coder.m4a", "a55_vbri.mp3", "alac.caf", "alac.m4a", "half_flac.flac",
+    "a47_asc_core_coder.m4a", "a55_vbri.mp3", "aac_96k.m4a", "alac.caf", "alac.m4a", "half_flac.flac",
+    "mov_f32be.mov", "mov_f32le.mov", "mov_f64be.mov", "mov_s24be.mov", "mov_s32be.mov",
 }
 REFUSED = {"a08_vorbis_in.wav", "a34c_gsm.wav"}
 N_PLACES, N_VALUES = 40, 6
