@@ -120,7 +120,7 @@ struct File<'a> {
 }
 
 /// A key and its value.
-type Entry<'a> = (&'a String, &'a toml::Value);
+type ConfigEntry<'a> = (&'a String, &'a toml::Value);
 
 impl File<'_> {
     /// Refuses a section that is no stage's, and a key that no stage knows.
@@ -183,12 +183,12 @@ impl File<'_> {
         &self,
         mut command: Command,
         section: &str,
-        shared: &[Entry<'_>],
+        shared: &[ConfigEntry<'_>],
         own: Option<&toml::Value>,
     ) -> anyhow::Result<Command> {
         let path = &self.path;
         let own = own.and_then(toml::Value::as_table);
-        let is_kind = |(key, value): &Entry<'_>| {
+        let is_kind = |(key, value): &ConfigEntry<'_>| {
             value.is_table() && command.get_subcommands().any(|kind| kind.get_name() == *key)
         };
         let own_values: Vec<_> = own.into_iter().flatten().filter(|kv| !is_kind(kv)).collect();

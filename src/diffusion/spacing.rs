@@ -27,7 +27,7 @@ pub enum Spacing {
 
 /// One step of a sampler: from x_t to x at `next`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Step {
+pub struct SamplerStep {
     pub t: usize,
     /// Where the step leads; `None` is clean data, ᾱ = 1.
     pub next: Option<usize>,
@@ -74,11 +74,11 @@ pub fn steps(
     n_train: usize,
     n_steps: usize,
     spacing: Spacing,
-) -> Result<Vec<Step>, DiffusionError> {
+) -> Result<Vec<SamplerStep>, DiffusionError> {
     let t = timesteps(n_train, n_steps, spacing)?;
     let end = (spacing == Spacing::Reference).then_some(0);
     let next = t.iter().skip(1).map(|&t| Some(t)).chain([end]);
-    Ok(t.iter().zip(next).map(|(&t, next)| Step { t, next }).collect())
+    Ok(t.iter().zip(next).map(|(&t, next)| SamplerStep { t, next }).collect())
 }
 
 /// Returns a/b, b > 0, rounded to the nearest integer, halves to even.
@@ -113,7 +113,7 @@ mod tests {
     #[test]
     fn the_last_step_leads_to_clean_data_but_for_the_reference() {
         let of = |spacing| steps(20, 2, spacing).expect("steps");
-        let step = |t, next| Step { t, next };
+        let step = |t, next| SamplerStep { t, next };
         assert_eq!(of(Spacing::Trailing), [step(19, Some(9)), step(9, None)]);
         assert_eq!(of(Spacing::Leading), [step(10, Some(0)), step(0, None)]);
         assert_eq!(of(Spacing::Linspace), [step(19, Some(0)), step(0, None)]);

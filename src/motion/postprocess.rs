@@ -33,7 +33,7 @@ use super::channels::{Channel, MOTION_DIM};
 use super::kinematics::{Poses, forward_differences, frames_of};
 use super::phase::WRAP_BARS;
 use super::quaternion::Quaternion;
-use fusion::Measured;
+use fusion::FusionMeasurements;
 use smoothing::{Polynomials, moving_average};
 
 /// Channel groups that the reference clamps and smooths: all that are vectors.
@@ -109,7 +109,7 @@ pub fn process_holding(
 /// Puts the poses that agree best with all that was decoded in the place of the decoded ones.
 fn fuse(config: &PostProcessConfig, frames: &mut Array2<f32>, held: &HeldPoses) -> Displacement {
     let variances = config.fusion_variances.unwrap_or_default();
-    let measured = Measured::of(frames.view());
+    let measured = FusionMeasurements::of(frames.view());
     let shifts_m = measured.shifts(&variances, held);
     let mut position_m = measured.position.clone();
     for (p, shift) in position_m.as_flattened_mut().iter_mut().zip(shifts_m.as_flattened()) {

@@ -1,7 +1,8 @@
 //! A small report, and parts of others, for tests.
 
 use super::{
-    Against, CheckLine, Metric, Outcome, Paired, Report, Verdict, VerdictTest, Worst, better,
+    CheckLine, ComparedRun, Metric, Outcome, PairedNumber, Report, Verdict, VerdictTest,
+    WorstMotion, better,
 };
 
 /// Returns a number without an interval, of a hundred things.
@@ -161,19 +162,19 @@ pub(super) fn example() -> Report {
             metric("generated", "held_out", "diversity", "axes", Some(3.0)),
             Metric { unit: "m/s³".to_owned(), ..jerk },
         ],
-        worst: vec![Worst {
+        worst: vec![WorstMotion {
             name: "song 3".to_owned(),
             facts: vec![("seed".to_owned(), "7".to_owned())],
             failed: vec!["Mean jerk: 512".to_owned()],
             svg: "<svg xmlns=\"http://www.w3.org/2000/svg\"/>".to_owned(),
         }],
-        against: Some(Against {
+        against: Some(ComparedRun {
             run: "before".to_owned(),
             metrics: vec![
                 with_interval(fid_k("generated", 3.5), 3.25, 3.75),
                 locked("generated", "locking_p", 0.25),
             ],
-            paired: vec![Paired {
+            paired: vec![PairedNumber {
                 metric: "fid_k".to_owned(),
                 variant: "axes".to_owned(),
                 split: "held_out".to_owned(),

@@ -99,7 +99,7 @@ pub struct Verdict {
 
 /// Which way a number is better.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Better {
+pub enum BetterDirection {
     Higher,
     Lower,
     /// Neither: where the nearest to real motion is best, and where a number is there to read others by.
@@ -128,7 +128,7 @@ pub struct Metric {
     /// How it was measured.
     pub protocol: String,
     /// What [`better`] says of the metric, or what is known of one that it does not know.
-    pub better: Better,
+    pub better: BetterDirection,
 }
 
 impl Metric {
@@ -175,7 +175,7 @@ pub struct CheckLine {
 
 /// A motion worth looking at.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Worst {
+pub struct WorstMotion {
     pub name: String,
     /// Names and values, in the order in which they are listed.
     pub facts: Vec<(String, String)>,
@@ -187,7 +187,7 @@ pub struct Worst {
 
 /// A number of what was generated in both runs, compared song by song.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Paired {
+pub struct PairedNumber {
     pub metric: String,
     pub variant: String,
     pub split: String,
@@ -204,11 +204,11 @@ pub struct Paired {
 
 /// Another run to compare with.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Against {
+pub struct ComparedRun {
     pub run: String,
     pub metrics: Vec<Metric>,
     /// Differences of the numbers that could be paired by song.
-    pub paired: Vec<Paired>,
+    pub paired: Vec<PairedNumber>,
     /// Settings that differ: name, there, here.
     pub settings: Vec<(String, String, String)>,
 }
@@ -225,6 +225,6 @@ pub struct Report {
     pub notes: Vec<String>,
     pub checks: Vec<CheckLine>,
     pub metrics: Vec<Metric>,
-    pub worst: Vec<Worst>,
-    pub against: Option<Against>,
+    pub worst: Vec<WorstMotion>,
+    pub against: Option<ComparedRun>,
 }

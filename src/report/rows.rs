@@ -2,7 +2,7 @@
 
 use super::meaning::{self, is_asked, is_compat};
 use super::names::{self, ALL, HELD_OUT, OWN, is_truth};
-use super::{Better, Metric};
+use super::{BetterDirection, Metric};
 
 /// A number of every subject.
 #[derive(Clone, Debug, PartialEq)]
@@ -16,8 +16,8 @@ pub(super) struct Row<'a> {
 }
 
 impl Row<'_> {
-    pub fn better(&self) -> Better {
-        self.cells.iter().flatten().next().map_or(Better::Neither, |metric| metric.better)
+    pub fn better(&self) -> BetterDirection {
+        self.cells.iter().flatten().next().map_or(BetterDirection::Neither, |metric| metric.better)
     }
 
     pub fn is_compat(&self) -> bool {

@@ -20,7 +20,7 @@ const BAR_PX: f64 = 90.0;
 
 /// How many motions passed every check of a set.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Passed {
+pub(super) enum PassCount {
     Exactly {
         n_passed: usize,
         n: usize,
@@ -35,7 +35,7 @@ pub(super) enum Passed {
     NotMeasured,
 }
 
-impl Passed {
+impl PassCount {
     /// Looks for the pass rate of all motions, `strict_raw` of a set at a stage and `strict` of what it
     /// became in the end, then at the checks of the set that could have failed.
     pub fn of(report: &Report, stage: &str, set: &str) -> Self {
@@ -148,7 +148,7 @@ pub(super) fn section(out: &mut String, report: &Report) {
                  says</th></tr></thead>\n<tbody>\n",
                 Escaped(&capitalized(set)),
                 Escaped(&words(stage)),
-                Escaped(&Passed::of(report, stage, set).words())
+                Escaped(&PassCount::of(report, stage, set).words())
             );
             for line in lines(report, stage, set) {
                 row(out, line);
@@ -210,7 +210,7 @@ mod tests {
     use super::*;
 
     fn passed(report: &Report, set: &str) -> String {
-        Passed::of(report, "final", set).words()
+        PassCount::of(report, "final", set).words()
     }
 
     #[test]
@@ -234,10 +234,10 @@ mod tests {
         report.metrics = vec![of("held_out", 0.5, 4), of("all", 0.3, 10)];
         assert_eq!(passed(&report, "strict"), "3 of 10 (30 %)");
         // The rate of what came out in the end says nothing of what was decoded.
-        assert_eq!(Passed::of(&report, "raw", "strict"), Passed::NotMeasured);
+        assert_eq!(PassCount::of(&report, "raw", "strict"), PassCount::NotMeasured);
         let rate = metric("generated", "all", "pass_rate", "strict_raw", Some(0.25));
         report.metrics.push(Metric { n: 8, ..rate });
-        assert_eq!(Passed::of(&report, "raw", "strict").words(), "2 of 8 (25 %)");
+        assert_eq!(PassCount::of(&report, "raw", "strict").words(), "2 of 8 (25 %)");
         assert_eq!(passed(&report, "strict"), "3 of 10 (30 %)");
     }
 
@@ -280,7 +280,7 @@ mod tests {
         assert_eq!(stages(&checks), ["raw", "final", "draft"]);
         let report = Report { checks, ..Report::default() };
         let passed = ["raw", "final", "draft", "other"]
-            .map(|stage| Passed::of(&report, stage, "strict").words());
+            .map(|stage| PassCount::of(&report, stage, "strict").words());
         assert_eq!(
             passed,
             ["2 of 9 (22.2 %)", "8 of 9 (88.9 %)", "1 of 9 (11.1 %)", "not measured"]

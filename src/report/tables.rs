@@ -5,7 +5,7 @@ use super::meaning::{CHANNELS, Section, meaning_of};
 use super::names::{self, music, words};
 use super::numbers::{MISSING, interval, value};
 use super::rows::{Row, rows, subjects};
-use super::{BY_CONSTRUCTION, Better, Metric, Report, channels, chart};
+use super::{BY_CONSTRUCTION, BetterDirection, Metric, Report, channels, chart};
 
 /// What is said over variants that reproduce a published formula.
 const COMPAT: &str = "These reproduce a published formula that has a defect, a misplaced parenthesis in \
@@ -104,9 +104,9 @@ fn table(out: &mut String, rows: &[&Row], subjects: &[&str]) {
 fn heading(out: &mut String, row: &Row, n_columns: usize) {
     let meaning = meaning_of(row.metric);
     let way = match row.better() {
-        Better::Higher => "<em>↑ higher is better</em>",
-        Better::Lower => "<em>↓ lower is better</em>",
-        Better::Neither => "",
+        BetterDirection::Higher => "<em>↑ higher is better</em>",
+        BetterDirection::Lower => "<em>↓ lower is better</em>",
+        BetterDirection::Neither => "",
     };
     put!(
         out,

@@ -6,9 +6,9 @@ use super::comparison::{Pair, counts, family, pairs};
 use super::names::{ALL, music, words};
 use super::numbers::{difference, short, value};
 use super::rows::{Row, rows, subjects, telling_split};
-use super::sanity::{FINAL, Passed, SETS, lines, sets, stages};
+use super::sanity::{FINAL, PassCount, SETS, lines, sets, stages};
 use super::verdicts::shown;
-use super::{Against, BY_CONSTRUCTION, CheckLine, Outcome, Report};
+use super::{BY_CONSTRUCTION, CheckLine, ComparedRun, Outcome, Report};
 
 /// No line has more characters.
 const MAX_COLUMNS: usize = 120;
@@ -77,7 +77,7 @@ fn sanity(out: &mut String, report: &Report) {
         all.push(FINAL);
     }
     for stage in all {
-        let [reference, strict] = SETS.map(|set| Passed::of(report, stage, set).words());
+        let [reference, strict] = SETS.map(|set| PassCount::of(report, stage, set).words());
         put_line(
             out,
             format_args!("sanity, {stage} motion: reference {reference}, strict {strict}"),
@@ -178,7 +178,7 @@ fn table(out: &mut String, lines: &[Vec<String>]) {
     }
 }
 
-fn compared(out: &mut String, report: &Report, against: &Against) {
+fn compared(out: &mut String, report: &Report, against: &ComparedRun) {
     let pairs = pairs(report, against);
     out.push('\n');
     if pairs.is_empty() {
@@ -349,10 +349,10 @@ open  Is it like real motion? not measured
         let lost = VerdictTest { message: long.clone(), ..test(&long, Outcome::Lost, 1.0, 0.5) };
         report.verdicts = vec![verdict(&long, &long, Outcome::Lost, vec![lost])];
         report.notes = vec![long.clone()];
-        report.against = Some(Against {
+        report.against = Some(ComparedRun {
             run: long.clone(),
             settings: vec![(long.clone(), long.clone(), long)],
-            ..Against::default()
+            ..ComparedRun::default()
         });
         let text = terminal(&report);
         let lengths: Vec<usize> = text.lines().map(|line| line.chars().count()).collect();
@@ -380,7 +380,7 @@ open  Is it like real motion? not measured
                 unit: hostile.to_owned(),
                 ..metric(hostile, "all", "fid_k", hostile, Some(1.0))
             }],
-            against: Some(Against { run: hostile.to_owned(), ..Against::default() }),
+            against: Some(ComparedRun { run: hostile.to_owned(), ..ComparedRun::default() }),
             ..Report::default()
         };
         let text = terminal(&report);

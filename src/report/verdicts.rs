@@ -75,7 +75,7 @@ impl Verdict {
 
 /// A verdict as it is shown.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Shown<'a> {
+pub(super) struct VerdictView<'a> {
     pub outcome: Outcome,
     /// The question in plain words.
     pub question: String,
@@ -84,7 +84,7 @@ pub(super) struct Shown<'a> {
     pub tests: &'a [VerdictTest],
 }
 
-impl<'a> Shown<'a> {
+impl<'a> VerdictView<'a> {
     fn of(verdict: &'a Verdict) -> Self {
         Self {
             outcome: verdict.settled(),
@@ -143,20 +143,19 @@ fn question(verdict: &str) -> String {
 
 /// Returns the verdicts in the order in which they are shown; of those that every run has, a missing one is
 /// open.
-pub(super) fn shown(report: &Report) -> Vec<Shown<'_>> {
+pub(super) fn shown(report: &Report) -> Vec<VerdictView<'_>> {
     let order = |name: &str| {
         VERDICTS.iter().position(|(known, _)| *known == name).unwrap_or(VERDICTS.len())
     };
     let is_missing = |name: &&str| report.verdicts.iter().all(|found| found.verdict != **name);
     let missing = VERDICTS.iter().map(|(name, _)| *name).filter(is_missing).map(|name| {
         let (question, songs) = (question(name), String::new());
-        (order(name), 0, Shown { outcome: Outcome::Open, question, songs, tests: &[] })
+        (order(name), 0, VerdictView { outcome: Outcome::Open, question, songs, tests: &[] })
     });
-    let measured = report
-        .verdicts
-        .iter()
-        .map(|verdict| (order(&verdict.verdict), split_order(&verdict.split), Shown::of(verdict)));
-    let mut all: Vec<(usize, usize, Shown)> = measured.chain(missing).collect();
+    let measured = report.verdicts.iter().map(|verdict| {
+        (order(&verdict.verdict), split_order(&verdict.split), VerdictView::of(verdict))
+    });
+    let mut all: Vec<(usize, usize, VerdictView)> = measured.chain(missing).collect();
     let rank = |outcome| Outcome::ALL.iter().position(|known| *known == outcome);
     all.sort_by_key(|(verdict, split, shown)| (rank(shown.outcome), *verdict, *split));
     all.into_iter().map(|(.., shown)| shown).collect()
@@ -237,7 +236,8 @@ mod tests {
 
     #[test]
     fn the_reason_is_that_of_the_worst_test() {
-        let of = |outcome, tests| Shown::of(&verdict("sound", "all", outcome, tests)).reason_of();
+        let of =
+            |outcome, tests| VerdictView::of(&verdict("sound", "all", outcome, tests)).reason_of();
         let said = |text: &str, test: VerdictTest| VerdictTest { message: text.to_owned(), ..test };
         let tests = vec![
             said("A little over.", test("a", Lost, 1.1, 1.0)),
@@ -266,7 +266,7 @@ mod tests {
         assert_eq!(of(Won, Vec::new()).0, "Not measured.");
     }
 
-    impl Shown<'_> {
+    impl VerdictView<'_> {
         /// Returns the reason, the counts and the names of the tests that are lost.
         fn reason_of(&self) -> (String, String, Vec<String>) {
             let lost = self.with(Lost).iter().map(|test| test.test.clone()).collect();

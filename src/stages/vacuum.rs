@@ -6,7 +6,7 @@ use std::str::FromStr;
 use std::time::Duration;
 
 use super::{ClientParams, Contract, Progress, Stage, Summary};
-use crate::store::{self, Location, Vacuumed};
+use crate::store::{self, Location, VacuumRemovals};
 
 /// The stage.
 pub struct Vacuum;
@@ -77,12 +77,12 @@ struct VacuumSummary {
     store: String,
     older_than: Age,
     dry_run: bool,
-    done: Vacuumed,
+    done: VacuumRemovals,
 }
 
 impl Summary for VacuumSummary {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        let Vacuumed { paths, n_bytes, n_kept } = &self.done;
+        let VacuumRemovals { paths, n_bytes, n_kept } = &self.done;
         writeln!(out, "vacuum {}", self.store)?;
         if self.dry_run {
             for path in paths {
@@ -107,7 +107,7 @@ impl Summary for VacuumSummary {
     }
 
     fn figures(&mut self) -> serde_json::Value {
-        let Vacuumed { paths, n_bytes, n_kept } = &self.done;
+        let VacuumRemovals { paths, n_bytes, n_kept } = &self.done;
         serde_json::json!({
             "store": self.store,
             "dry_run": self.dry_run,

@@ -14,8 +14,8 @@ use xxhash_rust::xxh3::xxh3_64;
 use super::StoreError;
 use super::commit::{KEY_DIGITS, input_hash, program, publish_manifest, publish_part};
 use super::digest::digest_texts;
-use super::location::{Location, Put};
-use super::manifest::{COMPACTED_FORMAT, Compacted, Header, Item, Manifest};
+use super::location::{Location, PutOutcome};
+use super::manifest::{COMPACTED_FORMAT, CompactionOrigin, Header, Item, Manifest};
 use super::parquet_object::names;
 use super::part::{PartWriter, ROW_GROUP_ROWS};
 use super::reader::Snapshot;
@@ -57,7 +57,7 @@ struct Plan {
 }
 
 /// An item that is written anew.
-struct Live {
+struct LiveItem {
     item: Item,
     header: usize,
     commit: Arc<str>,
@@ -143,7 +143,7 @@ fn plan(log: StageLog, done: &mut Compaction) -> Result<Option<Plan>, StoreError
 
 /// The items of a chunk, and what the commits say that settled them.
 struct Chunk {
-    items: BTreeMap<String, Live>,
+    items: BTreeMap<String, LiveItem>,
     headers: Arc<Vec<Header>>,
     /// Hashes of the names of all items of the stage.
     known: Arc<HashSet<u64>>,
@@ -152,7 +152,7 @@ struct Chunk {
 /// Returns the live items of the commits that are written anew, by ranges of the stable hash of their names, as
 /// stages batch them.
 fn chunks(plan: &Plan) -> Result<Vec<Chunk>, StoreError> {
-    let mut chunks: BTreeMap<u64, BTreeMap<String, Live>> = BTreeMap::new();
+    let mut chunks: BTreeMap<u64, BTreeMap<String, LiveItem>> = BTreeMap::new();
     let mut headers: Vec<Header> = Vec::new();
     let mut places: HashMap<Header, usize> = HashMap::new();
     let mut known = HashSet::new();
@@ -165,7 +165,7 @@ fn chunks(plan: &Plan) -> Result<Vec<Chunk>, StoreError> {
         });
         let chunk = chunks.entry(batch_of(&word.item.id, plan.n_chunks)).or_default();
         let commit = Arc::clone(&commit.key);
-        chunk.insert(word.item.id.clone(), Live { item: word.item, header, commit });
+        chunk.insert(word.item.id.clone(), LiveItem { item: word.item, header, commit });
     })?;
     let (headers, known) = (Arc::new(headers), Arc::new(known));
     let chunk = |items| Chunk { items, headers: Arc::clone(&headers), known: Arc::clone(&known) };
@@ -193,7 +193,7 @@ fn write(
     let mut parts = Vec::new();
     for schema in schemas {
         let (name, version) = (schema.name, schema.version);
-        let mut rows = Rows::new(schema.clone());
+        let mut rows = PartRows::new(schema.clone());
         for commit in &commits {
             for part in commit.parts.iter().filter(|part| part.table == name) {
                 let live = LivePart {
@@ -230,7 +230,7 @@ fn write(
     }
     let manifest = manifest(stage, key, &commits, chunk, parts, items);
     match publish_manifest(store, &manifest)? {
-        Put::Written | Put::AlreadyThere => Ok(()),
+        PutOutcome::Written | PutOutcome::AlreadyThere => Ok(()),
     }
 }
 
@@ -262,7 +262,7 @@ fn manifest(
         origin: String::new(),
         parts,
         items,
-        compacted: Some(Compacted { generation, commits: headers, of }),
+        compacted: Some(CompactionOrigin { generation, commits: headers, of }),
     }
 }
 
@@ -285,14 +285,14 @@ fn key_of(stage: &str, schemas: &[TableSchema], commits: &BTreeSet<&str>, chunk:
 }
 
 /// Rows of a table on their way into a part, item by item.
-struct Rows {
+struct PartRows {
     schema: TableSchema,
     batches: Vec<RecordBatch>,
     /// Items, their batches, and their rows in those.
     runs: Vec<(String, usize, std::ops::Range<usize>)>,
 }
 
-impl Rows {
+impl PartRows {
     fn new(schema: TableSchema) -> Self {
         Self { schema, batches: Vec::new(), runs: Vec::new() }
     }

@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 
 use super::StoreError;
 use super::digest::digest_texts;
-use super::location::{Location, Put};
+use super::location::{Location, PutOutcome};
 use super::schema::{ColumnType, TableSchema, TimestampUs};
 use super::store_snapshot::{LivePart, StoreSnapshot};
 use super::tables;
@@ -126,7 +126,7 @@ fn write(store: &Location, schema: &TableSchema, parts: &[LivePart]) -> Result<b
             return Ok(false);
         };
         let path = format!("{}/{FOLDER}/{:020}.json", schema.name, log.next_version);
-        if store.put_new(&path, Bytes::from(text))? == Put::Written {
+        if store.put_new(&path, Bytes::from(text))? == PutOutcome::Written {
             return Ok(true);
         }
     }

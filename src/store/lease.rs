@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 
 use super::StoreError;
-use super::location::{Location, Put};
+use super::location::{Location, PutOutcome};
 use super::schema::TimestampUs;
 
 /// Folder of the leases.
@@ -26,7 +26,7 @@ const PAUSE: Duration = Duration::from_millis(500);
 
 /// Who holds a lease, and until when.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-struct Terms {
+struct LeaseTerms {
     holder: Holder,
     expires_us: i64,
     is_released: bool,
@@ -115,7 +115,8 @@ impl Lease {
                 Some((number, _)) => number + 1,
                 None => 1,
             };
-            if put(store, name, number, &Terms::new(&holder, lifetime))? == Put::Written {
+            if put(store, name, number, &LeaseTerms::new(&holder, lifetime))? == PutOutcome::Written
+            {
                 // A listing that was taken while numbers came and went may have missed the highest.
                 if latest(store, name)?.is_none_or(|(highest, _)| highest <= number) {
                     return Ok(Self::hold(store, name, holder, lifetime, number));
@@ -168,7 +169,7 @@ impl Drop for Lease {
         if state.is_lost {
             return;
         }
-        let terms = Terms {
+        let terms = LeaseTerms {
             holder: self.held.holder.clone(),
             expires_us: TimestampUs::now().0,
             is_released: true,
@@ -201,14 +202,19 @@ impl HeldLease {
             }
             let number = state.number + 1;
             let begun = Instant::now();
-            match put(&self.store, &self.name, number, &Terms::new(&self.holder, self.lifetime)) {
-                Ok(Put::Written) => {
+            match put(
+                &self.store,
+                &self.name,
+                number,
+                &LeaseTerms::new(&self.holder, self.lifetime),
+            ) {
+                Ok(PutOutcome::Written) => {
                     state.number = number;
                     valid_until = begun + self.lifetime;
                     drop(state);
                     self.forget_old(number);
                 }
-                Ok(Put::AlreadyThere) => {
+                Ok(PutOutcome::AlreadyThere) => {
                     state.is_lost = true;
                     return;
                 }
@@ -229,7 +235,7 @@ impl HeldLease {
     }
 }
 
-impl Terms {
+impl LeaseTerms {
     fn new(holder: &Holder, lifetime: Duration) -> Self {
         let lifetime_us = i64::try_from(lifetime.as_micros()).unwrap_or(i64::MAX);
         let expires_us = TimestampUs::now().0.saturating_add(lifetime_us);
@@ -310,7 +316,7 @@ fn number_of(path: &str) -> Option<u64> {
 }
 
 /// Returns the terms of the highest number, if the lease was ever taken.
-fn latest(store: &Location, name: &str) -> Result<Option<(u64, Terms)>, StoreError> {
+fn latest(store: &Location, name: &str) -> Result<Option<(u64, LeaseTerms)>, StoreError> {
     for _ in 0..8 {
         let listed = store.list(&folder(name))?;
         let numbers = listed.iter().filter_map(|l| Some((number_of(&l.path)?, &l.path)));
@@ -318,7 +324,7 @@ fn latest(store: &Location, name: &str) -> Result<Option<(u64, Terms)>, StoreErr
         // One that was renewed meanwhile is gone.
         let Some(bytes) = store.read_if_there(path)? else { continue };
         // What cannot be read is over as soon as somebody takes the next number.
-        let terms = serde_json::from_slice(&bytes).unwrap_or(Terms {
+        let terms = serde_json::from_slice(&bytes).unwrap_or(LeaseTerms {
             holder: Holder::default(),
             expires_us: 0,
             is_released: true,
@@ -329,7 +335,12 @@ fn latest(store: &Location, name: &str) -> Result<Option<(u64, Terms)>, StoreErr
     Err(StoreError::Held { what: name.to_owned(), holder })
 }
 
-fn put(store: &Location, name: &str, number: u64, terms: &Terms) -> Result<Put, StoreError> {
+fn put(
+    store: &Location,
+    name: &str,
+    number: u64,
+    terms: &LeaseTerms,
+) -> Result<PutOutcome, StoreError> {
     let text = serde_json::to_vec(terms).expect("invariant: terms are strings and numbers");
     store.put_new(&format!("{}/{number:010}.json", folder(name)), text.into())
 }

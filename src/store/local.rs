@@ -3,7 +3,7 @@
 use std::path::Path as FsPath;
 
 use super::StoreError;
-use super::location::{Listed, Put};
+use super::location::{ListedObject, PutOutcome};
 
 /// Start of the names of files being written. The dot keeps an abandoned one out of `*.parquet` globs
 /// and of listings.
@@ -58,22 +58,22 @@ fn sync_folder(folder: &FsPath) -> std::io::Result<()> {
 }
 
 /// Links a temporary file to its final name after fsync of the data, then fsyncs the folder.
-pub fn persist_new(file: tempfile::NamedTempFile, path: &FsPath) -> std::io::Result<Put> {
+pub fn persist_new(file: tempfile::NamedTempFile, path: &FsPath) -> std::io::Result<PutOutcome> {
     file.as_file().sync_all()?;
     match file.persist_noclobber(path) {
         Ok(_) => {}
         Err(e) if e.error.kind() == std::io::ErrorKind::AlreadyExists => {
-            return Ok(Put::AlreadyThere);
+            return Ok(PutOutcome::AlreadyThere);
         }
         Err(e) => return Err(e.error),
     }
     if let Some(folder) = path.parent() {
         sync_folder(folder)?;
     }
-    Ok(Put::Written)
+    Ok(PutOutcome::Written)
 }
 
-pub fn list(root: &FsPath, folder: &str) -> Result<Vec<Listed>, StoreError> {
+pub fn list(root: &FsPath, folder: &str) -> Result<Vec<ListedObject>, StoreError> {
     let start = root.join(folder);
     if !start.exists() {
         return Ok(Vec::new());
@@ -91,7 +91,7 @@ pub fn list(root: &FsPath, folder: &str) -> Result<Vec<Listed>, StoreError> {
             continue;
         };
         let size_bytes = entry.metadata().map(|m| m.len()).unwrap_or_default();
-        found.push(Listed { path: path.to_owned(), size_bytes });
+        found.push(ListedObject { path: path.to_owned(), size_bytes });
     }
     Ok(found)
 }

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::StoreError;
-use super::location::{Listed, Location};
+use super::location::{ListedObject, Location};
 
 /// Layout of the manifests of stages; raised when a field changes its meaning.
 pub(super) const MANIFEST_FORMAT: u32 = 1;
@@ -29,12 +29,12 @@ pub struct Manifest {
     pub items: Vec<Item>,
     /// Which commits settled the items, where compaction rewrote them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub compacted: Option<Compacted>,
+    pub compacted: Option<CompactionOrigin>,
 }
 
 /// Where the items of a compaction's commit come from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Compacted {
+pub struct CompactionOrigin {
     /// One more than the highest generation among the commits that were rewritten; 0 stands for none.
     pub generation: u32,
     /// The commits that settled the items.
@@ -119,7 +119,7 @@ impl Manifest {
             let (found, supported) = (manifest.format, COMPACTED_FORMAT);
             return Err(StoreError::ManifestFormat { place: place.to_owned(), found, supported });
         }
-        if let Some(Compacted { commits, of, .. }) = &manifest.compacted {
+        if let Some(CompactionOrigin { commits, of, .. }) = &manifest.compacted {
             let (n_items, n_of) = (manifest.items.len(), of.len());
             if n_items != n_of {
                 return Err(damaged(format!("{n_items} items have {n_of} commits")));
@@ -189,7 +189,7 @@ pub(super) fn stage_and_key(path: &str) -> Option<(&str, &str)> {
 }
 
 /// Reads manifests that a listing told of, in that order.
-pub(super) fn read(store: &Location, listed: &[Listed]) -> Result<Vec<Manifest>, StoreError> {
+pub(super) fn read(store: &Location, listed: &[ListedObject]) -> Result<Vec<Manifest>, StoreError> {
     let read = store.read_many(listed)?;
     listed
         .iter()

@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime};
 use super::StoreError;
 use super::commit::KEY_DIGITS;
 use super::delta;
-use super::location::{Listed, Location};
+use super::location::{ListedObject, Location};
 use super::manifest::{self, FOLDER, Manifest, Rank, stage_and_key};
 use super::stage_log::StageLog;
 use super::tables;
@@ -17,7 +17,7 @@ const ABANDONED: Duration = Duration::from_secs(24 * 3600);
 
 /// What vacuum removes.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Vacuumed {
+pub struct VacuumRemovals {
     /// Manifests and parts, below the store, in order.
     pub paths: Vec<String>,
     pub n_bytes: u64,
@@ -34,15 +34,15 @@ pub fn vacuum(
     store: &Location,
     older_than: Duration,
     dry_run: bool,
-) -> Result<Vacuumed, StoreError> {
+) -> Result<VacuumRemovals, StoreError> {
     let now = SystemTime::now();
     let is_old = |time: SystemTime, age: Duration| {
         // A clock that is behind that of the storage has seen no time pass.
         now.duration_since(time).unwrap_or_default() >= age
     };
     let parts = parts_of(store)?;
-    let mut done = Vacuumed::default();
-    let mut by_stage: BTreeMap<String, Vec<(Listed, SystemTime)>> = BTreeMap::new();
+    let mut done = VacuumRemovals::default();
+    let mut by_stage: BTreeMap<String, Vec<(ListedObject, SystemTime)>> = BTreeMap::new();
     for (listed, time) in store.list_with_times(FOLDER)? {
         if let Some((stage, _)) = stage_and_key(&listed.path) {
             by_stage.entry(stage.to_owned()).or_default().push((listed, time));
@@ -50,9 +50,9 @@ pub fn vacuum(
     }
     let named_by_delta = delta::active_paths(store)?;
     let mut keys: HashSet<String> = HashSet::new();
-    let mut dead: Vec<Dead> = Vec::new();
+    let mut dead: Vec<DeadCommit> = Vec::new();
     for (stage, listed) in by_stage {
-        let (listed, times): (Vec<Listed>, Vec<SystemTime>) = listed.into_iter().unzip();
+        let (listed, times): (Vec<ListedObject>, Vec<SystemTime>) = listed.into_iter().unzip();
         let manifests = manifest::read(store, &listed)?;
         keys.extend(manifests.iter().map(|manifest| manifest.key.clone()));
         let mut of_stage = Vec::new();
@@ -65,7 +65,7 @@ pub fn vacuum(
             }
             let parts = manifest.parts.iter().map(|part| (part.path.clone(), part.n_bytes));
             let manifest = (listed.path.clone(), listed.size_bytes);
-            of_stage.push(Dead { manifest, parts: parts.collect() });
+            of_stage.push(DeadCommit { manifest, parts: parts.collect() });
         }
         if !of_stage.is_empty() && !dry_run {
             // Readers whose catalogue counts what goes now would read all manifests.
@@ -75,7 +75,7 @@ pub fn vacuum(
         }
         dead.extend(of_stage);
     }
-    for Dead { manifest, parts: of_manifest } in dead {
+    for DeadCommit { manifest, parts: of_manifest } in dead {
         // The manifest first: a part without one is abandoned, and goes another time.
         for (path, n_bytes) in std::iter::once(manifest).chain(of_manifest) {
             remove(store, path, n_bytes, dry_run, &mut done)?;
@@ -96,7 +96,7 @@ pub fn vacuum(
 }
 
 /// A commit that goes: paths and sizes.
-struct Dead {
+struct DeadCommit {
     manifest: (String, u64),
     parts: Vec<(String, u64)>,
 }
@@ -106,7 +106,7 @@ fn remove(
     path: String,
     n_bytes: u64,
     dry_run: bool,
-    done: &mut Vacuumed,
+    done: &mut VacuumRemovals,
 ) -> Result<(), StoreError> {
     if !dry_run {
         store.remove(&path)?;
@@ -118,7 +118,7 @@ fn remove(
 
 /// Lists the parts of all tables. They are listed before the manifests, so that a part whose manifest comes
 /// meanwhile is not taken for abandoned.
-fn parts_of(store: &Location) -> Result<Vec<(Listed, SystemTime)>, StoreError> {
+fn parts_of(store: &Location) -> Result<Vec<(ListedObject, SystemTime)>, StoreError> {
     let mut parts = Vec::new();
     for schema in tables::all() {
         let listed = store.list_with_times(schema.name)?;
@@ -170,7 +170,7 @@ fn dead_since(manifests: &[Manifest], times: &[SystemTime]) -> Vec<(usize, Syste
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::store::{Item, manifest::Compacted};
+    use crate::store::{Item, manifest::CompactionOrigin};
 
     fn manifest(key: &str, sequence: u64, items: &[&str]) -> Manifest {
         Manifest {
@@ -198,7 +198,7 @@ mod tests {
         let third = manifest("c", 1, &["y"]);
         // A compaction of the second and the third, and one of that.
         let compacted = |key: &str, generation| Manifest {
-            compacted: Some(Compacted {
+            compacted: Some(CompactionOrigin {
                 generation,
                 commits: [&second, &third].map(|m| m.headers().remove(0)).to_vec(),
                 of: vec![0, 1],

@@ -11,7 +11,7 @@ use crate::store::{
 };
 
 use super::checkpoint::Progress;
-use super::drive::{Losses, Step};
+use super::drive::{Losses, StepResult};
 use super::error::TrainingError;
 
 /// What a row tells of.
@@ -40,7 +40,7 @@ pub struct Entry<'a> {
     pub step: u64,
     pub losses: &'a Losses,
     pub live_loss: Option<f64>,
-    pub taken: Option<&'a Step>,
+    pub taken: Option<&'a StepResult>,
     pub is_skipped: bool,
     pub samples_per_s: Option<f64>,
     pub data_wait_s: Option<f64>,

@@ -1,9 +1,9 @@
 //! A table in memory, its rows in the order that its schema names.
 
 use anyhow::{Context as _, bail};
+use arrow_array::ArrayRef;
 use arrow_array::cast::AsArray as _;
 use arrow_array::types::{Float32Type, Float64Type, Int32Type, Int64Type};
-use arrow_array::ArrayRef;
 use motiongen::store::{Column, ColumnType, Location, Snapshot, TableSchema};
 
 /// The values of a column, row by row.

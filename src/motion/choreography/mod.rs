@@ -33,7 +33,7 @@ pub use activity::activity;
 pub use beat_grid::{Beat, BeatGrid};
 pub use floor::Turn;
 pub use primitive::{Primitive, PrimitiveError, Repertoire};
-pub use selection::Step;
+pub use selection::DanceStep;
 
 /// Tempi that are danced to, beats per minute; the upper end is the beat tracker's own.
 pub const TEMPI_BPM: std::ops::RangeInclusive<f64> = 20.0..=320.0;
@@ -113,7 +113,7 @@ pub struct Dance {
     /// The 25 channels of every frame, shape `[T, 25]`.
     pub frames: Array2<f32>,
     /// What is danced when.
-    pub steps: Vec<Step>,
+    pub steps: Vec<DanceStep>,
     /// What turns when.
     pub turns: Vec<Turn>,
 }

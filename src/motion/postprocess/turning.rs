@@ -3,7 +3,7 @@
 use std::f64::consts::TAU;
 
 use super::banded::{Equation, SPAN, Solution};
-use super::fusion::{HeldPoses, Measured, size};
+use super::fusion::{FusionMeasurements, HeldPoses, size};
 use super::variances::{AxisVariances, FusionVariances};
 use crate::motion::quaternion::{
     Quaternion, angular_velocity, dot, from_rotation_vector, mul, normalize,
@@ -31,7 +31,7 @@ pub(super) struct Turning<'a> {
 }
 
 impl<'a> Turning<'a> {
-    pub fn new(measured: &'a Measured, held: &HeldPoses) -> Self {
+    pub fn new(measured: &'a FusionMeasurements, held: &HeldPoses) -> Self {
         let q = &measured.orientation;
         let norm = |q: &Quaternion| dot(*q, *q).sqrt();
         let has_direction: Vec<bool> =

@@ -38,7 +38,7 @@ const LENGTH_TOLERANCE: f64 = 0.1;
 
 /// A phrase that motion can be for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Phrase<'a> {
+pub struct ForeignPhrase<'a> {
     pub id: &'a str,
     /// The file with its music.
     pub url: &'a str,
@@ -121,7 +121,7 @@ pub struct ForeignMotion {
 ///
 /// # Errors
 /// When there is no such folder, or no motion in it.
-pub fn read(dir: &Path, phrases: &[Phrase]) -> anyhow::Result<ForeignMotions> {
+pub fn read(dir: &Path, phrases: &[ForeignPhrase]) -> anyhow::Result<ForeignMotions> {
     let place = dir.display();
     ensure!(
         dir.is_dir(),
@@ -197,13 +197,13 @@ impl ForeignMotions {
 
 /// A file that holds no motion, or none for a phrase.
 #[derive(Debug)]
-pub struct Refused {
+pub struct RefusedFile {
     /// Its path below the folder.
     pub name: String,
     pub failure: Failure,
 }
 
-impl Refused {
+impl RefusedFile {
     /// Names files by their paths below a folder.
     pub fn all(folder: &Path, files: impl IntoIterator<Item = (PathBuf, Failure)>) -> Vec<Self> {
         let name =
@@ -263,7 +263,7 @@ fn walk(dir: &Path, found: &mut ForeignMotions) -> std::io::Result<Vec<PathBuf>>
             }
             if entry.file_type()?.is_dir() {
                 folders.push(path);
-            } else if content::Format::of(&path).is_some() {
+            } else if content::ForeignFormat::of(&path).is_some() {
                 files.push(path);
             } else {
                 found.n_others += 1;

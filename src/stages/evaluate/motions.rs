@@ -73,7 +73,7 @@ pub fn has_run(snapshot: &StoreSnapshot, run: &str) -> Result<bool, StoreError> 
 }
 
 /// What the store says of phrases: their songs and beats.
-pub struct Phrases {
+pub struct PhraseIndex {
     rows: HashMap<String, PhraseRow>,
     /// Number of each song.
     songs: BTreeMap<String, usize>,
@@ -82,7 +82,7 @@ pub struct Phrases {
     activities: HashMap<String, Vec<f64>>,
 }
 
-impl Phrases {
+impl PhraseIndex {
     /// Reads the phrases of a store, and the beats of those that were danced to and of those with real motion.
     ///
     /// # Errors
@@ -108,13 +108,13 @@ impl Phrases {
     }
 
     /// Returns the phrases that motion of another program can be for, in order of name.
-    pub fn foreign_phrases(&self) -> Vec<foreign::Phrase<'_>> {
-        let mut found: BTreeMap<&str, foreign::Phrase> = BTreeMap::new();
+    pub fn foreign_phrases(&self) -> Vec<foreign::ForeignPhrase<'_>> {
+        let mut found: BTreeMap<&str, foreign::ForeignPhrase> = BTreeMap::new();
         #[expect(clippy::iter_over_hash_type, reason = "collected into a map that is in order")]
         for (id, row) in &self.rows {
             let n_frames = row.n_feature_frames.and_then(|n| usize::try_from(n).ok());
             let n_frames = n_frames.or(Some((row.duration_s * FPS) as usize));
-            found.insert(id, foreign::Phrase { id, url: url_of(row), n_frames });
+            found.insert(id, foreign::ForeignPhrase { id, url: url_of(row), n_frames });
         }
         found.into_values().collect()
     }

@@ -46,7 +46,7 @@ impl Evaluand {
         let settings = RunSettings::of_run(row, &model.card)?;
         let length = self.window_frames(truth);
         let windows = self.music_windows(split, length, most)?;
-        let request = baselines::Request {
+        let request = baselines::BaselineRequest {
             store,
             model: &model,
             settings: &settings,

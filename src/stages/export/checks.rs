@@ -7,7 +7,7 @@ use anyhow::Context as _;
 use ndarray::{Array3, ArrayView3, Axis, s};
 
 use super::Params;
-use super::files::Files;
+use super::files::ExportedFiles;
 use crate::autodiff::{Parameters, Stream};
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
 use crate::generation::{
@@ -17,7 +17,7 @@ use crate::model::{MotionDecoder, Parameter, ParameterList, UNet1D, condition};
 use crate::motion::MOTION_DIM;
 use crate::onnx::{Device, Model, Runtime, Storage, values_of};
 use crate::stages::Progress;
-use crate::stages::trained::Trained;
+use crate::stages::trained::TrainedRun;
 use crate::store::tables::OnnxCheckRow;
 use crate::store::{TimestampUs, write_file};
 use crate::training::Dataset;
@@ -44,8 +44,8 @@ const ROUNDING_TOLERANCE: f64 = 0.05;
 pub struct Checking<'a> {
     pub dataset: &'a Dataset,
     pub params: &'a Params,
-    pub trained: &'a Trained,
-    pub files: &'a Files,
+    pub trained: &'a TrainedRun,
+    pub files: &'a ExportedFiles,
 }
 
 /// What came of it.
@@ -143,7 +143,7 @@ impl Checking<'_> {
         rows.push(self.sampled("guided_sample", &onnx, &of_files, &music, &case, guided)?.0);
         progress.advance(1);
         if is_rounded {
-            let Trained { unet, decoder, .. } = self.trained;
+            let TrainedRun { unet, decoder, .. } = self.trained;
             let trained = eager_of((unet.parameters.clone(), decoder.parameters.clone()))?;
             let (row, _) =
                 self.sampled(ROUNDING, &trained, &of_files, &music, &case, asked(1.0))?;
@@ -317,7 +317,7 @@ impl Checking<'_> {
 
 /// Makes the engine of our own interpreter for a run's networks, with weights of UNet and decoder.
 pub fn eager(
-    trained: &Trained,
+    trained: &TrainedRun,
     (unet, decoder): (Parameters<f32>, Parameters<f32>),
     n_threads: NonZeroUsize,
 ) -> anyhow::Result<EagerEngine> {

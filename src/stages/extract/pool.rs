@@ -12,7 +12,7 @@ pub struct Budget {
 }
 
 /// A share of a [`Budget`], given back when it is dropped.
-pub struct Share<'a> {
+pub struct BudgetShare<'a> {
     budget: &'a Budget,
     bytes: u64,
 }
@@ -23,18 +23,18 @@ impl Budget {
     }
 
     /// Waits until `bytes` are free; who asks for more than there is waits to be alone.
-    pub fn take(&self, bytes: u64) -> Share<'_> {
+    pub fn take(&self, bytes: u64) -> BudgetShare<'_> {
         let bytes = bytes.min(self.total_bytes);
         let mut used = lock(&self.used_bytes);
         while *used + bytes > self.total_bytes {
             used = self.freed.wait(used).unwrap_or_else(PoisonError::into_inner);
         }
         *used += bytes;
-        Share { budget: self, bytes }
+        BudgetShare { budget: self, bytes }
     }
 }
 
-impl Drop for Share<'_> {
+impl Drop for BudgetShare<'_> {
     fn drop(&mut self) {
         *lock(&self.budget.used_bytes) -= self.bytes;
         self.budget.freed.notify_all();

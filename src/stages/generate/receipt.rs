@@ -9,7 +9,7 @@ use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
 
 use super::maker::Maker;
-use super::outputs::Format;
+use super::outputs::MotionFormat;
 use super::settings::MotionSettings;
 use crate::store::{digest_of, digest_texts, write_file};
 
@@ -55,7 +55,7 @@ impl Receipt {
     }
 
     /// Returns whether a folder has this motion in some formats, each file as it was written.
-    pub fn is_kept(&self, folder: &Path, name: &str, formats: &[Format]) -> bool {
+    pub fn is_kept(&self, folder: &Path, name: &str, formats: &[MotionFormat]) -> bool {
         let Some(known) = Self::read(folder, name).filter(|known| known.key == self.key) else {
             return false;
         };
@@ -69,7 +69,12 @@ impl Receipt {
     ///
     /// # Errors
     /// What the disk says.
-    pub fn keep(mut self, folder: &Path, name: &str, formats: &[Format]) -> anyhow::Result<()> {
+    pub fn keep(
+        mut self,
+        folder: &Path,
+        name: &str,
+        formats: &[MotionFormat],
+    ) -> anyhow::Result<()> {
         if let Some(known) = Self::read(folder, name).filter(|known| known.key == self.key) {
             self.files = known.files;
         }
@@ -94,7 +99,7 @@ fn place(folder: &Path, name: &str) -> PathBuf {
     folder.join(format!("{name}.{SUFFIX}"))
 }
 
-fn file(folder: &Path, name: &str, format: Format) -> PathBuf {
+fn file(folder: &Path, name: &str, format: MotionFormat) -> PathBuf {
     folder.join(format!("{name}.{}", format.extension()))
 }
 

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
-use super::songs::{Files, Song, slug, slug_of};
+use super::songs::{Song, SongFiles, slug, slug_of};
 use super::split::TRAIN;
 use crate::stages::Stage as _;
 use crate::stages::beats::{self, BeatSource};
@@ -13,7 +13,7 @@ use crate::store::{Location, Row, StoreError, StoreSnapshot, outdated_features};
 
 /// What a store knows.
 #[derive(Debug, Default)]
-pub struct Known {
+pub struct StoreContents {
     /// Phrases with audio and features.
     pub songs: BTreeMap<String, Song>,
     /// Phrases with audio, but without features.
@@ -30,7 +30,7 @@ pub struct Known {
     pub others: HashMap<String, String>,
 }
 
-impl Known {
+impl StoreContents {
     /// Reads the tables of a store; an empty one knows nothing.
     ///
     /// # Errors
@@ -88,7 +88,7 @@ impl Known {
                 fingerprint: format!("store {} {params_hash}", row.content_hash),
                 split: TRAIN,
                 problem,
-                files: Files::Store {
+                files: SongFiles::Store {
                     n_frames,
                     song_hash: row.song_hash.clone(),
                     beats: known_beats.in_bars(&row),

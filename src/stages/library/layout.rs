@@ -4,7 +4,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
-use super::one::{Constructed, Music};
+use super::one::{ConstructedPhrase, SongMusic};
 use super::songs::Song;
 use crate::motion::npy;
 use crate::motion::npz::NpzWriter;
@@ -29,13 +29,13 @@ or the store of `motiongen library` itself where that matters.
 ";
 
 /// A folder of phrases in the making.
-pub struct Output {
+pub struct PhraseFolder {
     folder: PathBuf,
     /// Lines of the table of splits.
     splits: Mutex<Vec<String>>,
 }
 
-impl Output {
+impl PhraseFolder {
     /// Starts a folder.
     ///
     /// # Errors
@@ -49,8 +49,13 @@ impl Output {
     ///
     /// # Errors
     /// What the file system says.
-    pub fn write(&self, song: &Song, music: &Music, phrase: &Constructed) -> io::Result<()> {
-        let Constructed { id, motion, features, beats, later_beats, .. } = phrase;
+    pub fn write(
+        &self,
+        song: &Song,
+        music: &SongMusic,
+        phrase: &ConstructedPhrase,
+    ) -> io::Result<()> {
+        let ConstructedPhrase { id, motion, features, beats, later_beats, .. } = phrase;
         let values: Vec<f32> = motion.iter().copied().collect();
         let trajectory = npy::write(&[motion.nrows(), motion.ncols()], &values);
         write_file(&self.folder.join(format!("motion/{id}/trajectory.npy")), |out| {

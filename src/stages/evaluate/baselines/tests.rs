@@ -183,7 +183,7 @@ impl Bench {
         seed: u64,
         n_threads: usize,
     ) -> anyhow::Result<Vec<BaselineMotion>> {
-        let request = Request {
+        let request = BaselineRequest {
             store: &self.store,
             model: &self.model,
             settings: &self.settings(),
@@ -296,7 +296,7 @@ fn what_was_sampled_is_read_again_and_what_is_broken_sampled_again() {
     let mut other = motions.clone();
     other[1].frames[[2, 3]] = 7.5;
     let settings = bench.settings();
-    let request = Request {
+    let request = BaselineRequest {
         store: &bench.store,
         model: &bench.model,
         settings: &settings,
@@ -330,7 +330,7 @@ fn a_digest_is_that_of_everything_that_determines_the_motion() {
     let windows = windows();
     let settings = bench.settings();
     let digest = |baseline, seed, windows: &[MusicWindow], settings: &RunSettings| {
-        let request = Request {
+        let request = BaselineRequest {
             store: &bench.store,
             model: &bench.model,
             settings,
@@ -365,7 +365,7 @@ fn a_digest_is_that_of_everything_that_determines_the_motion() {
     other.card.weights_sha256.unet = "another".to_owned();
     assert_ne!(weights_digest(&other.card), weights_digest(&bench.model.card));
     let of_other = |baseline| {
-        let request = Request {
+        let request = BaselineRequest {
             store: &bench.store,
             model: &other,
             settings: &settings,

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use super::Phrase;
+use super::ForeignPhrase;
 use crate::stages::ingest::is_audio;
 
 /// Most digits of a sample's number.
@@ -20,7 +20,7 @@ pub struct Names<'a> {
 }
 
 impl<'a> Names<'a> {
-    pub fn new(phrases: &'a [Phrase]) -> Self {
+    pub fn new(phrases: &'a [ForeignPhrase]) -> Self {
         let (mut whole, mut last, mut audio) = (HashMap::new(), HashMap::new(), HashMap::new());
         for (i, phrase) in phrases.iter().enumerate() {
             // Whole names first, so that no phrase `a.ogg` takes the name of a phrase `a`.

@@ -23,7 +23,7 @@ impl Bench {
         path.display().to_string()
     }
 
-    fn read(&self, phrases: &[Phrase]) -> ForeignMotions {
+    fn read(&self, phrases: &[ForeignPhrase]) -> ForeignMotions {
         read(self.dir(), phrases).expect("motions")
     }
 
@@ -45,8 +45,8 @@ impl Bench {
     }
 }
 
-fn phrase(id: &str) -> Phrase<'_> {
-    Phrase { id, url: "", n_frames: None }
+fn phrase(id: &str) -> ForeignPhrase<'_> {
+    ForeignPhrase { id, url: "", n_frames: None }
 }
 
 /// Motion whose values are all different.
@@ -202,7 +202,7 @@ fn a_capture_is_read_as_ingest_reads_it() {
 }
 
 /// Returns the phrase and sample that a file of each name is for, by the file's name.
-fn matched(names: &[&str], phrases: &[Phrase]) -> BTreeMap<String, (String, usize)> {
+fn matched(names: &[&str], phrases: &[ForeignPhrase]) -> BTreeMap<String, (String, usize)> {
     let bench = Bench::new();
     for name in names {
         bench.put(name, "x");
@@ -225,7 +225,7 @@ fn files_belong_to_phrases_by_their_names() {
         phrase("song.t1.2"),
         phrase("song"),
         phrase("x/0"),
-        Phrase { url: "file:///music/deep/Tune.flac", ..phrase("tune of June") },
+        ForeignPhrase { url: "file:///music/deep/Tune.flac", ..phrase("tune of June") },
     ];
     let cases = [
         // The name, with and without the extension of the audio.
@@ -341,7 +341,7 @@ fn a_motion_much_longer_or_shorter_than_its_music_has_a_note() {
     let note = |n_frames: usize, n_music: Option<usize>| {
         let bench = Bench::new();
         let place = bench.put("a.npy", npy_of(&ramp(n_frames)));
-        let found = bench.read(&[Phrase { n_frames: n_music, ..phrase("a") }]);
+        let found = bench.read(&[ForeignPhrase { n_frames: n_music, ..phrase("a") }]);
         let note = found.files[0].read().expect("a motion").note?;
         Some(note.strip_prefix(&place).expect("the file's name").to_owned())
     };
