@@ -78,7 +78,7 @@ fn tensors<'a, E: Element>(
     sections: &[Section<'a, E>],
     precision: Precision,
 ) -> Vec<(String, SavedParameter<'a, E>)> {
-    let of = |&section: &Section<'a, E>| {
+    let parameters_of = |&section: &Section<'a, E>| {
         section.plan.list().iter().map(move |(id, parameter)| {
             (
                 format!("{}{}", section.prefix, parameter.name),
@@ -86,7 +86,7 @@ fn tensors<'a, E: Element>(
             )
         })
     };
-    sections.iter().flat_map(of).collect()
+    sections.iter().flat_map(parameters_of).collect()
 }
 
 fn header(metadata: &BTreeMap<String, String>) -> Option<HashMap<String, String>> {

@@ -230,8 +230,8 @@ fn keys(command: &Command) -> Vec<&str> {
         .filter(|a| !matches!(a.get_action(), ArgAction::Count))
         .filter_map(Arg::get_long)
         .filter(|flag| !["help", "version", FLAG].contains(flag));
-    let of_kinds = command.get_subcommands().flat_map(keys);
-    own.chain(of_kinds).filter(|flag| seen.insert(*flag)).collect()
+    let kind_keys = command.get_subcommands().flat_map(keys);
+    own.chain(kind_keys).filter(|flag| seen.insert(*flag)).collect()
 }
 
 fn unknown_key(command: &Command, section: &str, key: &str) -> String {

@@ -237,9 +237,10 @@ fn run_stage<S: Stage>(matches: &ArgMatches) -> ExitCode {
 
 /// Returns whether the file that a stage writes is standard output.
 fn writes_to_standard_output(matches: &ArgMatches) -> bool {
-    let of_kind = matches.subcommand().is_some_and(|(_, kind)| writes_to_standard_output(kind));
+    let is_kind_output =
+        matches.subcommand().is_some_and(|(_, kind)| writes_to_standard_output(kind));
     let named = OUTPUTS.iter().filter_map(|id| matches.try_get_raw(id).ok().flatten());
-    of_kind || named.flatten().any(|value| is_standard_output(Path::new(value)))
+    is_kind_output || named.flatten().any(|value| is_standard_output(Path::new(value)))
 }
 
 /// Parameters that name one file to be written.

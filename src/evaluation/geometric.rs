@@ -68,8 +68,8 @@ impl GeometricThresholds {
     /// Takes the quantiles over all frames of the ground truth, given in chunks; none without frames.
     pub fn fit<'a>(chunks: impl IntoIterator<Item = &'a Poses>) -> Option<Self> {
         let all: Vec<Quantities> = chunks.into_iter().flat_map(quantities).collect();
-        let quantile = |of: fn(&Quantities) -> f64, p: f64| {
-            percentile(&mut all.iter().map(of).collect::<Vec<_>>(), p)
+        let quantile = |quantity: fn(&Quantities) -> f64, p: f64| {
+            percentile(&mut all.iter().map(quantity).collect::<Vec<_>>(), p)
         };
         Some(Self {
             speed_q50_m_s: quantile(|x| x.speed, 50.0)?,
@@ -242,19 +242,19 @@ mod tests {
                 .collect(),
         };
         let found = geometric_features(&poses, &THRESHOLDS).expect("frames");
-        let of =
+        let feature =
             |name: &str| found[GEOMETRIC_NAMES.iter().position(|n| *n == name).expect("a feature")];
         for name in ["speed_above_q50", "speed_above_q90", "climbing_or_diving", "rolling"] {
-            assert_eq!(of(name), 1.0, "{name}");
+            assert_eq!(feature(name), 1.0, "{name}");
         }
         for name in ["radial", "high", "speeding_up"] {
-            assert_eq!(of(name), 1.0, "{name}");
+            assert_eq!(feature(name), 1.0, "{name}");
         }
         assert_eq!(
-            (of("yawing"), of("pitching"), of("forward"), of("curved")),
+            (feature("yawing"), feature("pitching"), feature("forward"), feature("curved")),
             (0.0, 0.0, 0.0, 0.0)
         );
-        assert!(of("sideways") > 0.5, "as long as the roll leaves x aside");
+        assert!(feature("sideways") > 0.5, "as long as the roll leaves x aside");
     }
 
     #[test]

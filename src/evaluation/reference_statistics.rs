@@ -189,7 +189,8 @@ impl ReferenceStatistics {
             all.extend(chunks(whole.len()).map(|chunk| part(&whole, chunk)));
         }
         let thresholds = GeometricThresholds::fit(&all)?;
-        let of = |set: FeatureSet| FeatureStatistics::fit(set.stacked(&all, &thresholds).view());
+        let statistics_of =
+            |set: FeatureSet| FeatureStatistics::fit(set.stacked(&all, &thresholds).view());
         Some(Self {
             version: REFERENCE_VERSION,
             data_hash,
@@ -200,11 +201,11 @@ impl ReferenceStatistics {
             body_radius_m: BODY_RADIUS_M,
             thresholds,
             window_range: WindowRange::fit(&postures)?,
-            axes: of(FeatureSet::Axes)?,
-            axes_compat: of(FeatureSet::AxesCompat)?,
-            markers: of(FeatureSet::Markers)?,
-            markers_compat: of(FeatureSet::MarkersCompat)?,
-            geometric: of(FeatureSet::Geometric)?,
+            axes: statistics_of(FeatureSet::Axes)?,
+            axes_compat: statistics_of(FeatureSet::AxesCompat)?,
+            markers: statistics_of(FeatureSet::Markers)?,
+            markers_compat: statistics_of(FeatureSet::MarkersCompat)?,
+            geometric: statistics_of(FeatureSet::Geometric)?,
         })
     }
 

@@ -247,17 +247,17 @@ fn smooth_columns(
 
 fn vectors(frames: &Array2<f32>, channel: Channel) -> Vec<[f64; 3]> {
     let start = channel.range().start;
-    let of_row = |row: ndarray::ArrayView1<'_, f32>| {
+    let to_vector = |row: ndarray::ArrayView1<'_, f32>| {
         std::array::from_fn(|axis| f64::from(row[start + axis]))
     };
-    frames.rows().into_iter().map(of_row).collect()
+    frames.rows().into_iter().map(to_vector).collect()
 }
 
 fn quaternions(frames: &Array2<f32>) -> Vec<Quaternion> {
     let start = Channel::Quaternion.range().start;
-    let of_row =
+    let to_quaternion =
         |row: ndarray::ArrayView1<'_, f32>| std::array::from_fn(|c| f64::from(row[start + c]));
-    frames.rows().into_iter().map(of_row).collect()
+    frames.rows().into_iter().map(to_quaternion).collect()
 }
 
 fn write_vectors(frames: &mut Array2<f32>, channel: Channel, vectors: &[[f64; 3]]) {

@@ -53,7 +53,7 @@ pub(super) struct Line {
 
 /// Returns the curves of a panel; none of [`MotionPanel::Path`].
 pub(super) fn lines(panel: MotionPanel, motion: &Trajectory) -> Vec<Line> {
-    let of = |channel: Channel, parts: &[(&'static str, Rgb)]| -> Vec<Line> {
+    let lines_of = |channel: Channel, parts: &[(&'static str, Rgb)]| -> Vec<Line> {
         let group = motion.channel(channel);
         let columns = group.columns().into_iter().zip(parts);
         columns
@@ -62,12 +62,12 @@ pub(super) fn lines(panel: MotionPanel, motion: &Trajectory) -> Vec<Line> {
     };
     let alone = |values: Array1<f32>| vec![Line { label: "", color: BLUE, values }];
     match panel {
-        MotionPanel::Position => of(Channel::Position, &AXES),
-        MotionPanel::Velocity => of(Channel::Velocity, &AXES),
-        MotionPanel::Acceleration => of(Channel::Acceleration, &AXES),
-        MotionPanel::AngularVelocity => of(Channel::AngularVelocity, &AXES),
-        MotionPanel::Quaternion => of(Channel::Quaternion, &[&[W][..], &AXES].concat()),
-        MotionPanel::Phase => of(Channel::Phase, &[("", BLUE)]),
+        MotionPanel::Position => lines_of(Channel::Position, &AXES),
+        MotionPanel::Velocity => lines_of(Channel::Velocity, &AXES),
+        MotionPanel::Acceleration => lines_of(Channel::Acceleration, &AXES),
+        MotionPanel::AngularVelocity => lines_of(Channel::AngularVelocity, &AXES),
+        MotionPanel::Quaternion => lines_of(Channel::Quaternion, &[&[W][..], &AXES].concat()),
+        MotionPanel::Phase => lines_of(Channel::Phase, &[("", BLUE)]),
         MotionPanel::QuaternionNorm => {
             let quaternions = motion.channel(Channel::Quaternion);
             let rows = quaternions.rows().into_iter();

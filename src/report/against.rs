@@ -119,14 +119,15 @@ mod tests {
 
     #[test]
     fn what_differs_is_seen_and_the_rest_is_folded_away() {
-        let of = |x: f64| with_interval(metric("generated", "all", "fid_k", "axes", Some(x)), x, x);
+        let fid_metric =
+            |x: f64| with_interval(metric("generated", "all", "fid_k", "axes", Some(x)), x, x);
         let jerk = |x| Metric {
             unit: "m/s³".to_owned(),
             ..metric("generated", "held_out", "jerk_mean", "", x)
         };
         let against = ComparedRun {
             run: "<old>".to_owned(),
-            metrics: vec![of(2.5), jerk(Some(3.0))],
+            metrics: vec![fid_metric(2.5), jerk(Some(3.0))],
             paired: vec![PairedNumber {
                 metric: "fid_k".to_owned(),
                 variant: "axes".to_owned(),
@@ -139,7 +140,7 @@ mod tests {
             }],
             settings: vec![("steps".to_owned(), "20".to_owned(), "<50>".to_owned())],
         };
-        let told = told(vec![of(1.5), jerk(Some(4.0))], &against);
+        let told = told(vec![fid_metric(1.5), jerk(Some(4.0))], &against);
         let (seen, folded) = told.split_once("<details>").expect("details");
         for wanted in [
             "<h2>Compared with &lt;old&gt;</h2>",
@@ -163,10 +164,14 @@ mod tests {
 
     #[test]
     fn without_pairs_nothing_is_called_better() {
-        let of = |x: f64| with_interval(metric("generated", "all", "fid_k", "axes", Some(x)), x, x);
-        let against =
-            ComparedRun { run: "b".to_owned(), metrics: vec![of(9.5)], ..ComparedRun::default() };
-        let told = told(vec![of(1.5)], &against);
+        let fid_metric =
+            |x: f64| with_interval(metric("generated", "all", "fid_k", "axes", Some(x)), x, x);
+        let against = ComparedRun {
+            run: "b".to_owned(),
+            metrics: vec![fid_metric(9.5)],
+            ..ComparedRun::default()
+        };
+        let told = told(vec![fid_metric(1.5)], &against);
         assert!(told.contains("<p>No number is paired song by song, so that none is called"));
         assert!(told.contains("<p>Nothing is shown to differ.</p>"));
         assert!(!told.contains("good") && !told.contains(">better<"), "{told}");

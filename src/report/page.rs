@@ -169,13 +169,18 @@ mod tests {
         let mut report = example();
         for (i, (subject, _)) in SUBJECTS.into_iter().enumerate() {
             let x = 0.1 + 0.1 * i as f64;
-            let of = |name, value| metric(subject, "held_out", name, "", value);
-            let coupled = with_interval(of("coupling_ratio", Some(x)), x - 0.05, x + 0.05);
+            let held_out_metric = |name, value| metric(subject, "held_out", name, "", value);
+            let coupled =
+                with_interval(held_out_metric("coupling_ratio", Some(x)), x - 0.05, x + 0.05);
             let relocked = Metric {
                 protocol: format!("the phase was relocked, {BY_CONSTRUCTION}"),
-                ..of("phase_error", None)
+                ..held_out_metric("phase_error", None)
             };
-            report.metrics.extend([coupled, relocked, of("share_upright", Some(1.1 - x))]);
+            report.metrics.extend([
+                coupled,
+                relocked,
+                held_out_metric("share_upright", Some(1.1 - x)),
+            ]);
         }
         std::fs::write(file, page(&report)).expect("written");
     }

@@ -39,9 +39,9 @@ impl PassCount {
     /// Looks for the pass rate of all motions, `strict_raw` of a set at a stage and `strict` of what it
     /// became in the end, then at the checks of the set that could have failed.
     pub fn of(report: &Report, stage: &str, set: &str) -> Self {
-        let of_stage = format!("{set}_{stage}");
+        let stage_variant = format!("{set}_{stage}");
         let named = |variant: &str| find(&report.metrics, OWN, ["pass_rate", variant], ALL);
-        let rate = named(&of_stage).or_else(|| named(set).filter(|_| stage == FINAL));
+        let rate = named(&stage_variant).or_else(|| named(set).filter(|_| stage == FINAL));
         if let Some((rate, n)) = rate.and_then(|metric| Some((metric.finite()?, metric.n))) {
             let n_passed = (rate * n as f64).round();
             return Self::Exactly {
@@ -66,13 +66,13 @@ impl PassCount {
 
     /// Returns it in a few words: `118 of 120 (98.3 %)`.
     pub fn words(self) -> String {
-        let of = |n_passed: usize, n: usize| match n {
+        let share_text = |n_passed: usize, n: usize| match n {
             0 => format!("{n_passed} of {n}"),
             _ => format!("{n_passed} of {n} ({})", percent(n_passed as f64 / n as f64)),
         };
         match self {
-            Self::Exactly { n_passed, n } => of(n_passed, n),
-            Self::AtMost { n_passed, n } => format!("at most {}", of(n_passed, n)),
+            Self::Exactly { n_passed, n } => share_text(n_passed, n),
+            Self::AtMost { n_passed, n } => format!("at most {}", share_text(n_passed, n)),
             Self::ByConstruction => format!("all are true {BY_CONSTRUCTION}"),
             Self::NotMeasured => "not measured".to_owned(),
         }
@@ -227,11 +227,11 @@ mod tests {
         assert_eq!(passed(&report, "reference"), "9 of 10 (90 %)");
         assert_eq!(passed(&report, "strict"), "at most 4 of 10 (40 %)");
         assert_eq!(passed(&report, "other"), "not measured");
-        let of = |split: &str, rate: f64, n: i64| Metric {
+        let pass_rate = |split: &str, rate: f64, n: i64| Metric {
             n,
             ..metric("generated", split, "pass_rate", "strict", Some(rate))
         };
-        report.metrics = vec![of("held_out", 0.5, 4), of("all", 0.3, 10)];
+        report.metrics = vec![pass_rate("held_out", 0.5, 4), pass_rate("all", 0.3, 10)];
         assert_eq!(passed(&report, "strict"), "3 of 10 (30 %)");
         // The rate of what came out in the end says nothing of what was decoded.
         assert_eq!(PassCount::of(&report, "raw", "strict"), PassCount::NotMeasured);

@@ -32,11 +32,11 @@ pub(super) fn metrics(out: &mut String, report: &Report) {
     legend(out, &subjects);
     let rows = rows(&report.metrics, &subjects);
     for section in sections(report) {
-        let of_section: Vec<&Row> =
+        let section_rows: Vec<&Row> =
             rows.iter().filter(|row| meaning_of(row.metric).section == section).collect();
         put!(out, "<section id=\"{}\">\n<h2>{}</h2>\n", section.id(), section.heading());
         let (channels, numbers): (Vec<&Row>, Vec<&Row>) =
-            of_section.into_iter().partition(|row| row.metric == CHANNELS);
+            section_rows.into_iter().partition(|row| row.metric == CHANNELS);
         let (compat, plain): (Vec<&Row>, Vec<&Row>) =
             numbers.into_iter().partition(|row| row.is_compat());
         table(out, &plain, &subjects);
@@ -187,8 +187,8 @@ fn channel_figures(out: &mut String, rows: &[&Row]) {
         meaning.ideal
     );
     for split in splits {
-        let of_split: Vec<&Row> = rows.iter().copied().filter(|row| row.split == split).collect();
-        channels::bars(out, &of_split, &music(split));
+        let split_rows: Vec<&Row> = rows.iter().copied().filter(|row| row.split == split).collect();
+        channels::bars(out, &split_rows, &music(split));
     }
     put!(out, "</div>\n");
 }

@@ -174,7 +174,7 @@ mod tests {
 
     #[test]
     fn a_verdict_is_won_only_where_every_test_is() {
-        let of = |outcome: Outcome, tests: &[Outcome]| {
+        let settled_outcome = |outcome: Outcome, tests: &[Outcome]| {
             let tests = tests.iter().map(|outcome| test("t", *outcome, 0.5, 1.0)).collect();
             verdict("varied", "all", outcome, tests).settled()
         };
@@ -190,7 +190,7 @@ mod tests {
             (Lost, &[], Lost),
         ];
         for (outcome, tests, wanted) in cases {
-            assert_eq!(of(outcome, tests), wanted, "{outcome:?} {tests:?}");
+            assert_eq!(settled_outcome(outcome, tests), wanted, "{outcome:?} {tests:?}");
         }
         // A win that rests on no number.
         for value in [None, Some(f64::NAN)] {
@@ -236,7 +236,7 @@ mod tests {
 
     #[test]
     fn the_reason_is_that_of_the_worst_test() {
-        let of =
+        let reason_for =
             |outcome, tests| VerdictView::of(&verdict("sound", "all", outcome, tests)).reason_of();
         let said = |text: &str, test: VerdictTest| VerdictTest { message: text.to_owned(), ..test };
         let tests = vec![
@@ -247,23 +247,23 @@ mod tests {
             said("Nothing known.", VerdictTest { limit: None, ..test("e", Lost, 9.0, 1.0) }),
             said("Too few.", VerdictTest { value: None, ..test("f", Open, 0.0, 1.0) }),
         ];
-        let (reason, counts, order) = of(Lost, tests);
+        let (reason, counts, order) = reason_for(Lost, tests);
         assert_eq!(reason, "Of the wrong sign.");
         assert_eq!(counts, "6 tests: 4 lost, 1 open, 1 won");
         assert_eq!(order, ["c", "d", "a", "e"]);
 
         let empty = VerdictTest { value: None, ..test("f", Open, 0.0, 0.25) };
-        let (reason, counts, _) = of(Won, vec![test("b", Won, 0.5, 1.0), empty]);
+        let (reason, counts, _) = reason_for(Won, vec![test("b", Won, 0.5, 1.0), empty]);
         assert_eq!(reason, "what is measured not measured, wanted at most 0.25 m");
         assert_eq!(counts, "2 tests: 1 open, 1 won");
         let won = || test("b", Won, 0.5, 1.0);
-        assert_eq!(of(Won, vec![won(), won()]).0, "All 2 tests that it rests on hold.");
-        let (reason, counts, _) = of(Won, vec![won()]);
+        assert_eq!(reason_for(Won, vec![won(), won()]).0, "All 2 tests that it rests on hold.");
+        let (reason, counts, _) = reason_for(Won, vec![won()]);
         assert_eq!(reason, "The test that it rests on holds.");
         assert_eq!(counts, "1 test: 1 won");
-        assert_eq!(of(Lost, vec![won()]).0, "None of its tests says why.");
-        assert_eq!(of(Open, vec![won()]).0, "Not enough was measured to tell.");
-        assert_eq!(of(Won, Vec::new()).0, "Not measured.");
+        assert_eq!(reason_for(Lost, vec![won()]).0, "None of its tests says why.");
+        assert_eq!(reason_for(Open, vec![won()]).0, "Not enough was measured to tell.");
+        assert_eq!(reason_for(Won, Vec::new()).0, "Not measured.");
     }
 
     impl VerdictView<'_> {

@@ -298,9 +298,9 @@ mod tests {
     fn rows_have_the_nearest_frame_and_none_behind_the_last() {
         let beats = [(0.05, Some(4)), (1.04, Some(1)), (2.0, None)];
         let found: Vec<_> = rows("a", beats, 41, BeatSource::Features).collect();
-        let of = |row: &BeatRow| (row.beat, row.frame, row.time_s, row.number);
+        let to_tuple = |row: &BeatRow| (row.beat, row.frame, row.time_s, row.number);
         let expected = [(0, 2, 0.05, Some(4)), (1, 31, 1.04, Some(1)), (2, 40, 2.0, None)];
-        assert_eq!(found.iter().map(of).collect::<Vec<_>>(), expected);
+        assert_eq!(found.iter().map(to_tuple).collect::<Vec<_>>(), expected);
         assert!(found.iter().all(|row| row.source.as_deref() == Some("features")));
     }
 }

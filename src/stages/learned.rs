@@ -80,17 +80,19 @@ pub fn of_run(
     progress: &dyn Progress,
     is_dry_run: bool,
 ) -> anyhow::Result<Option<LearnedFrom>> {
-    let of = |command, data: &str, most| {
+    let learned_by = |command, data: &str, most| {
         of_command(store, run, command, (data, most), machine, progress, is_dry_run)
     };
-    let Some(by_train) = of(Train::NAME, &trained.state.data, None)? else { return Ok(None) };
+    let Some(by_train) = learned_by(Train::NAME, &trained.state.data, None)? else {
+        return Ok(None);
+    };
     let Some(FinetuneData { data, num_phrases }) = &trained.tuned else {
         return Ok(Some(by_train));
     };
     if *data == by_train.data {
         return Ok(Some(by_train));
     }
-    let by_finetune = of(Finetune::NAME, data, *num_phrases)?;
+    let by_finetune = learned_by(Finetune::NAME, data, *num_phrases)?;
     Ok(by_finetune.map(|by_finetune| by_train.and(by_finetune)))
 }
 
@@ -201,9 +203,10 @@ fn card_of(store: &Location, model: &str) -> Result<Option<Bytes>, StoreError> {
         return Ok(None);
     }
     let path = format!("{}/{}", current_folder(store, &folder_of(model))?, file_names::CARD);
-    let of_program = || (model == pretrained::NAME).then(|| pretrained::file(file_names::CARD));
+    let pretrained_card =
+        || (model == pretrained::NAME).then(|| pretrained::file(file_names::CARD));
     match store.read_regular(&path, MAX_CARD_BYTES) {
-        Err(StoreError::NotFound { .. }) => Ok(of_program().flatten()),
+        Err(StoreError::NotFound { .. }) => Ok(pretrained_card().flatten()),
         read => read.map(Some),
     }
 }

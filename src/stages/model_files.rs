@@ -477,8 +477,8 @@ pub fn sha256(bytes: &[u8]) -> String {
 /// Returns what tells this processor from others: a model that is optimised for one may not run on another.
 fn processor() -> String {
     let known = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let of_first = known.lines().take_while(|line| !line.is_empty());
-    let mut told: Vec<&str> = of_first
+    let first_group = known.lines().take_while(|line| !line.is_empty());
+    let mut told: Vec<&str> = first_group
         .filter(|line| ["model name", "flags", "Features"].iter().any(|key| line.starts_with(key)))
         .collect();
     told.push(std::env::consts::ARCH);

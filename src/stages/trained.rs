@@ -55,8 +55,8 @@ impl TrainedRun {
     /// # Errors
     /// [`TrainingError::Missing`] with the command that makes what is missing.
     pub fn read(store: &Location, run: &str, stand: WeightsChoice) -> Result<Self, TrainingError> {
-        let of = |stage: &'static str| Checkpoints::new(store, run, stage);
-        let diffusion = of(DiffusionLearner::STAGE);
+        let checkpoints_of = |stage: &'static str| Checkpoints::new(store, run, stage);
+        let diffusion = checkpoints_of(DiffusionLearner::STAGE);
         let Some(&step) = diffusion.steps(CheckpointKind::Best)?.last() else {
             let way_out = format!("run motiongen train --run {run} first");
             return Err(TrainingError::Missing {
@@ -69,7 +69,7 @@ impl TrainedRun {
         let network = &state.config.network;
         let (_, unet) = UNet1D::new(&network.unet);
         let (_, decoder) = MotionDecoder::new(&network.decoder);
-        let tuned = of(FinetuneLearner::STAGE);
+        let tuned = checkpoints_of(FinetuneLearner::STAGE);
         let tuned_steps = match stand {
             WeightsChoice::Train => Vec::new(),
             WeightsChoice::Latest | WeightsChoice::Finetune => tuned.steps(CheckpointKind::Best)?,
@@ -79,12 +79,12 @@ impl TrainedRun {
                 Ok(BestWeights { parameters: section(&tuned, step, prefix, list)?, step })
             };
             // Only what is looked at has to be as this version has it.
-            let of_tuned: State<serde_json::Value> =
+            let tuned_state: State<serde_json::Value> =
                 tuned.read(CheckpointKind::Best, step, State::of)?;
-            let loss = of_tuned.progress.best.map(|best| best.loss);
-            let num_phrases = of_tuned.config["num_phrases"].as_u64();
+            let loss = tuned_state.progress.best.map(|best| best.loss);
+            let num_phrases = tuned_state.config["num_phrases"].as_u64();
             let num_phrases = num_phrases.and_then(|n| usize::try_from(n).ok());
-            let tuned_on = FinetuneData { data: of_tuned.data, num_phrases };
+            let tuned_on = FinetuneData { data: tuned_state.data, num_phrases };
             let (unet, decoder) = (best("unet.", unet)?, best("decoder.", decoder)?);
             let stage = FinetuneLearner::STAGE;
             return Ok(Self { state, unet, decoder, stage, loss, tuned: Some(tuned_on) });
@@ -95,7 +95,7 @@ impl TrainedRun {
             return Err(TrainingError::Missing { run, what, way_out });
         }
         let unet = best(&diffusion, run, "unet.", "trained UNet", unet)?;
-        let (stage, what) = (of(DecoderLearner::STAGE), "trained decoder");
+        let (stage, what) = (checkpoints_of(DecoderLearner::STAGE), "trained decoder");
         let decoder = best(&stage, run, "decoder.", what, decoder)?;
         let loss = state.progress.best.map(|best| best.loss);
         Ok(Self { state, unet, decoder, stage: DiffusionLearner::STAGE, loss, tuned: None })

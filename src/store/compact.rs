@@ -244,13 +244,13 @@ fn manifest(
 ) -> Manifest {
     // The headers that this chunk names, in the order in which it names them.
     let (mut headers, mut places) = (Vec::new(), HashMap::new());
-    let of = chunk.items.values().map(|live| {
+    let header_indices = chunk.items.values().map(|live| {
         *places.entry(live.header).or_insert_with(|| {
             headers.push(chunk.headers[live.header].clone());
             headers.len() as u32 - 1
         })
     });
-    let of = of.collect();
+    let header_indices = header_indices.collect();
     let generation = 1 + commits.iter().map(|commit| commit.generation).max().unwrap_or(0);
     Manifest {
         format: COMPACTED_FORMAT,
@@ -262,7 +262,7 @@ fn manifest(
         origin: String::new(),
         parts,
         items,
-        compacted: Some(CompactionOrigin { generation, commits: headers, of }),
+        compacted: Some(CompactionOrigin { generation, commits: headers, of: header_indices }),
     }
 }
 

@@ -94,8 +94,9 @@ fn read(store: &Location, table: &str) -> Result<Log, StoreError> {
             let action: Value = serde_json::from_slice(line)
                 .map_err(|e| refuse(format!("is damaged in {} ({e})", listed.path)))?;
             if let Some(protocol) = action.get("protocol") {
-                let of = |name: &str| protocol.get(name).and_then(Value::as_u64).unwrap_or(0);
-                let found = [of("minReaderVersion"), of("minWriterVersion")];
+                let version_of =
+                    |name: &str| protocol.get(name).and_then(Value::as_u64).unwrap_or(0);
+                let found = [version_of("minReaderVersion"), version_of("minWriterVersion")];
                 if found != PROTOCOL {
                     return Err(refuse(format!(
                         "is of protocol {}/{}, this program writes {}/{}; move it away",

@@ -154,7 +154,7 @@ mod tests {
             "models/m/.partial-ABCDEF",
             "baselines/.partial-123abc",
         ];
-        let of_others = [
+        let foreign_paths = [
             ".tmp_important_notes",
             ".partial-a1B2c3",
             "projects/a/.tmpl.html",
@@ -167,7 +167,7 @@ mod tests {
             "runs/a/diffusion/.tmp_notes",
             "runs/a/diffusion/deeper/.partial-a1B2c3",
         ];
-        ours.iter().chain(&of_others).for_each(|path| write(path, 2));
+        ours.iter().chain(&foreign_paths).for_each(|path| write(path, 2));
         write("motion/.partial-y0unG5", 0);
         sweep(root.path());
         let left: BTreeSet<String> = walkdir::WalkDir::new(root.path())
@@ -176,7 +176,7 @@ mod tests {
             .filter(|entry| entry.file_type().is_file())
             .map(|entry| entry.path().strip_prefix(root.path()).unwrap().display().to_string())
             .collect();
-        let expected = of_others.iter().chain(&["motion/.partial-y0unG5"]);
+        let expected = foreign_paths.iter().chain(&["motion/.partial-y0unG5"]);
         assert_eq!(left, expected.map(|path| (*path).to_owned()).collect());
     }
 }

@@ -226,11 +226,12 @@ mod tests {
     fn compactions_name_a_commit_for_every_item() {
         let commits =
             r#"[{"key": "x", "sequence": 0, "program": "", "params_hash": "", "origin": ""}]"#;
-        let compacted = |of: &str| {
-            format!(r#", "compacted": {{"generation": 1, "commits": {commits}, "of": {of}}}"#)
+        let compacted = |indices: &str| {
+            format!(r#", "compacted": {{"generation": 1, "commits": {commits}, "of": {indices}}}"#)
         };
         let items = [("a", "1"), ("b", "1")];
-        let parse = |of: &str| Manifest::parse(manifest(&items, &compacted(of)).as_bytes(), "m");
+        let parse =
+            |indices: &str| Manifest::parse(manifest(&items, &compacted(indices)).as_bytes(), "m");
         assert_eq!(parse("[0, 0]").expect("a manifest").header_of(1), 0);
         let advice = "; move it away and run the stage again";
         for (of, reason) in

@@ -61,9 +61,10 @@ impl Shard {
                 };
                 let (mut i, n) = (number(index, &i)?, number(count, &n)?);
                 if index == SLURM_INDEX {
-                    let of =
+                    let variable =
                         |name: &str| environment(name).map(|text| number(name, &text)).transpose();
-                    let (first, last, step) = (of(SLURM_MIN)?, of(SLURM_MAX)?, of(SLURM_STEP)?);
+                    let (first, last, step) =
+                        (variable(SLURM_MIN)?, variable(SLURM_MAX)?, variable(SLURM_STEP)?);
                     i = place_in_array(i, n, first.unwrap_or(0), last, step.unwrap_or(1))
                         .map_err(bad)?;
                 }

@@ -133,7 +133,7 @@ impl StageLog {
             manifests.iter().filter_map(|l| Some(stage_and_key(&l.path)?.0)).collect();
         stages.dedup();
         let read = |stage: &str| {
-            let of = |listed: &[ListedObject], folder: &str| -> Vec<ListedObject> {
+            let listed_below = |listed: &[ListedObject], folder: &str| -> Vec<ListedObject> {
                 let folder = format!("{folder}/{stage}/");
                 listed.iter().filter(|l| l.path.starts_with(&folder)).cloned().collect()
             };
@@ -143,7 +143,8 @@ impl StageLog {
                     store.list(&format!("{}/{stage}", catalogue::FOLDER))?,
                 ))
             };
-            let found = (of(&manifests, FOLDER), of(&catalogues, catalogue::FOLDER));
+            let found =
+                (listed_below(&manifests, FOLDER), listed_below(&catalogues, catalogue::FOLDER));
             Self::of(store, stage, found.0, found.1, again)
         };
         stages.into_iter().map(read).collect()

@@ -183,7 +183,7 @@ impl DiffusionLearner {
     /// Returns the means of some numbers over the frames of the validation windows, nothing dropped.
     fn mean_over_validation<const N: usize>(
         &self,
-        of: impl Fn(&DiffusionInputs) -> Result<[f64; N], TrainingError> + Sync,
+        mean_losses: impl Fn(&DiffusionInputs) -> Result<[f64; N], TrainingError> + Sync,
     ) -> Result<[f64; N], TrainingError> {
         let n = self.windows.n_validation();
         let n_wanted = n.clamp(MIN_VALIDATION_WINDOWS, MAX_VALIDATION_WINDOWS);
@@ -198,7 +198,7 @@ impl DiffusionLearner {
                 WithholdProbabilities::of(&self.config),
                 self.takes_style,
             );
-            let found = self.threads.run(|| of(&given))?;
+            let found = self.threads.run(|| mean_losses(&given))?;
             for (sum, value) in sums.iter_mut().zip(found) {
                 *sum += weight * value;
             }
@@ -323,15 +323,15 @@ impl<'a> DiffusionInputs<'a> {
         let mask = &self.batch.mask;
         let loss = objective.loss(g, schedule, &self.t, [prediction, &target], mask)?;
         let x_t = g.constant(prediction.shape(), &self.x_t);
-        let of_estimate = objective.estimate.loss(
+        let estimate_loss = objective.estimate.loss(
             g,
             normalizer,
             (schedule, &self.t),
             [prediction, &x_t],
             (&self.batch.motion, mask),
         )?;
-        Ok(match of_estimate {
-            Some(of_estimate) => g.add(&loss, &of_estimate)?,
+        Ok(match estimate_loss {
+            Some(estimate_loss) => g.add(&loss, &estimate_loss)?,
             None => loss,
         })
     }

@@ -366,8 +366,8 @@ impl Learner for FinetuneLearner {
                 counted.map(|(row, _)| norm(&row[Channel::Velocity.range()])).sum()
             };
             let speed_ratio = speed(decoded.data()) / speed(&real).max(f64::MIN_POSITIVE);
-            let mean = |of: &dyn Fn(&Coherence) -> f64| {
-                measured.iter().map(of).sum::<f64>() / measured.len() as f64
+            let mean = |value: &dyn Fn(&Coherence) -> f64| {
+                measured.iter().map(value).sum::<f64>() / measured.len() as f64
             };
             losses.parts.extend([
                 ("velocity_error", mean(&|c| c.velocity_m_s)),

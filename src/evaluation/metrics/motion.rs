@@ -332,14 +332,15 @@ fn multimodality_number(danced: &[MotionWindow]) -> Number {
         }
     }
     let several = places.values().filter(|(_, rows)| rows.len() > 1);
-    let of_place = |(song, rows): &(usize, Vec<Array2<f64>>)| {
+    let multimodality_of_place = |(song, rows): &(usize, Vec<Array2<f64>>)| {
         let rows = stacked(rows)?;
         let seeds = SEED..SEED + N_MULTIMODALITY;
         let found: Option<Vec<f64>> =
             seeds.map(|seed| multimodality(&[rows.view()], MULTIMODALITY_PAIRS, seed)).collect();
         Some((found?.iter().sum::<f64>() / N_MULTIMODALITY as f64, *song))
     };
-    let (values, songs): (Vec<f64>, Vec<usize>) = several.filter_map(of_place).unzip();
+    let (values, songs): (Vec<f64>, Vec<usize>) =
+        several.filter_map(multimodality_of_place).unzip();
     let protocol = format!(
         "motions at one place of one phrase, {MULTIMODALITY_PAIRS} pairs, {N_MULTIMODALITY} replications"
     );

@@ -133,13 +133,13 @@ impl Take {
         let at_rest = match (found.rest, &body.landmarks) {
             (Some(rest), Some(_)) => rest.to_y(),
             _ => {
-                let of_file = tilt(mul(to_y, above));
-                match OwnAxes::find(bvh, &body, &world, &world_root, of_file) {
+                let file_tilt = tilt(mul(to_y, above));
+                match OwnAxes::find(bvh, &body, &world, &world_root, file_tilt) {
                     Some(OwnAxes { up, to_body }) => {
                         account.notes.push(CaptureNote::OwnAxes { root: account.root.clone(), up });
                         to_body
                     }
-                    None => of_file,
+                    None => file_tilt,
                 }
             }
         };

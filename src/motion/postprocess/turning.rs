@@ -123,17 +123,17 @@ impl<'a> Turning<'a> {
 
     /// The sum that is made smallest.
     fn sum(&self, q: &[Quaternion], variances: &FusionVariances) -> f64 {
-        let weigh = |x: [f64; 3], of: &AxisVariances| -> f64 {
-            (0..3).map(|axis| x[axis] * x[axis] / of.of_axis(axis)).sum()
+        let weigh = |x: [f64; 3], variances: &AxisVariances| -> f64 {
+            (0..3).map(|axis| x[axis] * x[axis] / variances.of_axis(axis)).sum()
         };
-        let of_frame = |t: usize| {
+        let weighted_error = |t: usize| {
             let error = angular_velocity(self.q_hat[t], q[t], 1.0);
             let known = if self.has_direction[t] { error } else { [0.0; 3] };
             let missing = self.turn(q, t).map_or([0.0; 3], |(_, missing)| missing);
             weigh(known, &variances.orientation_rad2)
                 + weigh(missing, &variances.angular_velocity_rad2_s2)
         };
-        (0..q.len()).map(of_frame).sum()
+        (0..q.len()).map(weighted_error).sum()
     }
 }
 

@@ -210,11 +210,11 @@ fn lay(written: &[Measure], played: &[usize], meter: Meter) -> Result<TuneLayout
     }
     while let Some(measure) = measures.get(i) {
         if measure.ticks > full {
-            let of = |ticks: u32| format!("{}/{TICKS_PER_WHOLE}", ticks);
+            let in_ticks = |ticks: u32| format!("{}/{TICKS_PER_WHOLE}", ticks);
             return Err(AbcError::Overfull {
                 line: measure.line,
-                found: fraction(measure.ticks).unwrap_or_else(|| of(measure.ticks)),
-                expected: fraction(full).unwrap_or_else(|| of(full)),
+                found: fraction(measure.ticks).unwrap_or_else(|| in_ticks(measure.ticks)),
+                expected: fraction(full).unwrap_or_else(|| in_ticks(full)),
             });
         }
         if measure.begins_part {

@@ -139,12 +139,12 @@ impl EvaluationJob<'_> {
             let (id, first) = (window.phrase_id.as_str(), window.first_frame);
             self.baseline_item(measurer, &[], id, first, window.frames.view())
         };
-        let of_subject = |subject: Subject| -> Vec<MeasuredWindow> {
+        let windows_of = |subject: Subject| -> Vec<MeasuredWindow> {
             sampled.iter().filter(|window| window.subject == subject).filter_map(item).collect()
         };
         SampledBaselines {
-            untrained: of_subject(Subject::Untrained),
-            no_music: of_subject(Subject::NoMusic),
+            untrained: windows_of(Subject::Untrained),
+            no_music: windows_of(Subject::NoMusic),
         }
     }
 }

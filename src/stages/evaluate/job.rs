@@ -176,11 +176,11 @@ impl EvaluationJob<'_> {
             numbers.extend(self.control(Some(split)));
             let shuffled = meter.shuffled(&items);
             let shifted = meter.shifted(&items);
-            let of_split = |items: &'_ [MeasuredWindow]| -> Vec<MeasuredWindow> {
+            let items_in_split = |items: &'_ [MeasuredWindow]| -> Vec<MeasuredWindow> {
                 items.iter().filter(|item| item.split == split).cloned().collect()
             };
             let baseline = |subject: Subject, items: &[MeasuredWindow]| -> Finding {
-                let items = of_split(items);
+                let items = items_in_split(items);
                 let items: Vec<&MeasuredWindow> = items.iter().collect();
                 let numbers = match items.is_empty() {
                     true => Vec::new(),

@@ -169,10 +169,10 @@ fn missed(params: &Params, checks: &[SanityCheckRow]) -> Vec<CheckShortfall> {
         let is_of_set = |row: &&SanityCheckRow| {
             row.check_set == set && row.stage.as_deref() != Some(MotionStage::Raw.name())
         };
-        let of_set = || checks.iter().filter(is_of_set);
+        let checks_in_set = || checks.iter().filter(is_of_set);
         let motion = |row: &SanityCheckRow| (row.phrase_id.clone(), row.sample);
-        let all: BTreeSet<_> = of_set().map(motion).collect();
-        let failed: BTreeSet<_> = of_set().filter(|row| !row.passed).map(motion).collect();
+        let all: BTreeSet<_> = checks_in_set().map(motion).collect();
+        let failed: BTreeSet<_> = checks_in_set().filter(|row| !row.passed).map(motion).collect();
         let share = 1.0 - failed.len() as f64 / all.len().max(1) as f64;
         (share < least).then_some((set, share, least, failed.len()))
     };

@@ -193,9 +193,9 @@ impl PhraseIndex {
     }
 
     fn activity(&self, row: &PhraseRow, n_frames: usize) -> Option<Vec<f64>> {
-        let of_song = self.activities.get(song_of(row))?;
+        let song_activity = self.activities.get(song_of(row))?;
         let first = (row.start_s.unwrap_or(0.0) * FPS).round() as usize;
-        of_song.get(first..first + n_frames).map(<[f64]>::to_vec)
+        song_activity.get(first..first + n_frames).map(<[f64]>::to_vec)
     }
 
     /// Returns the song of a phrase and the frame of it at which the phrase begins.

@@ -253,8 +253,8 @@ fn paired(there: &[SongMetricRow], here: &[SongMetricRow]) -> Vec<PairedNumber> 
     let mut pairs: BTreeMap<[String; 3], Vec<f64>> = BTreeMap::new();
     for row in here {
         let [metric, variant, split, song] = key(row);
-        let of_song = [metric.clone(), variant.clone(), split.clone(), song];
-        if let Some(other) = known.get(&of_song) {
+        let key_of_song = [metric.clone(), variant.clone(), split.clone(), song];
+        if let Some(other) = known.get(&key_of_song) {
             pairs.entry([metric, variant, split]).or_default().push(row.value - other);
         }
     }
@@ -345,7 +345,7 @@ impl Badness {
 
 /// Returns the rows as a report takes them.
 fn shown(rows: &[MetricRow]) -> Vec<Metric> {
-    let of = |row: &MetricRow| Metric {
+    let to_metric = |row: &MetricRow| Metric {
         subject: row.subject.clone(),
         split: row.split.clone(),
         metric: row.metric.clone(),
@@ -358,7 +358,7 @@ fn shown(rows: &[MetricRow]) -> Vec<Metric> {
         protocol: row.protocol.clone(),
         better: report::better(&row.metric),
     };
-    rows.iter().map(of).collect()
+    rows.iter().map(to_metric).collect()
 }
 
 #[cfg(test)]
@@ -399,12 +399,16 @@ mod tests {
             .into_iter()
             .map(|line| (line.check, line.n_passed, line.n, line.worst_message))
             .collect();
-        let of = |check: &str, n_passed, n, message: &str| {
+        let summary = |check: &str, n_passed, n, message: &str| {
             (check.to_owned(), n_passed, n, message.to_owned())
         };
         assert_eq!(
             told,
-            [of("a", 3, 3, "a Some(0.9)"), of("b", 2, 4, "b Some(4.0)"), of("c", 0, 2, "c None"),]
+            [
+                summary("a", 3, 3, "a Some(0.9)"),
+                summary("b", 2, 4, "b Some(4.0)"),
+                summary("c", 0, 2, "c None"),
+            ]
         );
         assert!(lines(&rows)[2].worst_value.is_nan());
     }

@@ -99,7 +99,7 @@ impl Checking<'_> {
         let decoder = path(file_names::DECODER);
         let onnx = OnnxEngine::open(runtime, (&unet, false), &decoder, &network.unet, plan)?;
         // What the files hold, which rounding has changed.
-        let of_files = (
+        let stored_weights = (
             self.read_back(
                 file_names::UNET,
                 file_names::UNET_WEIGHTS,
@@ -113,7 +113,7 @@ impl Checking<'_> {
         );
         let threads = machine.threads;
         let eager_of = |weights| eager(self.trained, weights, threads);
-        let of_files = eager_of(of_files)?;
+        let stored_weights = eager_of(stored_weights)?;
         let music = self.music()?;
         let schedule = Schedule::new(&network.diffusion)?;
         let window = network.window_frames;
@@ -123,7 +123,7 @@ impl Checking<'_> {
         progress.start("check", "checks", cases.len() as u64 + 3 + u64::from(is_rounded));
         let mut rows = Vec::new();
         for case in &cases {
-            rows.push(self.forward(&onnx, &of_files, &music, case, schedule.len())?);
+            rows.push(self.forward(&onnx, &stored_weights, &music, case, schedule.len())?);
             progress.advance(1);
         }
         let case = Case { n_samples: 2, n_frames: window };
@@ -134,19 +134,20 @@ impl Checking<'_> {
             clip: true,
         };
         let asked = |guidance| Sampling { config: &config, schedule: &schedule, guidance };
-        let (row, latent) = self.sampled("sample", &onnx, &of_files, &music, &case, asked(1.0))?;
+        let (row, latent) =
+            self.sampled("sample", &onnx, &stored_weights, &music, &case, asked(1.0))?;
         rows.push(row);
         progress.advance(1);
-        rows.push(self.decoded(&onnx, &of_files, latent.view())?);
+        rows.push(self.decoded(&onnx, &stored_weights, latent.view())?);
         progress.advance(1);
         let guided = asked(GUIDANCE);
-        rows.push(self.sampled("guided_sample", &onnx, &of_files, &music, &case, guided)?.0);
+        rows.push(self.sampled("guided_sample", &onnx, &stored_weights, &music, &case, guided)?.0);
         progress.advance(1);
         if is_rounded {
             let TrainedRun { unet, decoder, .. } = self.trained;
             let trained = eager_of((unet.parameters.clone(), decoder.parameters.clone()))?;
             let (row, _) =
-                self.sampled(ROUNDING, &trained, &of_files, &music, &case, asked(1.0))?;
+                self.sampled(ROUNDING, &trained, &stored_weights, &music, &case, asked(1.0))?;
             rows.push(OnnxCheckRow { onnx_s: None, ..row });
             progress.advance(1);
         }

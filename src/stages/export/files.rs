@@ -42,15 +42,15 @@ impl ExportedFiles {
         let scales = &trained.state.scales;
         let storage = params.precision;
         let schedule = Schedule::new(&config.diffusion)?;
-        let of_unet = |id: ParameterId| trained.unet.parameters.unpacked(id);
-        let of_decoder = |id: ParameterId| trained.decoder.parameters.unpacked(id);
+        let unet_weights = |id: ParameterId| trained.unet.parameters.unpacked(id);
+        let decoder_weights = |id: ParameterId| trained.decoder.parameters.unpacked(id);
         let weights_sha256 = Networks {
             unet: weights_sha256(&trained.unet.parameters),
             decoder: weights_sha256(&trained.decoder.parameters),
         };
         let graphs = [
-            unet(&config.unet, &of_unet, &scales.features, Form::default(), storage)?,
-            decoder(&config.decoder, &of_decoder, storage)?,
+            unet(&config.unet, &unet_weights, &scales.features, Form::default(), storage)?,
+            decoder(&config.decoder, &decoder_weights, storage)?,
         ];
         let mut card = ModelCard {
             format: MODEL_FORMAT,

@@ -146,8 +146,9 @@ impl Maker<'_> {
             );
             let misses = constraints.as_ref().map(|c| c.errors(frames.view())).unwrap_or_default();
             let worst = |group: Channel, factor: f64| {
-                let of_group = misses.iter().filter(|miss| miss.what.starts_with(group.name()));
-                of_group.map(|miss| miss.error * factor).reduce(f64::max)
+                let misses_of_group =
+                    misses.iter().filter(|miss| miss.what.starts_with(group.name()));
+                misses_of_group.map(|miss| miss.error * factor).reduce(f64::max)
             };
             let generate_s = begun.elapsed().as_secs_f64();
             let found = CandidateFindings {

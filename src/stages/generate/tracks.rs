@@ -218,13 +218,13 @@ fn plan(
         extractions.iter().map(|row| (row.phrase_id.as_str(), row.n_frames)).collect();
     let outdated = outdated_features(snapshot, &rows)?;
     let is_wanted = |row: &PhraseRow| {
-        let of_kind = match target.tracks {
+        let is_of_kind = match target.tracks {
             Tracks::All => true,
             Tracks::Constructed => row.is_constructed(),
             Tracks::Songs => !row.is_constructed() && (row.has_audio || row.has_features),
         };
         let is_named = target.phrases.is_empty() || target.phrases.contains(&row.phrase_id);
-        let is_kind = of_kind || (!target.phrases.is_empty() && is_named);
+        let is_kind = is_of_kind || (!target.phrases.is_empty() && is_named);
         is_kind && is_named && target.split.is_none_or(|split| row.split == split)
     };
     let n_frames = |row: &PhraseRow| {

@@ -44,8 +44,8 @@ impl StoreContents {
                 if row.song_hash.is_none() {
                     known.unidentified.insert(slug.clone());
                 }
-                let of_song = known.constructed.entry(slug);
-                of_song.or_default().insert(row.phrase_id, row.source);
+                let phrases_of_song = known.constructed.entry(slug);
+                phrases_of_song.or_default().insert(row.phrase_id, row.source);
                 return;
             }
             known.others.insert(row.phrase_id.clone(), row.source.clone());

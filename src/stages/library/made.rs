@@ -184,9 +184,9 @@ impl Band {
     }
 
     /// Returns what tells songs of this band from those of another.
-    fn fingerprint(&self, of: &str) -> String {
+    fn fingerprint(&self, notes: &str) -> String {
         let hash = self.hash.as_ref().map(|hash| format!(" {hash}")).unwrap_or_default();
-        format!("{of} {}{hash}", music::VERSION)
+        format!("{notes} {}{hash}", music::VERSION)
     }
 
     fn play(&self, score: &Score, seed: u64) -> Result<Vec<f32>, String> {

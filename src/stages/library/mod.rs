@@ -197,11 +197,11 @@ fn prepare(songs: &mut Songs, params: &Params) -> anyhow::Result<()> {
     // Music of our own is for training: a verdict rests on real songs.
     let real = songs.songs.iter().filter(takes_place).filter(|song| !song.is_made());
     let names: Vec<String> = real.map(|song| song.id.clone()).collect();
-    let of =
+    let split_of_song =
         split::assign(names.iter().map(String::as_str), params.validation_songs, params.test_songs)
             .map_err(anyhow::Error::msg)?;
     for song in &mut songs.songs {
-        song.split = of.get(song.id.as_str()).copied().unwrap_or(split::TRAIN);
+        song.split = split_of_song.get(song.id.as_str()).copied().unwrap_or(split::TRAIN);
     }
     if names.is_empty() {
         tracing::warn!("no song is real, so none is for validation and for the test");

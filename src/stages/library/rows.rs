@@ -50,11 +50,15 @@ pub fn phrase_row(song: &Song, music: &SongMusic, phrase: &ConstructedPhrase) ->
 
 /// Digest over one line `role digest` for features and motion, as for the files of a phrase.
 fn content_hash(phrase: &ConstructedPhrase) -> String {
-    let of = |values: &ndarray::Array2<f32>| {
+    let digest_of_values = |values: &ndarray::Array2<f32>| {
         let bytes: Vec<u8> = values.iter().flat_map(|x| x.to_le_bytes()).collect();
         digest(&bytes)
     };
-    let lines = format!("features {}\nmotion {}\n", of(&phrase.features), of(&phrase.motion));
+    let lines = format!(
+        "features {}\nmotion {}\n",
+        digest_of_values(&phrase.features),
+        digest_of_values(&phrase.motion)
+    );
     digest(lines.as_bytes())
 }
 

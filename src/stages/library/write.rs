@@ -307,11 +307,11 @@ impl SongWriter<'_> {
         // The same song may be named by a folder now and by the store before.
         let former = self.constructed.get(&song.slug).and_then(|phrases| phrases.get(id));
         let is_same = former.is_some_and(|url| *url == song.url);
-        let of_another = || {
+        let other_origin = || {
             let known = self.ledger.get(id).filter(|known| known.item.succeeded())?;
             (known.origin != self.origin && !is_same && !self.force).then_some(&known.origin)
         };
-        let Some(from) = self.others.get(id).or_else(of_another) else { return Ok(()) };
+        let Some(from) = self.others.get(id).or_else(other_origin) else { return Ok(()) };
         let message = format!(
             "{}: its phrase {id} is in the store already, from {from}; rename the song or use another \
              store",

@@ -218,12 +218,12 @@ impl<'a> Writer<'a> {
 
     fn push_newer(&mut self, (m, i): (usize, usize)) -> Result<(), CatalogueError> {
         let manifest = &self.newer[m];
-        let of_manifest = (m, manifest.header_of(i));
-        let header = match self.headers.of_newer.get(&of_manifest) {
+        let place_in_manifest = (m, manifest.header_of(i));
+        let header = match self.headers.of_newer.get(&place_in_manifest) {
             Some(&place) => place,
             None => {
-                let place = self.place_of(self.newer_headers[m][of_manifest.1].clone());
-                self.headers.of_newer.insert(of_manifest, place);
+                let place = self.place_of(self.newer_headers[m][place_in_manifest.1].clone());
+                self.headers.of_newer.insert(place_in_manifest, place);
                 place
             }
         };

@@ -48,8 +48,8 @@ impl<'a> Names<'a> {
         let whole = |name: &str| self.whole.get(name).copied();
         let bare = |name: &str| {
             let name = last_part(name);
-            let of = |names: &HashMap<&str, Option<usize>>| names.get(name).copied().flatten();
-            of(&self.last).or_else(|| of(&self.audio))
+            let lookup = |names: &HashMap<&str, Option<usize>>| names.get(name).copied().flatten();
+            lookup(&self.last).or_else(|| lookup(&self.audio))
         };
         let numbered = numbered(name);
         let first = |phrase: usize| (phrase, 0);

@@ -208,11 +208,11 @@ fn matched(names: &[&str], phrases: &[ForeignPhrase]) -> BTreeMap<String, (Strin
         bench.put(name, "x");
     }
     let found = bench.read(phrases);
-    let of = |file: &ForeignFile| {
+    let to_entry = |file: &ForeignFile| {
         let below = file.path.strip_prefix(bench.dir()).expect("below").display().to_string();
         (below, (file.phrase_id.clone(), file.sample))
     };
-    found.files.iter().map(of).collect()
+    found.files.iter().map(to_entry).collect()
 }
 
 #[test]
@@ -370,12 +370,12 @@ fn bad_files_are_refused_with_what_is_wrong() {
         );
         (FailureKind::Shape, message)
     };
-    let of = |shape: &[usize]| npy::write(shape, &vec![0.5_f32; shape.iter().product()]);
-    assert_eq!(refused("a.npy", &of(&[3, 24])), shape("[3, 24]", ""));
-    assert_eq!(refused("a.npy", &of(&[25, 3])), shape("[25, 3]", "; transpose it"));
-    assert_eq!(refused("a.npy", &of(&[0, 25])), shape("[0, 25]", ""));
-    assert_eq!(refused("a.npy", &of(&[1, 3, 25])), shape("[1, 3, 25]", ""));
-    assert_eq!(refused("a.npy", &of(&[])), shape("[]", ""));
+    let npy_of = |shape: &[usize]| npy::write(shape, &vec![0.5_f32; shape.iter().product()]);
+    assert_eq!(refused("a.npy", &npy_of(&[3, 24])), shape("[3, 24]", ""));
+    assert_eq!(refused("a.npy", &npy_of(&[25, 3])), shape("[25, 3]", "; transpose it"));
+    assert_eq!(refused("a.npy", &npy_of(&[0, 25])), shape("[0, 25]", ""));
+    assert_eq!(refused("a.npy", &npy_of(&[1, 3, 25])), shape("[1, 3, 25]", ""));
+    assert_eq!(refused("a.npy", &npy_of(&[])), shape("[]", ""));
 
     let header = exchange::csv_header();
     let no_frames = ": has no frames; write it again".to_owned();
