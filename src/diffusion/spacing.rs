@@ -42,7 +42,7 @@ pub struct SamplerStep {
 /// - linspace: round((n − 1 − i) (T−1)/(n−1)), and T − 1 where n is 1
 /// - reference: T − 1 − i ⌊T/n⌋
 ///
-/// They are those of NumPy's `arange`, `linspace` and `round` in exact arithmetic.
+/// The timesteps are those of NumPy's `arange`, `linspace` and `round` in exact arithmetic.
 ///
 /// # Errors
 /// An `n_steps` of 0 or above `n_train`.

@@ -12,7 +12,7 @@ use super::reference_statistics::{FeatureSet, ReferenceStatistics};
 use super::sanity::{Check, CheckSet, checks};
 use super::window_range::Posture;
 
-/// A window of motion as its numbers.
+/// The measured numbers of a window of motion.
 #[derive(Clone, Debug)]
 pub struct WindowMeasures {
     pub n_frames: usize,

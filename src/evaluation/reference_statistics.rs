@@ -156,7 +156,7 @@ pub enum ReferenceError {
     Bounds,
 }
 
-/// What is known of the ground truth.
+/// Statistics of the ground truth.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ReferenceStatistics {
     pub version: u32,
@@ -214,7 +214,7 @@ impl ReferenceStatistics {
     /// Errors: [`ReferenceError`] for text that is not such an artefact, another version, and features of
     /// another size.
     pub fn from_json(text: &str) -> Result<Self, ReferenceError> {
-        /// What tells whether the rest can be read.
+        /// The version, which tells whether the rest can be read.
         #[derive(Deserialize)]
         struct FormatVersion {
             version: u32,

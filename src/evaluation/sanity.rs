@@ -214,7 +214,7 @@ pub fn derivative_error(frames: ArrayView2<f32>, of: Channel, derivative: Channe
     (0..pairs).map(off).sum::<f64>() / (3 * pairs.max(1)) as f64
 }
 
-/// What the checks look at.
+/// The quantities of a motion that the checks compare with thresholds.
 struct CheckQuantities {
     norm: f64,
     phase: [f64; 2],

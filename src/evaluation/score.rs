@@ -14,7 +14,7 @@ const HALF_COHERENT_M_S: f64 = 0.1;
 /// Tempi beside the music's own that locking is held against.
 const N_WRONG_TEMPI: usize = 12;
 
-/// What a motion scores.
+/// The score of a motion.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Score {
     /// From 0 to 1; none for motion that is not finite.

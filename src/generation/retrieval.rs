@@ -69,7 +69,8 @@ impl Retrieval {
         self.keys.is_empty()
     }
 
-    /// Returns the phrase that is nearest to features, `[T, 163]`, and how far it is; the first of equals.
+    /// Returns the phrase that is nearest to features, `[T, 163]`, and its distance; among equal distances the
+    /// first phrase.
     ///
     /// `d² = mean over blocks and features of ((x - y) / s)²`, of the blocks that both have, x and y means
     /// over a block and s the standard deviation over the library. None for no frames, and where a feature is

@@ -28,7 +28,7 @@ pub const RUN_WINDOWS: usize = 4;
 /// Frames that neighbouring windows share, by default: one second.
 pub const OVERLAP_FRAMES: usize = 30;
 
-/// What motion is made with.
+/// The model and settings that motion is generated with.
 #[derive(Clone, Copy)]
 pub struct Generator<'a> {
     pub engine: &'a dyn Engine,
@@ -40,10 +40,11 @@ pub struct Generator<'a> {
     pub overlap_frames: usize,
 }
 
-/// What motion is made for.
+/// The conditions of a track that motion is generated for.
 #[derive(Clone, Copy, Debug)]
 pub struct Track<'a> {
-    /// What the network hears: features as the table has them, then the clock if it hears one, \[T, condition_dim\].
+    /// The condition of the network: features as the table has them, then the clock if it takes one,
+    /// \[T, condition_dim\].
     pub condition: ArrayView2<'a, f32>,
     /// Bar phase of the music, in [0, 1), \[T\]: motion is sampled with this phase, for a network that hears the clock.
     pub phase: Option<&'a [f64]>,

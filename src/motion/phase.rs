@@ -55,7 +55,7 @@ pub enum BeatsPerBarSource {
     Given,
     /// The highest beat number.
     Numbers,
-    /// Nobody said it: [`DEFAULT_BEATS_PER_BAR`].
+    /// Not stated: [`DEFAULT_BEATS_PER_BAR`].
     Default,
 }
 

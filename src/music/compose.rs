@@ -103,7 +103,7 @@ fn tempo(style: &Style, chance: &mut Chance) -> (f64, Drift) {
     (bpm, drift)
 }
 
-/// What plays in a section.
+/// The layers that play in a section.
 #[derive(Clone, Copy, Debug)]
 struct Layers {
     drums: Amount,
@@ -123,7 +123,7 @@ struct SectionPlan {
     rises: bool,
 }
 
-/// What a song has decided before its first note.
+/// The decisions on a song before its first note.
 #[derive(Clone, Debug)]
 struct SongPlan {
     style: &'static Style,
@@ -282,7 +282,7 @@ impl SongPlan {
     }
 }
 
-/// Draws the sections of a song of so many times four bars.
+/// Draws the sections of a song of `n_fours` times four bars.
 fn sections(n_fours: usize, chance: &mut Chance) -> Vec<SectionPlan> {
     use SectionKind::{Break, Chorus, Intro, Outro, Verse};
     let mut kinds = vec![(Intro, 1)];

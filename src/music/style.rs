@@ -9,7 +9,7 @@ use super::styles;
 /// One bar of drums: a pattern for every voice that plays.
 pub type Groove = &'static [(Voice, &'static str)];
 
-/// What lies off the grid when a style swings.
+/// The subdivision that a style swings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SwingGrid {
     Eighths,

@@ -24,7 +24,7 @@ const PAGE_BYTES: usize = 4096;
 #[derive(Clone, Debug)]
 pub struct ModelFile {
     pub graph: Graph,
-    /// What is told of the model: key and value.
+    /// Metadata of the model: key and value.
     pub metadata: BTreeMap<String, String>,
     pub description: String,
 }

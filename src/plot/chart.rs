@@ -27,7 +27,7 @@ const HEAD_SHARE: f64 = 0.98;
 /// Space above the greatest value of a linear axis, as a factor.
 const HEADROOM: f64 = 1.05;
 
-/// What a curve tells, which decides how it looks.
+/// The kind of a curve, which decides how it looks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum CurveKind {
     Steps,

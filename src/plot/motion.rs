@@ -16,7 +16,7 @@ use crate::units::{FPS, frames_to_s};
 /// A motion, or an excerpt, and what is known of its beats.
 #[derive(Clone, Copy, Debug)]
 pub struct MotionPlot<'a> {
-    /// What stands over the plot, for example the name of the phrase.
+    /// The title of the plot, for example the name of the phrase.
     pub title: &'a str,
     /// Values that are not finite are gaps.
     pub motion: &'a Trajectory,

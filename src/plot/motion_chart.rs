@@ -23,7 +23,7 @@ const BAND_OPACITY: f64 = 0.2;
 const PAD_SHARE: f64 = 0.05;
 /// Norms beyond this factor of 1 are no quaternions, and have an axis from 0.
 const MAX_NORM_FACTOR: f64 = 2.0;
-/// The log axis of jerk ends so far below its head: nobody looks for less.
+/// Lower end of the log axis of jerk as a share of its head; smaller values are of no interest.
 const JERK_SHARE: f64 = 1e-6;
 /// Least distance of two labels on the axis of norms.
 const LABEL_PX: f64 = 20.0;
@@ -41,7 +41,7 @@ const LEGEND_UP_PX: f64 = 12.0;
 const AXES: [(&str, Rgb); 3] = [("x", BLUE), ("y", GREEN), ("z", PURPLE)];
 const W: (&str, Rgb) = ("w", INK);
 
-/// What one curve shows.
+/// The values of one curve.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Line {
     /// Empty where the heading says it all.

@@ -10,7 +10,7 @@ use crate::motion::quaternion::{dot, normalize, rotate};
 use crate::motion::{Channel, Trajectory};
 use crate::units::FPS;
 
-/// What is shown around the path, as a share of its longer side, and the least side that is shown.
+/// The margin around the path, as a share of its longer side, and the least side that is shown.
 const PAD_SHARE: f64 = 0.08;
 const MIN_SIDE_M: f64 = 0.5;
 /// Room for a tick of either axis.

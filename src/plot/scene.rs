@@ -83,7 +83,7 @@ pub(super) struct Image {
 pub(super) struct Scene {
     pub width_px: f64,
     pub height_px: f64,
-    /// What the page shows, for readers that cannot see it.
+    /// A description of the page, for readers that cannot see it.
     pub title: String,
     pub items: Vec<SceneItem>,
 }

@@ -14,13 +14,13 @@ use super::{Format, Picture, PlotError, check_width, font, write};
 /// A run, as far as it is drawn.
 #[derive(Clone, Copy, Debug)]
 pub struct TrainingPlot<'a> {
-    /// What stands over the plot: the run's name.
+    /// The title of the plot: the run's name.
     pub title: &'a str,
     /// Stages to draw, from the top.
     pub stages: &'a [StageCurves],
 }
 
-/// What was logged of a stage.
+/// The logged rows of a stage.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StageCurves {
     pub stage: TrainingStage,

@@ -80,7 +80,7 @@ impl ValueAxis {
         }
     }
 
-    /// Returns 1, 2 and 5 times the powers of ten if these have room, else the powers or every so many
+    /// Returns 1, 2 and 5 times the powers of ten if these have room, else the powers or every nth
     /// of them; round numbers where the axis is too short for three of those.
     fn log_ticks(&self, height_px: f64, max_ticks: usize) -> Vec<Tick> {
         let fits = |ticks: &[Tick]| {

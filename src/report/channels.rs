@@ -16,7 +16,7 @@ const FOOT_PX: f64 = 16.0;
 const BAR_PX: f64 = 6.0;
 
 /// Writes the channels of one split as a figure with a bar for what was generated and one for held-out real
-/// motion; where neither has numbers, for whoever has.
+/// motion; where neither has numbers, for every subject that has.
 pub(super) fn bars(out: &mut String, rows: &[&Row], caption: &str) {
     let shown = shown(rows);
     let shown_values = |row: &Row| -> Vec<Option<f64>> {

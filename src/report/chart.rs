@@ -15,8 +15,8 @@ const SIDE_PX: f64 = 5.0;
 const DOT_PX: f64 = 2.4;
 const OWN_DOT_PX: f64 = 3.4;
 
-/// Values of which the largest is so many times the smallest are on a scale of logarithms; beyond that the
-/// smallest is a zero that was rounded.
+/// Ratios of the largest value to the smallest for which the scale is logarithmic; beyond them the smallest is a
+/// zero that was rounded.
 const LOG_RATIOS: std::ops::Range<f64> = 30.0..1e9;
 /// Fewer values than this are no comparison.
 const MIN_VALUES: usize = 2;

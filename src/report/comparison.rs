@@ -8,7 +8,7 @@ use super::{BetterDirection, ComparedRun, Metric, PairedNumber, Report};
 /// A paired difference with a lower p, adjusted by Holm, is not put down to chance.
 pub(super) const SIGNIFICANT_P: f64 = 0.05;
 
-/// What two numbers say of each other.
+/// The outcome of comparing two numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Change {
     Worse,

@@ -47,15 +47,15 @@ impl Section {
 pub(super) const VERDICTS: [(&str, Section); 4] =
     [("sound", Sound), ("like_real", Real), ("follows_music", Music), ("varied", Varied)];
 
-/// What a metric means.
+/// The meaning of a metric.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Meaning {
     pub metric: &'static str,
     pub section: Section,
     pub better: BetterDirection,
-    /// What is measured.
+    /// The measured quantity.
     pub text: &'static str,
-    /// What chance gives, or what is perfect.
+    /// The value by chance, or the perfect one.
     pub ideal: &'static str,
 }
 

@@ -68,7 +68,7 @@ pub struct VerdictTest {
     /// Its name in tables, such as `other_music`.
     pub test: String,
     pub outcome: Outcome,
-    /// What is measured, in words.
+    /// The measured statistic, in words.
     pub statistic: String,
     /// None where there is too little to tell; such a test is not shown as won.
     pub value: Option<f64>,
@@ -85,7 +85,7 @@ pub struct VerdictTest {
     pub message: String,
 }
 
-/// What tests say together of one question about a run.
+/// The answer of several tests to one question about a run.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Verdict {
     /// `sound`, `like_real`, `follows_music` or `varied`.
@@ -110,7 +110,7 @@ pub enum BetterDirection {
 /// One measured number, as the table `metrics` has it.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Metric {
-    /// Whose number it is: `generated`, or what it is compared with, such as `held_out_truth`.
+    /// The subject that was measured: `generated`, or what it is compared with, such as `held_out_truth`.
     pub subject: String,
     /// Which music: `all`, `held_out`, `validation`, `trained_on` or `unknown`.
     pub split: String,
@@ -123,7 +123,7 @@ pub struct Metric {
     /// Ends of its 95 % interval.
     pub ci_low: Option<f64>,
     pub ci_high: Option<f64>,
-    /// What was counted.
+    /// How many items were measured.
     pub n: i64,
     /// How it was measured.
     pub protocol: String,
@@ -213,7 +213,7 @@ pub struct ComparedRun {
     pub settings: Vec<(String, String, String)>,
 }
 
-/// What a report tells.
+/// The content of a report.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Report {
     pub title: String,

@@ -7,7 +7,7 @@ use super::numbers::{MISSING, interval, value};
 use super::rows::{Row, rows, subjects};
 use super::{BY_CONSTRUCTION, BetterDirection, Metric, Report, channels, chart};
 
-/// What is said over variants that reproduce a published formula.
+/// The note on variants that reproduce a published formula.
 const COMPAT: &str = "These reproduce a published formula that has a defect, a misplaced parenthesis in \
                       its acceleration, and are only for comparison with published numbers.";
 

@@ -127,7 +127,7 @@ fn of_command(
     }))
 }
 
-/// Why nobody knows what the model of a motion learned from.
+/// Why it is not known what the model of a motion learned from.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum LearnedFromError {

@@ -69,7 +69,7 @@ pub fn default_model_cache() -> PathBuf {
 pub struct OpenModel {
     pub card: ModelCard,
     source: Source,
-    /// What messages call it.
+    /// The name in messages.
     place: String,
     /// Whether the files' digests are known to be those of the card.
     is_verified: bool,
@@ -92,7 +92,7 @@ pub const POINTER: &str = "current.json";
 /// Digits of the name of such a folder.
 const VERSION_DIGITS: usize = 32;
 
-/// What [`POINTER`] says.
+/// The content of [`POINTER`].
 #[derive(serde::Serialize, serde::Deserialize)]
 struct Pointer {
     folder: String,

@@ -45,7 +45,7 @@ pub struct MotionParams {
     pub samples: Vec<usize>,
 }
 
-/// How many motions have room.
+/// How many motions can be displayed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MotionCapacity {
     /// A plot's.
@@ -54,10 +54,10 @@ pub enum MotionCapacity {
     Many,
 }
 
-/// What is shown.
+/// Motions to display, with title and beats.
 #[derive(Clone, Debug)]
 pub struct MotionDisplay {
-    /// What stands over it.
+    /// The title above it.
     pub title: String,
     /// One or more.
     pub shown: Vec<DisplayedMotion>,

@@ -5,7 +5,7 @@
 
 use crate::store::{Commit, Item, Ledger, Location, SettledItem, StoreError, digest_texts};
 
-/// What a stage has seen again.
+/// Items whose content a stage has seen again under another fingerprint.
 #[derive(Debug)]
 pub struct SeenContent {
     stage: &'static str,

@@ -30,11 +30,11 @@ pub struct TrainedRun {
     pub stage: &'static str,
     /// The validation loss of what the stage minimises.
     pub loss: Option<f64>,
-    /// What fine-tuned weights learned from; none for those of train.
+    /// The data that fine-tuned weights learned from; none for those of train.
     pub tuned: Option<FinetuneData>,
 }
 
-/// What finetune learned from.
+/// The data that finetune learned from.
 #[derive(Clone, Debug)]
 pub struct FinetuneData {
     /// Fingerprint of its dataset.

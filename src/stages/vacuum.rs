@@ -52,7 +52,7 @@ impl fmt::Display for Age {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let seconds = self.0.as_secs();
         let is_whole = |(_, unit): &&(char, u64)| seconds >= *unit && seconds.is_multiple_of(*unit);
-        // Seven days are a week, but nobody says so of what can be other numbers of days.
+        // Seven days are a week, but ages are usually given in days, so that weeks are not printed.
         let (name, unit) = UNITS.iter().skip(1).find(is_whole).unwrap_or(&('s', 1));
         write!(f, "{}{name}", seconds / unit)
     }

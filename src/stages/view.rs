@@ -208,7 +208,7 @@ fn page_of(subject: MotionDisplay, audio: Option<Audio>) -> Page {
     Page { title: subject.title, samples: samples.collect(), beats_s: subject.beats_s, audio }
 }
 
-/// What was made.
+/// The summary of a page: its sizes and its file.
 struct ViewSummary {
     n_motions: usize,
     n_frames: usize,

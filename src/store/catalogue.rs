@@ -45,7 +45,7 @@ const FAILURE: &str = "failure";
 /// Why a catalogue is of no use.
 pub(super) type UnusableReason = String;
 
-/// What the footer of a catalogue says.
+/// The content of a catalogue's footer.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub(super) struct Meta {
     format: u32,
@@ -76,7 +76,7 @@ pub(super) struct Catalogue {
     file: ParquetObject,
 }
 
-/// The latest word on an item, as a catalogue has it.
+/// The latest settlement of an item, as a catalogue has it.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct CatalogueRow<'a> {
     pub item: &'a str,

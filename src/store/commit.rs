@@ -37,7 +37,7 @@ struct OpenPart {
     writer: PartWriter,
 }
 
-/// What a commit added.
+/// The rows and bytes that a commit added.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct CommitResult {
     pub n_rows: u64,

@@ -1,8 +1,8 @@
 //! Compaction: parts that hold dead rows or are small are written anew, whole.
 //!
-//! What counts does not change, so nobody has to wait: a compaction repeats the latest word on each item under the
-//! rank of the commit that settled it. Who settles an item meanwhile outranks it, and of two compactions of the
-//! same items one counts. The old parts stay where they are until vacuum takes them.
+//! The live rows do not change, so other processes need not wait: a compaction repeats the latest settlement of each
+//! item under the rank of the commit that settled it. A commit that settles an item meanwhile outranks it, and of
+//! two compactions of the same items one counts. The old parts stay where they are until vacuum takes them.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
@@ -32,7 +32,7 @@ const MAX_BYTES: u64 = 64 << 20;
 /// A commit is small that has less than this share of both.
 const SMALL: u64 = 4;
 
-/// What a compaction did, or would do.
+/// The result of a compaction, or of its dry run.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Compaction {
     /// Parts that counted before, in all stages.

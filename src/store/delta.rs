@@ -22,7 +22,7 @@ const FOLDER: &str = "_delta_log";
 /// Times that a version is written again that another process wrote first.
 const RETRIES: usize = 8;
 
-/// What a table's log says.
+/// The state of a table by its log.
 #[derive(Default)]
 struct Log {
     next_version: u64,

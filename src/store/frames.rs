@@ -123,7 +123,7 @@ impl<'a> FrameColumns<'a> {
 }
 
 /// Rows of numbers of one width, appended in any order and read at random: in memory, or in a file of
-/// this machine that nobody else sees and that goes with the program.
+/// this machine that other processes do not see and that is removed with the program.
 #[derive(Debug)]
 pub struct FrameSpool {
     width: usize,

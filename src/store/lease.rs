@@ -2,7 +2,7 @@
 //!
 //! `leases/<name>/<number>.json`, each put unless it is there: the highest number tells who holds the lease and until
 //! when. The holder renews it under the next number for as long as it lives; when it is killed the lease runs out,
-//! and whoever waits takes the next number. Nobody ever has to change an object.
+//! and a process that waits takes the next number. No object is ever changed.
 
 use std::path::Path as FsPath;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -37,7 +37,7 @@ struct LeaseTerms {
 struct Holder {
     host: String,
     pid: u32,
-    /// What tells this machine since it was started, and its process numbers, from all others.
+    /// The identity of this machine since it was started, as process numbers are only unique there.
     machine: String,
     /// When the process started, in ticks since the machine did.
     started: String,
@@ -124,7 +124,7 @@ impl Lease {
                 store.remove(&format!("{}/{number:010}.json", folder(name)))?;
                 continue;
             }
-            // Somebody else was faster; it is looked at again, as one that was renewed.
+            // Another process was faster; the lease is looked at again, as one that was renewed.
             seen = Some(number - 1);
         }
     }
@@ -301,7 +301,7 @@ fn started(pid: u32) -> Option<String> {
     // The name of the program may hold anything; what follows it is the third field.
     let (_, rest) = stat.rsplit_once(')')?;
     let mut fields = rest.split_whitespace();
-    // A process that ended and that nobody has waited for is dead.
+    // A process that ended and was not yet waited for is dead.
     let state = fields.next()?;
     (state != "Z" && state != "X").then_some(())?;
     fields.nth(18).map(str::to_owned)
@@ -323,7 +323,7 @@ fn latest(store: &Location, name: &str) -> Result<Option<(u64, LeaseTerms)>, Sto
         let Some((number, path)) = numbers.max() else { return Ok(None) };
         // One that was renewed meanwhile is gone.
         let Some(bytes) = store.read_if_there(path)? else { continue };
-        // What cannot be read is over as soon as somebody takes the next number.
+        // A lease that cannot be read is over as soon as a process takes the next number.
         let terms = serde_json::from_slice(&bytes).unwrap_or(LeaseTerms {
             holder: Holder::default(),
             expires_us: 0,

@@ -9,16 +9,16 @@ use super::location::Location;
 use super::manifest::{Header, Item, Manifest};
 use super::stage_log::StageLog;
 
-/// What a store knows of one stage's items.
+/// The settled items of one stage in a store.
 #[derive(Debug, Default)]
 pub struct Ledger {
     /// Sorted by id: of a million items a list takes half the memory of a map that repeats their ids.
     settled: Vec<SettledItem>,
-    /// What was settled since, which counts before it.
+    /// Items that were settled since, which take precedence.
     added: HashMap<String, SettledItem>,
 }
 
-/// The latest word on an item, and what the commit that settled it says of all its items.
+/// The latest settlement of an item, with the header of the commit that settled it.
 #[derive(Clone, Debug)]
 pub struct SettledItem {
     pub item: Item,

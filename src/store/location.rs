@@ -39,7 +39,7 @@ pub(crate) enum LocationKind {
     Remote { store: Arc<dyn ObjectStore>, prefix: ObjectPath },
 }
 
-/// What a listing tells of one object, or of one file below a local folder.
+/// An object of a listing, or a file below a local folder.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ListedObject {
     /// Path below the location, `/`-separated.
@@ -252,7 +252,7 @@ impl Location {
         }
     }
 
-    /// Reads a whole object that somebody else wrote, if it is a regular file of at most so many bytes.
+    /// Reads a whole object that another program wrote, if it is a regular file of at most `max_bytes`.
     ///
     /// # Errors
     /// [`StoreError::NotAFile`], [`StoreError::TooLarge`], and as [`Location::read`].
@@ -268,7 +268,7 @@ impl Location {
     /// Returns whether anything was ever committed here.
     ///
     /// # Errors
-    /// What the storage says.
+    /// The error of the storage.
     pub fn is_store(&self) -> Result<bool, StoreError> {
         match &self.kind {
             LocationKind::Local(root) => Ok(root.join(COMMITS).is_dir()),
@@ -284,7 +284,7 @@ impl Location {
     /// Reads a whole object; none where there is no such object.
     ///
     /// # Errors
-    /// What the storage says.
+    /// The error of the storage.
     pub fn read_if_there(&self, path: &str) -> Result<Option<Bytes>, StoreError> {
         match self.read(path) {
             Err(StoreError::NotFound { .. }) => Ok(None),
@@ -334,7 +334,7 @@ impl Location {
     /// Writes `bytes` at `path` in place of what is there: the old or the new is there at any moment, whole.
     ///
     /// # Errors
-    /// What the storage says.
+    /// The error of the storage.
     pub fn replace(&self, path: &str, bytes: Bytes) -> Result<(), StoreError> {
         let place = || self.url_of(path);
         match &self.kind {
@@ -365,7 +365,7 @@ impl Location {
         .map_err(|e| StoreError::io("make a temporary file beside it", &self.url_of(path), e))
     }
 
-    /// Says of a local file that it was written now, so that nobody takes it for abandoned; best effort.
+    /// Sets the time of a local file to now, so that it is not taken for abandoned; best effort.
     pub(crate) fn touch(&self, path: &str) {
         if let LocationKind::Local(root) = &self.kind
             && let Ok(file) = std::fs::File::options().write(true).open(root.join(path))
@@ -377,7 +377,7 @@ impl Location {
     /// Removes an object; one that is gone already is no error.
     ///
     /// # Errors
-    /// What the storage says.
+    /// The error of the storage.
     pub fn remove(&self, path: &str) -> Result<(), StoreError> {
         let place = || self.url_of(path);
         let removed = match &self.kind {

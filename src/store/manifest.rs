@@ -43,7 +43,7 @@ pub struct CompactionOrigin {
     pub of: Vec<u32>,
 }
 
-/// What a commit says of all its items.
+/// The properties that all items of a commit share.
 #[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Header {
     pub key: String,

@@ -73,7 +73,7 @@ fn is_descriptor_folder(folder: &FsPath) -> bool {
 /// Symbolic links are followed; pipes and devices are written to, and `-` is standard output.
 ///
 /// # Errors
-/// What the file system or `write` says; the old file is untouched then.
+/// The error of the file system or of `write`; the old file is untouched then.
 pub fn write_file(
     path: &FsPath,
     write: impl FnOnce(&mut dyn Write) -> std::io::Result<()>,
@@ -96,7 +96,7 @@ pub fn write_file(
 /// Creates the temporary file for what [`replace_file`] will publish at `path`.
 ///
 /// # Errors
-/// What the file system says.
+/// The error of the file system.
 pub fn temporary_beside(path: &FsPath) -> std::io::Result<tempfile::NamedTempFile> {
     match OutputTarget::of(path)? {
         OutputTarget::File(path) => temporary_in(path.parent().unwrap_or(FsPath::new("."))),
@@ -107,7 +107,7 @@ pub fn temporary_beside(path: &FsPath) -> std::io::Result<tempfile::NamedTempFil
 /// Publishes a finished temporary file at `path`, as [`write_file`] does.
 ///
 /// # Errors
-/// What the file system says; the old file is untouched then.
+/// The error of the file system; the old file is untouched then.
 pub fn replace_file(path: &FsPath, file: tempfile::NamedTempFile) -> std::io::Result<()> {
     match OutputTarget::of(path)? {
         OutputTarget::File(path) => publish(&path, file),

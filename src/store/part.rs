@@ -39,7 +39,7 @@ struct FrameBuffer {
     channels: Vec<Vec<f32>>,
 }
 
-/// What names an item beside its own column; the same for all its frames.
+/// The value of a label column of an item; the same for all its frames.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Label {
     Text(String),

@@ -20,10 +20,10 @@ use super::store_snapshot::{LivePart, StoreSnapshot};
 use super::tables;
 use super::{ClientOptions, StoreError};
 
-/// What polars calls a count that has no name.
+/// The name that polars gives to a count without one.
 const COUNT_COLUMN: &str = "len";
 
-/// What a store holds of one table.
+/// The size and schema of a table in a store.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TableInfo {
     pub name: &'static str,
@@ -36,7 +36,7 @@ pub struct TableInfo {
 
 /// Reads one SQL statement over the tables of a store.
 ///
-/// Selections and filters are pushed down to the Parquet parts; a table that nobody has written yet is empty.
+/// Selections and filters are pushed down to the Parquet parts; a table that was never written is empty.
 /// Rows are read when the answer is written.
 ///
 /// # Errors

@@ -24,7 +24,7 @@ pub struct Snapshot {
 }
 
 impl Snapshot {
-    /// Takes a snapshot of a table; a table that nobody has written is empty.
+    /// Takes a snapshot of a table; a table that was never written is empty.
     ///
     /// # Errors
     /// [`StoreError::SchemaVersion`] when a part is of a version that is not read; [`StoreError`] when

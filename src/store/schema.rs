@@ -18,7 +18,7 @@ pub struct TableSchema {
     /// The oldest version that is read: since then only nullable columns were added, which are null in older
     /// parts.
     pub oldest_version: u32,
-    /// What one row is.
+    /// The meaning of one row.
     pub description: &'static str,
     pub columns: Vec<Column>,
     /// Columns by which the rows of a part are sorted.

@@ -95,8 +95,8 @@ impl Shard {
 
 /// Returns the place of a Slurm task among the `count` of its array.
 ///
-/// A list of tasks does not say how many there were when the job was cut into shards, so whoever did only its own
-/// would leave phrases to nobody.
+/// A list of tasks does not say how many there were when the job was cut into shards; if each task did only its
+/// own shard, phrases would be left out.
 fn place_in_array(
     id: u32,
     count: u32,

@@ -40,7 +40,7 @@ pub struct SourceProblem {
     /// Path below the source; bytes that are not UTF-8 are shown as U+FFFD.
     pub path: String,
     pub kind: SourceProblemKind,
-    /// What is wrong, as the predicate of a sentence about the path.
+    /// The problem, as the predicate of a sentence about the path.
     pub message: String,
 }
 
@@ -183,7 +183,7 @@ impl Source {
                         .buffered(window);
                     let mut fetched = std::pin::pin!(fetched);
                     while let Some(content) = fetched.next().await {
-                        // The reader is gone: nobody wants the rest.
+                        // The receiver is dropped: the rest is not wanted.
                         if sender.send(content).await.is_err() {
                             break;
                         }

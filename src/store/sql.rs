@@ -100,7 +100,7 @@ fn named(query: &Query) -> Option<String> {
         }
         let text = expr.to_string().replace('"', "");
         let n_before = names.iter().filter(|(before, _)| before == expr).count();
-        // Who asks for the same twice is given it twice.
+        // An expression that is selected twice gets two columns.
         let name = if n_before == 0 { text } else { format!("{text} {}", n_before + 1) };
         names.push((expr.clone(), name.clone()));
         *item =

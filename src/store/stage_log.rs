@@ -14,8 +14,8 @@ use super::manifest::{self, FOLDER, Header, Item, Manifest, Part, Rank, stage_an
 /// Times that a listing is taken again, where what it told of was gone before it was read.
 const RETRIES: usize = 4;
 /// Least manifests that a catalogue is written for, and how many of those that it covers come to one that it
-/// does not before another is written: all catalogues of a growing store together cost as much as so many of the
-/// last one.
+/// does not before another is written: all catalogues of a growing store together cost as much as
+/// `COVERED_PER_NEWER` of the last one.
 const MIN_NEWER: usize = 16;
 const COVERED_PER_NEWER: usize = 16;
 
@@ -63,7 +63,7 @@ impl CommitState {
     }
 }
 
-/// The latest word on an item.
+/// The latest settlement of an item.
 pub(super) struct ItemRecord<'a> {
     pub item: Item,
     pub header: &'a Header,
@@ -356,7 +356,7 @@ impl StageLog {
     }
 }
 
-/// The latest word that newer manifests have on each item.
+/// The latest settlement of each item in newer manifests.
 struct NewestItems<'a> {
     headers: Vec<Vec<Header>>,
     manifests: &'a [Manifest],

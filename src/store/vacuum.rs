@@ -1,4 +1,5 @@
-//! Vacuum: commits whose rows all were superseded go, with their parts, once nobody reads them any more.
+//! Vacuum: commits whose rows all were superseded are removed, with their parts, once no reader needs them any
+//! more.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::time::{Duration, SystemTime};
@@ -15,7 +16,7 @@ use super::tables;
 /// writes its parts first.
 const ABANDONED: Duration = Duration::from_secs(24 * 3600);
 
-/// What vacuum removes.
+/// The files that vacuum removes.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct VacuumRemovals {
     /// Manifests and parts, below the store, in order.
@@ -26,7 +27,7 @@ pub struct VacuumRemovals {
 }
 
 /// Removes what has been dead for longer than `older_than`, and parts that writers who were killed left behind; with
-/// `dry_run` it tells what it would remove. Whoever took a snapshot longer ago loses its parts.
+/// `dry_run` it tells what it would remove. A snapshot that is older loses its parts.
 ///
 /// # Errors
 /// [`StoreError`] when the store cannot be read, or refuses to remove.

@@ -12,7 +12,7 @@ use super::error::TrainingError;
 pub(super) const AVERAGE: &str = "ema.";
 pub(super) const MOMENTS: [&str; 2] = ["adam.m.", "adam.v."];
 
-/// What changes while one network is trained, and how it is saved.
+/// The state of one network in training: parameters, optimizer and moving average, and how they are saved.
 pub struct NetworkState {
     /// Section of the weights.
     prefix: &'static str,

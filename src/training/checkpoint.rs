@@ -33,7 +33,7 @@ pub struct State<C> {
     pub progress: Progress,
 }
 
-/// What changes from step to step.
+/// The progress of a training, which changes from step to step.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Progress {
     /// Steps done.
@@ -109,7 +109,7 @@ pub struct Checkpoints<'a> {
     folder: String,
 }
 
-/// What a checkpoint is for.
+/// The purpose of a checkpoint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum CheckpointKind {
     /// Everything, to go on from.

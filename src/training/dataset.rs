@@ -21,7 +21,7 @@ use crate::store::{
 /// features is centred on the end of the audio, and both lengths are rounded.
 const LENGTH_TOLERANCE_FRAMES: usize = 3;
 
-/// What a phrase is used for.
+/// The use of a phrase in training.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Split {
     Train,
@@ -126,7 +126,7 @@ pub enum DatasetError {
     },
 }
 
-/// What one table gave of a phrase.
+/// The frames of a phrase as read from one table.
 struct PhraseFrames {
     row: u64,
     n_frames: usize,

@@ -159,10 +159,10 @@ impl DiffusionLearner {
         Ok(loss)
     }
 
-    /// Returns what is lost on the validation windows by those who do not look.
+    /// Returns the losses on the validation windows of predictors that ignore their input.
     ///
     /// # Errors
-    /// What reading the windows says.
+    /// The error of reading the windows.
     pub fn baselines(&self) -> Result<Baselines, TrainingError> {
         let mean = self.mean_over_validation(|given| Ok(given.mean_target()))?;
         let [constant, untrained] = self.mean_over_validation(|given| {
@@ -246,7 +246,7 @@ impl WithholdProbabilities {
     }
 }
 
-/// What the network is given of a batch, and what it should say.
+/// Inputs of the denoiser for a batch, with its target.
 pub struct DiffusionInputs<'a> {
     batch: &'a Batch,
     pub t: Vec<usize>,

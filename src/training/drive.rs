@@ -17,8 +17,8 @@ use super::window::Batch;
 
 /// Steps in a row that may be skipped because something is not finite.
 const MAX_SKIPPED_IN_A_ROW: u32 = 10;
-/// How long steps are tried, without effect, to see how many fit into a time: at least so many, and for so
-/// long, but not more than a share of the time.
+/// How long steps are rehearsed, without effect, to estimate how many fit into a time: at least `MIN_TRIED` steps
+/// and `TRIED_S` seconds, but at most the share `SHARE_TRIED` of the time.
 const MIN_TRIED: u64 = 3;
 const TRIED_S: f64 = 8.0;
 const SHARE_TRIED: f64 = 0.02;
@@ -26,7 +26,7 @@ const SHARE_TRIED: f64 = 0.02;
 /// validations take the rest.
 const SHARE_OF_TIME: f64 = 0.92;
 
-/// Losses by name, and what is minimised.
+/// The loss that is minimised, and its parts by name.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Losses {
     pub total: f64,
@@ -47,7 +47,7 @@ impl Losses {
     }
 }
 
-/// What a step came to.
+/// The result of a training step.
 #[derive(Clone, Debug)]
 pub struct StepResult {
     pub losses: Losses,
@@ -63,7 +63,7 @@ impl StepResult {
     }
 }
 
-/// What a validation came to.
+/// The losses of a validation.
 #[derive(Clone, Debug)]
 pub struct Validation {
     /// Of the weights that would be used: the average, where there is one.
@@ -80,7 +80,7 @@ pub trait Reducer: Send + Sync {
     fn reduce(&mut self, gradients: &mut Gradients<f32>);
 }
 
-/// A trainer alone.
+/// The reducer of a single process: leaves the gradients as they are.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct NoReduction;
 
@@ -88,7 +88,7 @@ impl Reducer for NoReduction {
     fn reduce(&mut self, _gradients: &mut Gradients<f32>) {}
 }
 
-/// What learns.
+/// A network, or both, with its optimizer: takes training steps and validates.
 pub trait Learner: Send {
     /// Name of the stage, as tables and folders spell it.
     const STAGE: &'static str;
@@ -186,7 +186,7 @@ impl Plan {
     }
 }
 
-/// Whoever looks on.
+/// Receives progress events of a training.
 pub trait Watch {
     /// Training begins at `step` of `n_steps`.
     fn begin(&self, stage: &'static str, step: u64, n_steps: u64);
@@ -194,7 +194,7 @@ pub trait Watch {
     fn step(&self, said: &str);
     /// Something worth a line.
     fn note(&self, line: &str);
-    /// Whether someone asked for an end.
+    /// Whether the user asked for an end.
     fn is_interrupted(&self) -> bool;
     /// Memory of the process, in bytes, if it can be told.
     fn resident_bytes(&self) -> Option<u64>;
@@ -211,7 +211,7 @@ pub enum TrainingEnd {
     OutOfTime,
     /// Nothing improved any more.
     Stale,
-    /// Someone asked for it.
+    /// The user asked for an end.
     Interrupted,
 }
 

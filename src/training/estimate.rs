@@ -17,8 +17,8 @@ use crate::model::{Graph, Result};
 use crate::motion::{Channel, MOTION_DIM, Normalizer};
 use crate::units::FPS;
 
-/// The next derivative of captured motion is so many times as large, 1/s: its jerk is 19 times its acceleration
-/// (38 m/s³ and 2 m/s² on constructed dance, 42 and 2.2 on captured).
+/// Ratio of the size of a derivative of captured motion to that of the one before, 1/s: its jerk is 19 times its
+/// acceleration (38 m/s³ and 2 m/s² on constructed dance, 42 and 2.2 on captured).
 const RATE_PER_S: f64 = 20.0;
 
 /// Weights of the losses on the estimate; with zeros nothing is added.

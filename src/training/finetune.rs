@@ -40,7 +40,7 @@ const N_VALIDATION: usize = 64;
 /// Section of both networks beside the optimizer's.
 const BOTH: &str = "model.";
 
-/// What is said of motion that was sampled and decoded.
+/// Motion that was sampled and decoded, with its losses.
 struct SampledMotion<T> {
     position: T,
     quaternion: T,
@@ -48,7 +48,7 @@ struct SampledMotion<T> {
     decoded: T,
 }
 
-/// What end-to-end training adds up, and the motion that it is about.
+/// The losses of end-to-end training, and the decoded motion that they measure.
 pub struct EndToEndLosses<T> {
     pub total: T,
     pub diffusion: T,

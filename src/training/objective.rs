@@ -23,7 +23,7 @@ pub struct Objective {
     /// How channels are weighed; as release 0.1 did, all alike, where a run says nothing.
     #[serde(default)]
     pub channels: ChannelWeights,
-    /// What is asked of the estimate of clean motion beside.
+    /// Additional losses on the estimate of clean motion.
     #[serde(default)]
     pub estimate: EstimateLosses,
 }

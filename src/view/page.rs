@@ -66,7 +66,7 @@ fn write_audio(out: &mut String, audio: Option<&Audio>) {
     out.push_str("\"></audio>\n");
 }
 
-/// What the script reads.
+/// The data that the script reads.
 #[derive(Serialize)]
 struct Data<'a> {
     fps: f64,

@@ -59,7 +59,7 @@ fn zeros<E: Element>() -> Vec<E> {
     vec![E::ZERO; BLOCK]
 }
 
-/// What a product multiplies with its rows: panels for a run of k.
+/// The right-hand side of a product, as panels for a run of k.
 struct Block<E> {
     b: *const E,
     b_panel: usize,

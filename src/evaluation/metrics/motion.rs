@@ -32,7 +32,7 @@ const MAX_COMPARED_PER_SONG: usize = 24;
 /// Songs, evenly among all, that are compared with each other.
 const MAX_COMPARED_SONGS: usize = 48;
 
-/// What windows are held against.
+/// Reference values that windows are compared with.
 #[derive(Clone, Copy, Debug)]
 pub struct MotionContext<'a> {
     pub reference: Option<&'a ReferenceStatistics>,

@@ -17,10 +17,10 @@ use super::{MotionWindow, MusicWindow, Number, SEED, mean_over, staged};
 /// Wrong tempi that locking is held against.
 pub const N_WRONG_TEMPI: usize = 199;
 
-/// What windows are held against.
+/// Reference values that windows are compared with.
 #[derive(Clone, Copy, Debug)]
 pub struct MusicContext<'a> {
-    /// What vertical velocity is known to owe to the bar; none where that is not known.
+    /// The known dependence of vertical velocity on the phase in the bar; none where it is not known.
     pub coupling: Option<&'a Coupling>,
     /// Wrong tempi that are tried; none of them where there is no need.
     pub n_wrong_tempi: usize,

@@ -325,7 +325,7 @@ fn noise_belongs_to_frames_and_seeds() {
     let all = fill(0..windows.len(), 5, 0);
     let shift = windows.shift(1);
     let window = 40 * MOTION_DIM;
-    // What two windows share has one noise, and a window has the same in any run.
+    // Frames that two windows share have one noise, and a window has the same in any run.
     assert_eq!(all[shift * MOTION_DIM..window], all[window..window + (40 - shift) * MOTION_DIM]);
     assert_eq!(fill(1..2, 5, 0), all[window..2 * window]);
     assert!(fill(1..2, 5, 1) != fill(1..2, 5, 0) && fill(1..2, 6, 0) != fill(1..2, 5, 0));

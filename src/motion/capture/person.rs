@@ -41,7 +41,7 @@ const ENDS: [(usize, Vector); 5] = [
     (15, [-0.15, 0.0, 0.0]),
 ];
 
-/// What the person does.
+/// The action of the person.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum PersonAction {
     Walks,
@@ -73,7 +73,7 @@ pub struct Person {
     pub own_axes: bool,
     /// Whether every joint has position channels, and offsets are zero.
     pub six_channels: bool,
-    /// What stands above the hips: place, m, and constant turn.
+    /// The nodes above the hips: place, m, and constant turn.
     pub above: Vec<(Vector, Quaternion)>,
     /// Whether the topmost joint also holds a thing that stays where it is.
     pub prop: bool,

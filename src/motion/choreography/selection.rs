@@ -110,7 +110,7 @@ struct Chooser<'a> {
     grid: &'a BeatGrid,
     activity: &'a [f64],
     repertoire: &'a Repertoire,
-    /// Whether so many beats can be filled.
+    /// Whether a number of beats can be filled with primitives, by that number.
     fills: Vec<bool>,
 }
 
@@ -192,7 +192,7 @@ impl Chooser<'_> {
     }
 }
 
-/// What orders candidates that are equally near.
+/// Returns the sort key of candidates that are equally near.
 fn key(step: &DanceStep) -> (usize, Option<usize>) {
     (step.n_beats, step.primitive)
 }

@@ -70,7 +70,7 @@ impl Displacement {
     }
 }
 
-/// What was decoded of a motion, frame by frame; all four of one length.
+/// The decoded channels of a motion, frame by frame, as measurements to fuse; all of one length.
 pub(super) struct FusionMeasurements {
     /// p̂, m.
     pub position: Vec<[f64; 3]>,

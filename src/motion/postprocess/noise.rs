@@ -56,7 +56,7 @@ pub fn truth(n: usize) -> Poses {
     }
 }
 
-/// What a decoder without any error says of poses, in double precision.
+/// Returns the output of a decoder without any error for poses, in double precision.
 pub fn exact(poses: &Poses) -> FusionMeasurements {
     let held = |x: &dyn Fn(usize) -> [f64; 3], n: usize, lost: usize| -> Vec<[f64; 3]> {
         (0..n).map(|t| if n > lost { x(t.min(n - 1 - lost)) } else { [0.0; 3] }).collect()

@@ -67,9 +67,9 @@ pub struct TuneNote {
 /// A tune, its repeats written out.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tune {
-    /// What `T:` says first.
+    /// The first `T:` field.
     pub title: String,
-    /// What `R:` says.
+    /// The `R:` field.
     pub rhythm: String,
     pub meter: Meter,
     pub tempo: Option<Tempo>,

@@ -72,7 +72,7 @@ pub struct BaselineMotion {
     pub frames: Array2<f32>,
 }
 
-/// What is sampled, with what, for which music.
+/// The windows to sample, with model, settings and seed.
 pub struct BaselineRequest<'a> {
     pub store: &'a Location,
     pub model: &'a OpenModel,

@@ -32,7 +32,7 @@ use crate::units::frames_to_s;
 /// Songs whose activity is read; that of others counts as its mean.
 const MAX_HEARD_SONGS: usize = 500;
 
-/// What is evaluated.
+/// The motions to evaluate: those of a run, or of a folder.
 pub struct Evaluand {
     pub run: String,
     pub model: String,

@@ -46,13 +46,13 @@ pub struct ForeignPhrase<'a> {
     pub n_frames: Option<usize>,
 }
 
-/// What a folder has: motions that can be read, and why others cannot.
+/// The motions of a folder that can be read, and why others cannot.
 #[derive(Debug, Default)]
 pub struct ForeignMotions {
     /// By phrase and sample.
     pub files: Vec<ForeignFile>,
     pub failures: Vec<(PathBuf, Failure)>,
-    /// Files that are named like no motion, which nobody looks at.
+    /// Number of files whose names are not those of motions; they are not read.
     pub n_others: usize,
 }
 
@@ -66,7 +66,7 @@ pub struct ForeignFile {
     pub n_music_frames: Option<usize>,
 }
 
-/// What a file held, from which its 25 channels came.
+/// The content of a file from which its 25 channels came.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FileContent {
     /// All of them.
@@ -109,7 +109,7 @@ pub struct ForeignMotion {
     pub frames: Array2<f32>,
     pub content: FileContent,
     pub has_phase: bool,
-    /// What is unusual of it and no reason to refuse it.
+    /// Notes on what is unusual about the file, but no reason to refuse it.
     pub note: Option<String>,
 }
 

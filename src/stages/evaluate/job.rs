@@ -72,13 +72,13 @@ pub struct SampledWindow {
     pub frames: Array2<f32>,
 }
 
-/// What was found.
+/// The numbers and verdicts of an evaluation.
 pub struct EvaluationFindings {
     pub findings: Vec<Finding>,
     pub verdicts: Vec<(MusicSplit, Verdict)>,
 }
 
-/// What is evaluated, and what it is compared with.
+/// The inputs of an evaluation: motions, and what they are compared with.
 pub struct EvaluationJob<'a> {
     pub params: &'a Params,
     pub snapshot: &'a StoreSnapshot,

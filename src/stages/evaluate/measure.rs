@@ -31,7 +31,7 @@ pub struct Measurer<'a> {
     pub window_frames: usize,
     /// Most frames of a motion that are looked at.
     pub num_frames: Option<usize>,
-    /// One of so many frames is kept.
+    /// One of every `stride` frames is kept.
     pub stride: usize,
     pub threads: NonZeroUsize,
 }
@@ -58,7 +58,7 @@ impl Measurer<'_> {
     /// is never given out stays empty.
     ///
     /// # Errors
-    /// What `feed` says.
+    /// The error of `feed`.
     pub fn run<E: Send>(
         &self,
         n: usize,

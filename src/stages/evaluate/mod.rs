@@ -179,7 +179,7 @@ fn missed(params: &Params, checks: &[SanityCheckRow]) -> Vec<CheckShortfall> {
     wanted.into_iter().filter_map(missed).collect()
 }
 
-/// What was measured.
+/// The summary of an evaluation.
 struct EvaluateSummary {
     store: String,
     run: String,
@@ -263,7 +263,7 @@ impl Summary for EvaluateSummary {
     }
 }
 
-/// What would be measured.
+/// The summary of a dry run.
 struct EvaluateDryRun {
     store: String,
     run: String,

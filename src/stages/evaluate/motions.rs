@@ -72,7 +72,7 @@ pub fn has_run(snapshot: &StoreSnapshot, run: &str) -> Result<bool, StoreError> 
     Ok(is_there)
 }
 
-/// What the store says of phrases: their songs and beats.
+/// The songs, beats and activities of the store's phrases.
 pub struct PhraseIndex {
     rows: HashMap<String, PhraseRow>,
     /// Number of each song.
@@ -231,7 +231,7 @@ fn has_truth(row: &PhraseRow) -> bool {
     row.has_motion && (row.has_features || row.has_audio)
 }
 
-/// What tells a phrase's song from others: the digest of its music, or its file where that is not known.
+/// Returns the identity of a phrase's song: the digest of its music, or its file where that is not known.
 fn song_of(row: &PhraseRow) -> &str {
     let file = || if row.is_constructed() { &row.source } else { url_of(row) };
     row.song_hash.as_deref().unwrap_or_else(file)

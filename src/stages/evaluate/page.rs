@@ -50,7 +50,7 @@ impl OtherRun {
     }
 }
 
-/// What a report tells of.
+/// The evaluation that a report presents.
 pub struct Page<'a> {
     pub store: &'a Location,
     pub subject: &'a Evaluand,
@@ -149,7 +149,7 @@ impl Page<'_> {
         notes
     }
 
-    /// Returns the motions that fail the most checks; of equals those with the lowest score.
+    /// Returns the motions that fail the most checks; among equal counts those with the lowest score.
     fn worst(&self, n: usize) -> anyhow::Result<Vec<WorstMotion>> {
         let mut failed: BTreeMap<(&str, i32), Vec<&SanityCheckRow>> = BTreeMap::new();
         let is_final = |row: &&SanityCheckRow| row.stage.as_deref() != Some("raw");
@@ -282,7 +282,7 @@ fn paired(there: &[SongMetricRow], here: &[SongMetricRow]) -> Vec<PairedNumber> 
         .collect()
 }
 
-/// What determines the motions of a run.
+/// Returns the settings that determine the motions of a run.
 fn settings(row: &GenerationRow) -> [(&'static str, String); 7] {
     [
         ("model", row.model.clone()),

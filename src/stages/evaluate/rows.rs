@@ -16,7 +16,7 @@ const ITEMS_FROM: &str = "generations";
 /// The names under which checks and numbers are committed.
 pub const STAGES: [&str; 2] = [CHECKS, Evaluate::NAME];
 
-/// What an evaluation found, as rows.
+/// The results of an evaluation, as rows.
 #[derive(Clone, Debug, Default)]
 pub struct EvaluationRows {
     pub checks: Vec<SanityCheckRow>,
@@ -25,7 +25,7 @@ pub struct EvaluationRows {
     pub songs: Vec<SongMetricRow>,
 }
 
-/// Whose rows they are.
+/// The run and evaluation that rows belong to.
 #[derive(Clone, Copy, Debug)]
 pub struct RunName<'a> {
     pub run: &'a str,
@@ -176,7 +176,7 @@ pub fn songs_of(store: &Location, run: &str) -> Result<Vec<SongMetricRow>, Store
     Snapshot::take(store, SongMetricRow::schema())?.rows_where(|row: &SongMetricRow| row.run == run)
 }
 
-/// What the tables of a store know of a run.
+/// What identifies an evaluation of a run in the tables of a store.
 pub struct RunIdentity<'a> {
     pub store: &'a Location,
     pub run: &'a str,

@@ -20,7 +20,7 @@ use crate::evaluation::reference_statistics::ReferenceStatistics;
 /// Other songs whose music a motion is held against.
 const MAX_OTHER_SONGS: usize = 8;
 
-/// Whose numbers they are.
+/// The motions or baseline that numbers were measured on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Subject {
     Generated,
@@ -205,7 +205,7 @@ impl MeasureSettings<'_> {
     }
 }
 
-/// What is added to the variants of numbers of motion as it was decoded.
+/// The suffix of variants of numbers of motion as it was decoded.
 pub const DECODED: &str = "raw";
 
 /// Compares the values of channels with those of the training split.

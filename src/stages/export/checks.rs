@@ -40,7 +40,7 @@ const DERIVED_TOLERANCE: f64 = 1e-2;
 /// Rounded weights: the rms that a whole sample may move, in units of the data's spread.
 const ROUNDING_TOLERANCE: f64 = 0.05;
 
-/// What is checked.
+/// The trained networks and exported files to compare.
 pub struct Checking<'a> {
     pub dataset: &'a Dataset,
     pub params: &'a Params,
@@ -48,7 +48,7 @@ pub struct Checking<'a> {
     pub files: &'a ExportedFiles,
 }
 
-/// What came of it.
+/// The results of the checks.
 pub struct CheckResults {
     pub rows: Vec<OnnxCheckRow>,
     pub runtime: String,

@@ -195,7 +195,7 @@ fn publish(store: &Location, model: &str, files: &ExportedFiles) -> Result<(), S
     let into = if is_there { format!("{folder}/{version}") } else { folder.clone() };
     let is_within =
         |path: &str, folder: &str| path.strip_prefix(folder).is_some_and(|p| p.starts_with('/'));
-    // What an export that was killed left behind.
+    // Files that an export that was killed left behind.
     for listed in store.list(&into)?.into_iter().filter(|_| into != before || !is_there) {
         store.remove(&listed.path)?;
     }
@@ -208,7 +208,7 @@ fn publish(store: &Location, model: &str, files: &ExportedFiles) -> Result<(), S
     }
     let pointer_path = format!("{folder}/{POINTER}");
     store.replace(&pointer_path, pointer)?;
-    // The model before this one stays where it has a folder, for those who are reading it.
+    // The model before this one stays where it has a folder, for programs that are reading it.
     for ListedObject { path, .. } in store.list(&folder)? {
         let is_kept = path == pointer_path
             || is_within(&path, &into)

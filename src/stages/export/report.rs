@@ -117,7 +117,7 @@ fn of_card(card: &ModelCard, place: &str) -> serde_json::Value {
     })
 }
 
-/// What `--dry-run` says.
+/// The summary of a dry run.
 pub struct ExportDryRun {
     place: String,
     card: ModelCard,

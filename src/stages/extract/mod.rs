@@ -67,7 +67,7 @@ pub struct Params {
     pub force: bool,
 }
 
-/// What both ways of running share.
+/// Settings that extraction from a store and from files share.
 struct ExtractJob<'a> {
     rules: ExtractRules,
     n_workers: NonZeroUsize,
@@ -137,7 +137,7 @@ fn params_hash(tuning: Option<Tuning>) -> String {
     digest(text.to_string().as_bytes())
 }
 
-/// What became of the files.
+/// Counts of the files that were extracted, unchanged or failed.
 #[derive(Debug, Default)]
 struct ExtractTally {
     n_todo: u64,

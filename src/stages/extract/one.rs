@@ -15,7 +15,7 @@ use crate::stages::feature_file::read_features;
 use crate::store::{Content, SourceFile, StoreError, digest, digest_of};
 use crate::units::{frames_to_s, s_to_frames};
 
-/// How every phrase is done.
+/// Settings of the extraction, the same for every phrase.
 #[derive(Clone, Copy, Debug)]
 pub struct ExtractRules {
     /// Fixes the tuning that would be estimated.
@@ -26,7 +26,7 @@ pub struct ExtractRules {
     pub timeout: Duration,
 }
 
-/// What the features of a phrase are made from.
+/// The source of a phrase's features.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Origin {
     Audio,
@@ -62,11 +62,11 @@ pub struct ExtractedFeatures {
     pub beats: Vec<(usize, f64)>,
     /// Time of every beat that motion follows, s, and its number in the bar if known.
     pub pulse: Vec<(f64, Option<i64>)>,
-    /// What only audio tells.
+    /// None for features that were read from a file.
     pub audio: Option<AudioFacts>,
 }
 
-/// What only audio tells.
+/// Facts that are known of audio only, not of a feature file.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AudioFacts {
     pub n_samples: u64,

@@ -1,7 +1,7 @@
 //! With a store: the phrases that have no current features get them, batch by batch.
 //!
 //! As in ingest, a batch is a range of the phrases' stable hash, cut by the table of phrases alone:
-//! whoever does it, whenever, writes the same bytes under the same name. Files of a batch are done
+//! every process, at any time, writes the same bytes under the same name. Files of a batch are done
 //! side by side, the longest first, and the batch is committed when its last file is done.
 
 use std::cmp::Reverse;
@@ -38,7 +38,7 @@ pub struct StoreTarget<'a> {
     pub force: bool,
 }
 
-/// A phrase to be done.
+/// A phrase to extract features of.
 struct PhraseTask {
     batch: usize,
     row: PhraseRow,
@@ -231,7 +231,7 @@ fn work_off(
     pool::run(
         job.n_workers,
         || {
-            // Who asks for an end gets the batch that is under way, whole.
+            // After an interrupt the batch that is under way is still completed.
             let batch = Some(queue.peek()?.batch);
             if batch != under_way && job.progress.is_interrupted() {
                 lock(done).is_stopped = true;

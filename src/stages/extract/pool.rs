@@ -22,7 +22,7 @@ impl Budget {
         Self { total_bytes, used_bytes: Mutex::new(0), freed: Condvar::new() }
     }
 
-    /// Waits until `bytes` are free; who asks for more than there is waits to be alone.
+    /// Waits until `bytes` are free; a request for more than the whole budget waits until all of it is free.
     pub fn take(&self, bytes: u64) -> BudgetShare<'_> {
         let bytes = bytes.min(self.total_bytes);
         let mut used = lock(&self.used_bytes);

@@ -139,7 +139,7 @@ impl ConstraintsRequest {
     /// Returns what is asked of a track.
     ///
     /// # Errors
-    /// One sentence for what cannot be asked of a track of so many frames.
+    /// One sentence for what cannot be asked of a track of `n_frames`.
     pub fn of_track(&self, n_frames: usize, limits: ChannelLimits) -> anyhow::Result<Constraints> {
         let file = &self.file;
         let mut wanted = Vec::new();

@@ -24,7 +24,7 @@ const IN_MEMORY_BYTES: u64 = 64 << 20;
 /// Longest audio.
 const MAX_DURATION_S: f64 = 24.0 * 3600.0;
 
-/// What is asked for.
+/// The files to generate motion for, and the folder to write to.
 pub struct FolderTarget<'a> {
     pub audio: &'a [PathBuf],
     pub folder: &'a Path,
@@ -35,7 +35,7 @@ pub struct FolderTarget<'a> {
     pub force: bool,
 }
 
-/// A motion to be made.
+/// A motion to generate for a file.
 struct FileMotionTask<'a> {
     path: &'a PathBuf,
     stem: String,
@@ -223,7 +223,7 @@ fn told(name: &str, made: &GeneratedMotion) -> String {
     )
 }
 
-/// What a page tells of a motion.
+/// The facts on a motion that a page shows.
 fn facts(made: &GeneratedMotion) -> Vec<(String, String)> {
     let Some(row) = made.rows.iter().find(|row| row.selected) else { return Vec::new() };
     let mut facts = vec![

@@ -18,12 +18,12 @@ use crate::store::tables::GenerationRow;
 use crate::store::{TimestampUs, digest};
 use crate::units::frames_to_s;
 
-/// What is danced to.
+/// The music of a phrase or file, to which motion is generated.
 pub struct PhraseMusic<'a> {
     pub phrase_id: &'a str,
     /// Digest of what the phrase's files hold, as `generations` has it.
     pub content_hash: &'a str,
-    /// What messages and failures name.
+    /// The name in messages and failures.
     pub source: &'a str,
     /// \[T, 163\]
     pub features: ArrayView2<'a, f32>,
@@ -45,7 +45,7 @@ pub struct GeneratedMotion {
     pub seconds: f64,
 }
 
-/// What makes motion.
+/// Generates motions: samples candidates, scores them, and keeps the best.
 pub struct Maker<'a> {
     pub generator: Generator<'a>,
     pub card: &'a ModelCard,
@@ -71,7 +71,7 @@ pub fn seed_of(seed: u64, phrase_id: &str, sample: usize, candidate: usize) -> u
         .expect("a digest has hexadecimal digits")
 }
 
-/// What a network hears of a track, and the bar phase that its motion is sampled with.
+/// The conditions of a network for a track, and the bar phase that its motion is sampled with.
 #[derive(Clone, Copy)]
 struct TrackConditions<'a> {
     /// \[T, condition_dim\]
@@ -165,7 +165,7 @@ impl Maker<'_> {
                 generate_s,
             };
             rows.push(self.row(music, n_frames, &found));
-            // The first of equals, so that one candidate more changes nothing else.
+            // Among equal scores the first, so that one candidate more changes nothing else.
             let value = score.total.unwrap_or(f64::NEG_INFINITY);
             if best.as_ref().is_none_or(|known| value > known.value) {
                 best = Some(Candidate { value, candidate, frames, decoded, displacement });
@@ -295,7 +295,7 @@ struct Candidate {
     displacement: Option<Displacement>,
 }
 
-/// What was found of a candidate.
+/// The score and errors of a candidate.
 struct CandidateFindings<'a> {
     sample: usize,
     candidate: usize,

@@ -205,7 +205,7 @@ pub(in crate::stages) fn weights_digest(card: &ModelCard) -> String {
     sha256(both.as_bytes())
 }
 
-/// What became of the motions.
+/// Counts of the motions that were generated, unchanged or failed.
 #[derive(Debug, Default)]
 struct GenerateTally {
     n_todo: u64,

@@ -65,7 +65,7 @@ pub struct MotionOutput<'a> {
 /// Writes a motion into a folder in some formats; returns the files.
 ///
 /// # Errors
-/// What the disk says, with the file's name; each file is whole or not there.
+/// The error of the file system, with the file's name; each file is whole or not there.
 pub fn write(
     output: &MotionOutput,
     formats: &[MotionFormat],

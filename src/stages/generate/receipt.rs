@@ -15,10 +15,10 @@ use crate::store::{digest_of, digest_texts, write_file};
 
 /// Raised when generate writes other files for the same motion.
 const FILES_VERSION: &str = "1";
-/// What the names of receipts end with.
+/// The suffix of the names of receipts.
 const SUFFIX: &str = "motiongen.json";
 
-/// What a motion was made from, and the files that it was written into.
+/// The inputs that a motion was made from, and the files that it was written into.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Receipt {
     /// Digest of all that determines the motion.
@@ -68,7 +68,7 @@ impl Receipt {
     /// Writes the receipt of a motion that was written in some formats.
     ///
     /// # Errors
-    /// What the disk says.
+    /// The error of the file system.
     pub fn keep(
         mut self,
         folder: &Path,

@@ -1,7 +1,7 @@
 //! The phrases of a store, made batch by batch.
 //!
-//! As in extract, a batch is a range of the phrases' stable hash, cut by the table of phrases alone: whoever
-//! does it, whenever, writes the same motions under the same name. Phrases of a batch are made side by side,
+//! As in extract, a batch is a range of the phrases' stable hash, cut by the table of phrases alone: every
+//! process, at any time, writes the same motions under the same name. Phrases of a batch are made side by side,
 //! and the batch is committed when its last one is done.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
@@ -49,7 +49,7 @@ pub struct TrackTarget<'a> {
     pub n_workers: NonZeroUsize,
 }
 
-/// A phrase to be danced to.
+/// A phrase to generate motion for.
 struct TrackTask {
     batch: u64,
     row: PhraseRow,

@@ -1,7 +1,7 @@
 //! Batches: phrases that are read, checked and committed together.
 //!
 //! A batch is a range of the phrases' stable hash, so what is in it depends on the source alone:
-//! whoever does it, whenever, after however many kills, writes the same bytes under the same name.
+//! every process, at any time and after any number of kills, writes the same bytes under the same name.
 
 use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};

@@ -26,7 +26,7 @@ pub enum Layout {
     Library,
 }
 
-/// What a file is to its phrase.
+/// The role of a file in its phrase.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Role {
     Audio,
@@ -103,7 +103,7 @@ fn looks_like_phrases(listing: &Listing) -> bool {
 fn phrase_layout(listing: Listing, drafts: &mut Drafts) {
     let lacking = lacking_files(&listing);
     for folder in listing.folders {
-        // What a folder holds that is called like a phrase's file is nobody's.
+        // The contents of a folder whose name is that of a phrase's file belong to no phrase.
         if let Some((id, _)) = phrase_slot(&folder) {
             drafts.fail(id.to_owned(), not_a_file(&folder));
         }
@@ -258,7 +258,7 @@ fn library_layout(listing: Listing, drafts: &mut Drafts) {
     }
 }
 
-/// What becomes a plan, in the order in which it is met.
+/// Phrases of a plan under construction, in the order in which they are found.
 #[derive(Default)]
 struct Drafts {
     /// The id of a phrase, and what is known of it.

@@ -223,7 +223,7 @@ fn is_settled(
 /// # Errors
 /// [`StoreError`] when the commits cannot be read.
 fn unidentified(store: &StoreSnapshot) -> Result<BTreeSet<String>, StoreError> {
-    // Rows that cannot be read cannot be mended, and keep nobody from ingesting others.
+    // Rows that cannot be read cannot be mended, and do not keep others from being ingested.
     let (table, _) = store.known_table(PhraseRow::schema())?;
     let lacks = |row: &PhraseRow| {
         let has_music = row.audio_url.is_some() || row.features_url.is_some();
@@ -241,7 +241,7 @@ fn unidentified(store: &StoreSnapshot) -> Result<BTreeSet<String>, StoreError> {
     Ok(found)
 }
 
-/// What became of the phrases.
+/// Counts of the phrases that were ingested, unchanged or failed.
 #[derive(Clone, Debug, Default)]
 struct IngestTally {
     n_done: u64,

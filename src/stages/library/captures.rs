@@ -85,7 +85,7 @@ impl Captures {
         let files: Vec<_> = files.into_iter().filter(|file| is_motion(&file.path)).collect();
         let problems = problems.into_iter();
         let problems = problems.filter(|p| {
-            // Nobody can tell what lies behind a link that is not followed.
+            // What lies behind a link that is not followed is unknown.
             is_motion(&p.path) || p.kind == SourceProblemKind::Symlink
         });
         let problems = problems.map(|p| {

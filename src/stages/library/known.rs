@@ -11,14 +11,14 @@ use crate::stages::failure::{Failure, FailureKind};
 use crate::store::tables::{ExtractionRow, PhraseRow};
 use crate::store::{Location, Row, StoreError, StoreSnapshot, outdated_features};
 
-/// What a store knows.
+/// The songs, captures and phrases of a store.
 #[derive(Debug, Default)]
 pub struct StoreContents {
     /// Phrases with audio and features.
     pub songs: BTreeMap<String, Song>,
     /// Phrases with audio, but without features.
     pub n_without_features: usize,
-    /// Phrases with motion and without audio that nobody constructed, and their digests.
+    /// Phrases with motion and without audio that were not constructed, and their digests.
     pub captures: BTreeMap<String, String>,
     /// Constructed phrases with the URLs of their songs, by the part of their name that stands for the
     /// song.

@@ -48,7 +48,7 @@ impl PhraseFolder {
     /// Writes a phrase, each file whole or not at all.
     ///
     /// # Errors
-    /// What the file system says.
+    /// The error of the file system.
     pub fn write(
         &self,
         song: &Song,
@@ -88,7 +88,7 @@ impl PhraseFolder {
     /// Writes what is about the whole folder.
     ///
     /// # Errors
-    /// What the file system says.
+    /// The error of the file system.
     pub fn finish(self) -> io::Result<()> {
         write_file(&self.folder.join("README.txt"), |out| out.write_all(README.as_bytes()))?;
         let mut lines = self.splits.into_inner().unwrap_or_else(PoisonError::into_inner);

@@ -154,7 +154,7 @@ fn song_of_tune(
     Song { id, slug, url, fingerprint, split, is_unidentified: false, problem, files }
 }
 
-/// Who plays.
+/// The instruments that play, of a soundfont or the synthesizer.
 #[derive(Clone, Default)]
 pub struct Band {
     #[cfg(feature = "soundfont")]
@@ -236,7 +236,7 @@ pub fn beats_text(beats: &Beats) -> String {
 /// Writes a song for people to hear: `NAME.wav` and `NAME.beats.txt`.
 ///
 /// # Errors
-/// What the file system says.
+/// The error of the file system.
 pub fn write(folder: &Path, song: &Song, performance: &Performance) -> std::io::Result<()> {
     std::fs::create_dir_all(folder)?;
     let file = |ending: &str| folder.join(format!("{}.{ending}", song.slug));

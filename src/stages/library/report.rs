@@ -9,7 +9,7 @@ use super::write::SongOutcome;
 use crate::stages::Summary;
 use crate::stages::failure::{Failure, failures_json, write_failures, write_notes};
 
-/// What became of songs and captures.
+/// Counts of songs, captures and phrases that were constructed, unchanged or failed.
 #[derive(Debug, Default)]
 pub struct LibraryTally {
     pub n_todo: usize,

@@ -22,16 +22,16 @@ const MAX_SLUG_BYTES: usize = 180;
 pub struct Song {
     /// Its name: the phrase of the store, or the path below the folder.
     pub id: String,
-    /// What stands for it in the names of its phrases.
+    /// The part of its phrases' names that stands for it.
     pub slug: String,
     /// The audio file, as `source` of its phrases.
     pub url: String,
-    /// What is known of its files without reading them.
+    /// The fingerprint of its files, known without reading them.
     pub fingerprint: String,
     pub split: &'static str,
     /// Whether the store has phrases of it that do not tell which music they are to, and now could.
     pub is_unidentified: bool,
-    /// What keeps it from being danced to, where that is known already.
+    /// The reason why it cannot be danced to, where that is known already.
     pub problem: Option<Failure>,
     pub files: SongFiles,
 }
@@ -65,7 +65,7 @@ pub enum SongFiles {
     },
 }
 
-/// What was read of a song.
+/// The data of a song as it was read.
 pub enum SongInput {
     Features(Result<Array2<f32>, Failure>),
     Files {
@@ -211,7 +211,7 @@ pub struct SongFeed {
 }
 
 impl SongFeed {
-    /// Sends every song with its input until nobody receives any more.
+    /// Sends every song with its input until the receiver is dropped.
     ///
     /// # Errors
     /// [`StoreError`] when the table of features cannot be read.
@@ -265,7 +265,7 @@ fn send_features(
     let wanted = missing.keys().cloned().collect();
     store.table(tables::features())?.visit_items(&wanted, |id, frames| {
         if let Some(song) = missing.remove(id) {
-            // Nobody listens any more when the job has failed; it says so itself.
+            // The receiver is dropped when the job has failed; the job reports that itself.
             sender.send((song, SongInput::Features(Ok(frames)))).ok();
         }
         Ok::<_, StoreError>(())

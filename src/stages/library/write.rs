@@ -38,10 +38,10 @@ pub struct SongWriter<'a> {
     pub seen: &'a SeenContent,
 }
 
-/// What became of a song.
+/// The outcome of a song.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SongOutcome {
-    /// So many new phrases.
+    /// The number of new phrases.
     Phrases(usize),
     /// The store has its phrases already.
     Unchanged,

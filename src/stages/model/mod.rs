@@ -87,7 +87,7 @@ impl Stage for Model {
     }
 }
 
-/// What following a network through gives.
+/// Layers, operations and memory of a network, from following shapes through it.
 struct NetworkOutline {
     layers: Vec<Layer>,
     flops: u64,

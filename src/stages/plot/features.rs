@@ -98,7 +98,7 @@ pub fn run(params: &Params) -> anyhow::Result<Box<dyn Summary>> {
     write_picture(what, output, &picture, params.dry_run)
 }
 
-/// What is drawn.
+/// The features to draw.
 struct PlottedFeatures {
     title: String,
     /// [T, 163].
@@ -113,7 +113,7 @@ fn from_audio(path: &Path, tuning: Option<Tuning>) -> anyhow::Result<PlottedFeat
     if path.is_dir() {
         bail!("{place}: is a folder; name a file in it");
     }
-    // Who waits for one picture decides how long.
+    // The user who waits for one picture decides how long.
     let options = Options {
         tuning,
         max_duration_s: f64::INFINITY,

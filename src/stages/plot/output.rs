@@ -36,7 +36,7 @@ pub fn format_of(output: &Path) -> anyhow::Result<Format> {
 /// Writes a picture of `what`, whole or not at all; in a dry run not at all.
 ///
 /// # Errors
-/// What the file system says.
+/// The error of the file system.
 pub fn write_picture(
     what: String,
     output: &Path,
@@ -51,7 +51,7 @@ pub fn write_picture(
     Ok(Box::new(PlotSummary { what, output: output.to_owned(), width_px, height_px, dry_run }))
 }
 
-/// What was drawn.
+/// The summary of a plot.
 struct PlotSummary {
     what: String,
     output: PathBuf,

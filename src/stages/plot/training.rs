@@ -200,7 +200,7 @@ fn curves(stage: TrainingStage, panels: &[TrainingPanel], rows: &[TrainingLogRow
         |kind: RowKind| rows.iter().copied().filter(move |row| row.kind == kind.name());
     let best = rows_of_kind(RowKind::Validation)
         .filter_map(|row| Some((steps_done(row), row.loss.filter(|loss| loss.is_finite())?)))
-        // The first of equals, as training keeps it.
+        // Among equal losses the first, as training keeps it.
         .min_by(|a, b| a.1.total_cmp(&b.1));
     let panels = panels.iter().map(|&panel| {
         let value = |row: &TrainingLogRow| value(row, panel);

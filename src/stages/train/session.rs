@@ -1,4 +1,4 @@
-//! What training and fine-tuning share: the run's name and claim, its phrases, and whoever looks on.
+//! What training and fine-tuning share: the run's name and claim, its phrases, and progress.
 
 use std::collections::BTreeSet;
 use std::num::NonZeroUsize;
@@ -76,7 +76,7 @@ pub fn check_run_name(run: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Takes the right to write a run; whoever asks for it meanwhile waits or is refused.
+/// Takes the lease to write a run; other processes that ask for it meanwhile wait or are refused.
 ///
 /// # Errors
 /// [`StoreError::Held`] when another process writes it.
@@ -238,7 +238,7 @@ fn record(
     if commit.is_empty() { Ok(()) } else { commit.publish().map(|_| ()) }
 }
 
-/// Whoever looks on: the command line.
+/// Shows the progress of a training on the command line.
 pub struct ProgressWatch<'a>(pub &'a dyn Progress);
 
 impl ProgressWatch<'_> {

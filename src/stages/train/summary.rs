@@ -11,7 +11,7 @@ use crate::training::{Baselines, ExcludedPhrase, Progress, TrainingEnd};
 /// Phrases left out that the account spells out.
 const N_SHOWN: usize = 10;
 
-/// What became of one network.
+/// The outcome of training one network.
 #[derive(Clone, Debug)]
 pub struct StageSummary {
     stage: &'static str,
@@ -28,7 +28,7 @@ impl StageSummary {
     }
 }
 
-/// What became of a run.
+/// The summary of a run.
 #[derive(Clone, Debug)]
 pub struct TrainSummary {
     run: String,
@@ -155,7 +155,7 @@ fn beside(loss: f64, other: f64) -> String {
     if percent < 0.0 { format!("{:.0} % above", -percent) } else { format!("{percent:.0} % below") }
 }
 
-/// What would be done.
+/// The summary of a dry run.
 #[derive(Clone, Debug)]
 pub struct TrainDryRun {
     pub run: String,

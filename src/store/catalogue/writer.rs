@@ -45,13 +45,13 @@ pub(in crate::store) fn write(
     let mut old: Vec<&ListedObject> = listed.iter().filter(|l| is_catalogue(&l.path)).collect();
     old.sort_by(|a, b| b.path.cmp(&a.path));
     for one in old.into_iter().skip(N_KEPT - 1) {
-        // Who reads it falls back on the newest; who may not remove it leaves it.
+        // A reader of it falls back on the newest; a process that may not remove it leaves it.
         store.remove(&one.path).ok();
     }
     Ok(())
 }
 
-/// What keeps a catalogue from being written.
+/// Why a catalogue cannot be written.
 #[derive(Debug, thiserror::Error)]
 pub(in crate::store) enum CatalogueError {
     #[error(transparent)]
