@@ -211,13 +211,13 @@ impl ModelCard {
     /// One sentence for a text that is no card, another format, another layout of channels or features.
     pub fn read(bytes: &[u8], place: &str) -> Result<Self, CardError> {
         #[derive(Deserialize)]
-        struct FormatVersion {
+        struct Head {
             format: u32,
         }
         let place = || place.to_owned();
         let unreadable =
             |e: serde_json::Error| CardError::Unreadable { place: place(), reason: e.to_string() };
-        let FormatVersion { format } = serde_json::from_slice(bytes).map_err(unreadable)?;
+        let Head { format } = serde_json::from_slice(bytes).map_err(unreadable)?;
         if format != MODEL_FORMAT {
             return Err(CardError::Format { place: place(), found: format });
         }

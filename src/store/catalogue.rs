@@ -54,12 +54,12 @@ pub(super) struct Meta {
     /// The commits that settled the items.
     pub headers: Vec<Header>,
     /// The commits whose parts hold their rows.
-    pub commits: Vec<CatalogueEntry>,
+    pub commits: Vec<Entry>,
 }
 
 /// A commit, as a catalogue knows it.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-pub(super) struct CatalogueEntry {
+pub(super) struct Entry {
     pub key: String,
     pub generation: u32,
     pub parts: Vec<Part>,
@@ -125,8 +125,7 @@ impl Catalogue {
 
     /// Refuses a catalogue that counts rows of a commit whose manifest is gone.
     fn checked(self, keys: &HashSet<&str>) -> Result<Self, UnusableReason> {
-        let is_gone =
-            |entry: &&CatalogueEntry| !entry.is_dead && !keys.contains(entry.key.as_str());
+        let is_gone = |entry: &&Entry| !entry.is_dead && !keys.contains(entry.key.as_str());
         match self.meta.commits.iter().find(is_gone) {
             Some(entry) => Err(format!("commit {} is gone", entry.key)),
             None => Ok(self),

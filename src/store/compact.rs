@@ -15,7 +15,7 @@ use super::StoreError;
 use super::commit::{KEY_DIGITS, input_hash, program, publish_manifest, publish_part};
 use super::digest::digest_texts;
 use super::location::{Location, PutOutcome};
-use super::manifest::{COMPACTED_FORMAT, CompactionOrigin, Header, Item, Manifest};
+use super::manifest::{COMPACTED_FORMAT, Compacted, Header, Item, Manifest};
 use super::parquet_object::names;
 use super::part::{PartWriter, ROW_GROUP_ROWS};
 use super::reader::Snapshot;
@@ -262,7 +262,7 @@ fn manifest(
         origin: String::new(),
         parts,
         items,
-        compacted: Some(CompactionOrigin { generation, commits: headers, of: header_indices }),
+        compacted: Some(Compacted { generation, commits: headers, of: header_indices }),
     }
 }
 

@@ -29,12 +29,12 @@ pub struct Manifest {
     pub items: Vec<Item>,
     /// Which commits settled the items, where compaction rewrote them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub compacted: Option<CompactionOrigin>,
+    pub compacted: Option<Compacted>,
 }
 
 /// Where the items of a compaction's commit come from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct CompactionOrigin {
+pub struct Compacted {
     /// One more than the highest generation among the commits that were rewritten; 0 stands for none.
     pub generation: u32,
     /// The commits that settled the items.
@@ -119,7 +119,7 @@ impl Manifest {
             let (found, supported) = (manifest.format, COMPACTED_FORMAT);
             return Err(StoreError::ManifestFormat { place: place.to_owned(), found, supported });
         }
-        if let Some(CompactionOrigin { commits, of, .. }) = &manifest.compacted {
+        if let Some(Compacted { commits, of, .. }) = &manifest.compacted {
             let (n_items, n_of) = (manifest.items.len(), of.len());
             if n_items != n_of {
                 return Err(damaged(format!("{n_items} items have {n_of} commits")));

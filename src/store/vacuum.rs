@@ -171,7 +171,7 @@ fn dead_since(manifests: &[Manifest], times: &[SystemTime]) -> Vec<(usize, Syste
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::store::{Item, manifest::CompactionOrigin};
+    use crate::store::{Item, manifest::Compacted};
 
     fn manifest(key: &str, sequence: u64, items: &[&str]) -> Manifest {
         Manifest {
@@ -199,7 +199,7 @@ mod tests {
         let third = manifest("c", 1, &["y"]);
         // A compaction of the second and the third, and one of that.
         let compacted = |key: &str, generation| Manifest {
-            compacted: Some(CompactionOrigin {
+            compacted: Some(Compacted {
                 generation,
                 commits: [&second, &third].map(|m| m.headers().remove(0)).to_vec(),
                 of: vec![0, 1],

@@ -83,14 +83,14 @@ impl<C: Serialize + DeserializeOwned> State<C> {
         let refuse =
             |reason: String| Err(TrainingError::Checkpoint { place: place.to_owned(), reason });
         #[derive(Deserialize)]
-        struct FormatVersion {
+        struct Head {
             format: u32,
         }
         let Some(text) = archive.metadata().get(STATE) else {
             return refuse("holds weights but no state; name a checkpoint that train wrote".into());
         };
-        match serde_json::from_str::<FormatVersion>(text) {
-            Ok(FormatVersion { format }) if format != FORMAT => {
+        match serde_json::from_str::<Head>(text) {
+            Ok(Head { format }) if format != FORMAT => {
                 return refuse(format!(
                     "has format {format}, this program reads format {FORMAT}; use the version of \
                      motiongen that wrote it, or train anew with --force"

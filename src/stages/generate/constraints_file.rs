@@ -1,5 +1,6 @@
 //! The file in which a user says what a motion must do.
 
+use std::fmt;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
@@ -78,10 +79,19 @@ struct Continued {
 }
 
 /// A file that was read, with the motion that it continues.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, PartialEq)]
 pub struct ConstraintsRequest {
     file: ConstraintsFile,
     before: Option<(Array2<f32>, usize)>,
+}
+
+impl fmt::Debug for ConstraintsRequest {
+    /// Writes the text that the digest of a motion's settings contains. It begins with `Asked`, as in stores that were
+    /// written before: another text would make their motions again.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { file, before } = self;
+        f.debug_struct("Asked").field("file", file).field("before", before).finish()
+    }
 }
 
 impl ConstraintsRequest {

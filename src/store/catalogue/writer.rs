@@ -14,7 +14,7 @@ use parquet::file::properties::{EnabledStatistics, WriterProperties};
 use parquet::schema::types::ColumnPath;
 
 use super::{
-    COMMIT, Catalogue, CatalogueEntry, CatalogueRow, FAILURE, FINGERPRINT, FOLDER, FORMAT, HEADER,
+    COMMIT, Catalogue, CatalogueRow, Entry, FAILURE, FINGERPRINT, FOLDER, FORMAT, HEADER,
     INPUT_HASH, ITEM, META, META_DIGEST, Meta, N_KEPT, ROW_GROUP_ROWS, SUFFIX, UnusableReason,
     is_catalogue, number_of,
 };
@@ -102,7 +102,7 @@ impl<'a> Writer<'a> {
             meta.commits.extend(is_known.then(|| entry.clone()));
         }
         let first_commit = meta.commits.len();
-        meta.commits.extend(newer.iter().map(|manifest| CatalogueEntry {
+        meta.commits.extend(newer.iter().map(|manifest| Entry {
             key: manifest.key.clone(),
             generation: manifest.generation(),
             parts: manifest.parts.clone(),
