@@ -16,7 +16,7 @@ use motiongen::model::{DecoderConfig, MotionDecoder, Preset, UNet1D};
 use motiongen::motion::{MOTION_DIM, Normalizer};
 use motiongen::training::{
     Augmentation, Batch, Chances, Dataset, FinetuneConfig, FinetuneLearner, Learner as _,
-    NetworkConfig, Objective, OptimizerConfig, TemporalConfig, Windows, Withhold,
+    NetworkConfig, Objective, OptimizerConfig, TemporalConfig, Windows, WithholdProbabilities,
 };
 use serde_json::{Value, json};
 
@@ -91,7 +91,7 @@ impl Bench {
                 let networks = [&unet, &decoder];
                 FinetuneLearner::new(
                     &network,
-                    (&Objective::default(), Withhold::default()),
+                    (&Objective::default(), WithholdProbabilities::default()),
                     &config,
                     &windows,
                     networks,

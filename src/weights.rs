@@ -42,13 +42,13 @@ pub struct Section<'a, E: Element> {
 }
 
 /// One parameter on its way to a file.
-struct Saved<'a, E: Element> {
+struct SavedParameter<'a, E: Element> {
     section: Section<'a, E>,
     id: ParameterId,
     precision: Precision,
 }
 
-impl<E: Element> View for Saved<'_, E> {
+impl<E: Element> View for SavedParameter<'_, E> {
     fn dtype(&self) -> Dtype {
         match self.precision {
             Precision::F32 => Dtype::F32,
@@ -77,13 +77,16 @@ impl<E: Element> View for Saved<'_, E> {
 fn tensors<'a, E: Element>(
     sections: &[Section<'a, E>],
     precision: Precision,
-) -> Vec<(String, Saved<'a, E>)> {
-    let of = |&section: &Section<'a, E>| {
+) -> Vec<(String, SavedParameter<'a, E>)> {
+    let parameters_of = |&section: &Section<'a, E>| {
         section.plan.list().iter().map(move |(id, parameter)| {
-            (format!("{}{}", section.prefix, parameter.name), Saved { section, id, precision })
+            (
+                format!("{}{}", section.prefix, parameter.name),
+                SavedParameter { section, id, precision },
+            )
         })
     };
-    sections.iter().flat_map(of).collect()
+    sections.iter().flat_map(parameters_of).collect()
 }
 
 fn header(metadata: &BTreeMap<String, String>) -> Option<HashMap<String, String>> {

@@ -9,7 +9,8 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use motiongen::onnx::{
-    Device, Encoded, Model, ModelFile, Numbers, Runtime, Session, SessionOptions, Tensor, check,
+    Device, EncodedModel, Model, ModelFile, NamedTensor, Numbers, Runtime, Session, SessionOptions,
+    check,
 };
 
 /// Returns onnxruntime, which `make setup` obtains; nothing is skipped where it is missing.
@@ -32,7 +33,7 @@ pub fn session(file: ModelFile, folder: &Path, name: &str) -> Session {
 pub fn write(file: ModelFile, path: &Path, embedded_bytes: usize) -> Model {
     let beside = path.with_extension("bin");
     let weights_name = beside.file_name().expect("a name").to_string_lossy().into_owned();
-    let Encoded { model, weights } = file.encode(&weights_name, embedded_bytes);
+    let EncodedModel { model, weights } = file.encode(&weights_name, embedded_bytes);
     std::fs::write(path, &model).expect("written");
     if let Some(weights) = &weights {
         std::fs::write(&beside, weights).expect("written");
@@ -43,14 +44,14 @@ pub fn write(file: ModelFile, path: &Path, embedded_bytes: usize) -> Model {
 }
 
 /// An input of numbers.
-pub fn floats(name: &'static str, shape: &[usize], numbers: &[f32]) -> Tensor<'static> {
-    Tensor { name, shape: shape.to_vec(), numbers: Numbers::Float(numbers.to_vec().into()) }
+pub fn floats(name: &'static str, shape: &[usize], numbers: &[f32]) -> NamedTensor<'static> {
+    NamedTensor { name, shape: shape.to_vec(), numbers: Numbers::Float(numbers.to_vec().into()) }
 }
 
 /// An input of whole numbers.
-pub fn integers(name: &'static str, numbers: &[i64]) -> Tensor<'static> {
+pub fn integers(name: &'static str, numbers: &[i64]) -> NamedTensor<'static> {
     let shape = vec![numbers.len()];
-    Tensor { name, shape, numbers: Numbers::Integer(numbers.to_vec().into()) }
+    NamedTensor { name, shape, numbers: Numbers::Integer(numbers.to_vec().into()) }
 }
 
 /// Numbers of a fixed sequence, about normal.

@@ -17,7 +17,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use bytes::Bytes;
-use motiongen::store::{ClientOptions, Location, Put};
+use motiongen::store::{ClientOptions, Location, PutOutcome};
 use object_store::{BackoffConfig, ObjectStore, RetryConfig};
 use tempfile::TempDir;
 
@@ -124,13 +124,13 @@ fn noise(n: usize, seed: u64) -> Vec<u8> {
     bytes
 }
 
-fn put(location: &Location, path: &str, bytes: &[u8]) -> Put {
+fn put(location: &Location, path: &str, bytes: &[u8]) -> PutOutcome {
     location
         .put_new(path, Bytes::copy_from_slice(bytes))
         .unwrap_or_else(|e| panic!("{path}: {}", chain(&e)))
 }
 
-fn put_file(location: &Location, path: &str, bytes: &[u8]) -> Put {
+fn put_file(location: &Location, path: &str, bytes: &[u8]) -> PutOutcome {
     let mut file = location.temporary(path).expect("a temporary file");
     file.write_all(bytes).expect("room for a temporary file");
     location.put_file_new(path, file).unwrap_or_else(|e| panic!("{path}: {}", chain(&e)))

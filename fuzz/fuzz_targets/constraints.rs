@@ -23,7 +23,7 @@ mod generation {
 #[allow(dead_code, reason = "this target reaches a part of the module")]
 mod constraints_file;
 
-use constraints_file::Asked;
+use constraints_file::ConstraintsRequest;
 use motion::ChannelLimits;
 
 /// Frames of the track, few enough that a constraint behind the end is usual.
@@ -32,7 +32,7 @@ const N_FRAMES: usize = 31;
 fuzz_target!(|bytes: &[u8]| {
     let text = String::from_utf8_lossy(bytes);
     for is_json in [false, true] {
-        let Ok(asked) = Asked::of_text(&text, is_json) else { continue };
+        let Ok(asked) = ConstraintsRequest::of_text(&text, is_json) else { continue };
         match asked.of_track(N_FRAMES, ChannelLimits::Wide) {
             Ok(constraints) => {
                 let mut frames = ndarray::Array2::zeros((N_FRAMES, motion::MOTION_DIM));

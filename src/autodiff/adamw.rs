@@ -12,7 +12,7 @@ use super::parameters::{Gradients, Parameters};
 
 /// Elements of a chunk: four streams of it (1 MB of `f32`) stay in the second cache.
 const CHUNK: usize = 1 << 16;
-/// What PyTorch adds to the norm before it divides by it.
+/// The number that PyTorch adds to the norm before it divides by it.
 const CLIP_EPSILON: f64 = 1e-6;
 
 /// The settings of [`AdamW`].
@@ -44,7 +44,7 @@ pub struct AdamW<E: Element> {
     n_steps: u64,
 }
 
-/// What one element's update needs beside its own numbers.
+/// The coefficients of an update, the same for every element.
 #[derive(Clone, Copy)]
 struct Update<E> {
     clip: E,

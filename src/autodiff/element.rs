@@ -131,7 +131,7 @@ pub fn erf_f32(x: f32) -> f32 {
     x * polynomial(&P) / polynomial(&Q)
 }
 
-/// What both types take from the standard library.
+/// The operations that both types take from the standard library.
 macro_rules! standard {
     () => {
         const ZERO: Self = 0.0;

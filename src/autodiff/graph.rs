@@ -10,7 +10,7 @@ use crate::model::{
 };
 
 use super::op::activation::Activate;
-use super::op::attention::{Attend, Place};
+use super::op::attention::{Attend, InputChannels};
 use super::op::binary::{AddToFrames, Binary, Pair};
 use super::op::channels::{Concat, TakeChannels};
 use super::op::conv::Product;
@@ -97,7 +97,7 @@ impl<I: Interpreter> Graph for I {
                 inputs.push(part.tensor);
                 inputs.len() - 1
             });
-            Place { input, first: part.first }
+            InputChannels { input, first: part.first }
         });
         let attend = Attend::new(places, width, heads, causal);
         match key_mask {

@@ -84,7 +84,7 @@ fn filled<E: Element>(arena: &Arena<E>, shape: &[usize], fill: impl FnOnce(&mut 
 
 /// Runs operations: what the tape and the eager interpreter have in common.
 ///
-/// Whoever can do this is a [`Graph`](crate::model::Graph).
+/// Every implementation is a [`Graph`](crate::model::Graph).
 pub trait Interpreter: Sized {
     type Element: Element;
 

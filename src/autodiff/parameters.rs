@@ -165,7 +165,7 @@ impl<E: Element> Parameters<E> {
         self.values.as_slice().expect("one run of memory")
     }
 
-    /// Returns the values of all for writing. Whoever writes keeps gaps and padding zero.
+    /// Returns the values of all for writing. The caller keeps gaps and padding zero.
     pub fn all_mut(&mut self) -> &mut [E] {
         self.values.as_slice_mut().expect("one run of memory")
     }

@@ -29,11 +29,11 @@ pub struct Tape<'p, E: Element> {
 }
 
 struct Node<'p, E: Element> {
-    step: Step<'p, E>,
+    step: NodeKind<'p, E>,
     inputs: Vec<Option<NodeId>>,
 }
 
-enum Step<'p, E: Element> {
+enum NodeKind<'p, E: Element> {
     /// An input whose gradient is wanted.
     Input,
     Operation(Box<dyn Operation<E>>),
@@ -89,11 +89,11 @@ impl<'p, E: Element> Tape<'p, E> {
     }
 
     fn mark(&mut self, mut x: Tensor<E>) -> Tensor<E> {
-        x.node = Some(self.push(Step::Input, Vec::new()));
+        x.node = Some(self.push(NodeKind::Input, Vec::new()));
         x
     }
 
-    fn push(&mut self, step: Step<'p, E>, inputs: Vec<Option<NodeId>>) -> NodeId {
+    fn push(&mut self, step: NodeKind<'p, E>, inputs: Vec<Option<NodeId>>) -> NodeId {
         self.nodes.push(Node { step, inputs });
         NodeId(self.nodes.len() - 1)
     }
@@ -137,14 +137,14 @@ impl<'p, E: Element> Tape<'p, E> {
         drop(result);
         while let Some(node) = self.nodes.pop() {
             let place = self.nodes.len();
-            if matches!(node.step, Step::Input) {
+            if matches!(node.step, NodeKind::Input) {
                 continue;
             }
             let Some(dy) = slots[place].take() else { continue };
             let needs: Vec<_> = node.inputs.iter().map(Option::is_some).collect();
             let found = match node.step {
-                Step::Input => continue,
-                Step::Operation(mut operation) => {
+                NodeKind::Input => continue,
+                NodeKind::Operation(mut operation) => {
                     let parameters = self.parameters;
                     let mut at =
                         Backward { parameters, gradients, arena: &self.arena, needs: &needs };
@@ -157,7 +157,7 @@ impl<'p, E: Element> Tape<'p, E> {
                     }
                     found
                 }
-                Step::Part(part) => self.backward_part(part, dy, &needs, gradients)?,
+                NodeKind::Part(part) => self.backward_part(part, dy, &needs, gradients)?,
             };
             for (input, dx) in node.inputs.iter().zip(found) {
                 if let (Some(input), Some(dx)) = (input, dx) {
@@ -231,7 +231,7 @@ impl<'p, E: Element> Interpreter for Tape<'p, E> {
             let (name, id) = (operation.name(), operation.parameter());
             check_finite(name, id, self.parameters, "result", &y)?;
         }
-        y.node = recording.then(|| self.push(Step::Operation(Box::new(operation)), inputs));
+        y.node = recording.then(|| self.push(NodeKind::Operation(Box::new(operation)), inputs));
         Ok(y)
     }
 
@@ -250,7 +250,7 @@ impl<'p, E: Element> Interpreter for Tape<'p, E> {
         self.recording = true;
         let mut y = y?;
         let run = Box::new(part);
-        y.node = Some(self.push(Step::Part(Part { inputs, run, n_random }), nodes));
+        y.node = Some(self.push(NodeKind::Part(Part { inputs, run, n_random }), nodes));
         Ok(y)
     }
 

@@ -12,7 +12,7 @@ use super::tape::NodeId;
 #[derive(Clone, Debug)]
 pub struct Tensor<E: Element> {
     value: Arc<Value<E>>,
-    /// What computed it, where a tape recorded that.
+    /// The node that computed it, where a tape recorded that.
     pub(super) node: Option<NodeId>,
 }
 
@@ -90,7 +90,7 @@ impl<E: Element> Tensor<E> {
         value.array.as_mut().and_then(|a| a.as_slice_mut()).expect("tensors lie in order")
     }
 
-    /// Returns whether nobody else sees this tensor, so that it may be overwritten.
+    /// Returns whether this is the only reference to the values, so that they may be overwritten.
     pub(super) fn is_unique(&self) -> bool {
         Arc::strong_count(&self.value) == 1
     }

@@ -120,7 +120,7 @@ struct File<'a> {
 }
 
 /// A key and its value.
-type Entry<'a> = (&'a String, &'a toml::Value);
+type ConfigEntry<'a> = (&'a String, &'a toml::Value);
 
 impl File<'_> {
     /// Refuses a section that is no stage's, and a key that no stage knows.
@@ -183,12 +183,12 @@ impl File<'_> {
         &self,
         mut command: Command,
         section: &str,
-        shared: &[Entry<'_>],
+        shared: &[ConfigEntry<'_>],
         own: Option<&toml::Value>,
     ) -> anyhow::Result<Command> {
         let path = &self.path;
         let own = own.and_then(toml::Value::as_table);
-        let is_kind = |(key, value): &Entry<'_>| {
+        let is_kind = |(key, value): &ConfigEntry<'_>| {
             value.is_table() && command.get_subcommands().any(|kind| kind.get_name() == *key)
         };
         let own_values: Vec<_> = own.into_iter().flatten().filter(|kv| !is_kind(kv)).collect();
@@ -230,8 +230,8 @@ fn keys(command: &Command) -> Vec<&str> {
         .filter(|a| !matches!(a.get_action(), ArgAction::Count))
         .filter_map(Arg::get_long)
         .filter(|flag| !["help", "version", FLAG].contains(flag));
-    let of_kinds = command.get_subcommands().flat_map(keys);
-    own.chain(of_kinds).filter(|flag| seen.insert(*flag)).collect()
+    let kind_keys = command.get_subcommands().flat_map(keys);
+    own.chain(kind_keys).filter(|flag| seen.insert(*flag)).collect()
 }
 
 fn unknown_key(command: &Command, section: &str, key: &str) -> String {

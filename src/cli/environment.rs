@@ -7,11 +7,11 @@ use anyhow::bail;
 use clap::builder::{BoolishValueParser, TypedValueParser};
 use clap::{Arg, ArgAction, Command};
 
-/// What the names of all variables of the program begin with.
+/// The prefix of the names of all variables of the program.
 const PREFIX: &str = "MOTIONGEN_";
 /// Variables that are read elsewhere: by the log, by onnxruntime's sessions, by the kernels.
 const OTHERS: [&str; 3] = ["MOTIONGEN_LOG", "MOTIONGEN_DEVICE", "MOTIONGEN_SIMD"];
-/// What the names of variables begin with that the project's own tests read.
+/// The prefix of the names of variables that the project's own tests read.
 const OF_TESTS: [&str; 2] = ["MOTIONGEN_TEST_", "MOTIONGEN_PAGE"];
 /// Flags of stages that a build may be without.
 const OF_OTHER_BUILDS: [&str; 3] = ["MOTIONGEN_SQL", "MOTIONGEN_TABLES", "MOTIONGEN_SOUNDFONT"];

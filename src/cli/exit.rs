@@ -90,7 +90,7 @@ pub fn report(stage: &str, form: Form, outcome: anyhow::Result<Box<dyn Summary>>
 pub fn stopped(stage: &str, form: Form) {
     tell("stopped as asked; the same command goes on with what is missing");
     if form == Form::Json {
-        // Nobody is left to be told that it could not be written.
+        // Standard output is gone when this fails, so that the error cannot be reported.
         print_object(&outcome_of(stage, STOPPED, 0)).ok();
     }
 }
@@ -102,7 +102,7 @@ pub fn usage(
     error: &clap::Error,
     configuration: Option<&OsStr>,
 ) -> ExitCode {
-    // The reader of a help text may be gone; there is nobody left to tell.
+    // The reader of a help text may be gone, and with it the place to report an error.
     error.print().ok();
     if !error.use_stderr() {
         return ExitCode::SUCCESS;

@@ -40,37 +40,37 @@ use exit::Form;
 use progress::Bars;
 
 /// A stage with its types taken away, for the front door.
-struct Entry {
+struct StageEntry {
     name: &'static str,
     about: &'static str,
     command: fn() -> Command,
     run: fn(&ArgMatches) -> ExitCode,
 }
 
-impl Entry {
+impl StageEntry {
     fn of<S: Stage>() -> Self {
         Self { name: S::NAME, about: S::ABOUT, command: command::<S>, run: run_stage::<S> }
     }
 }
 
 /// Returns every stage, in the order in which a pipeline runs them.
-fn entries() -> Vec<Entry> {
+fn entries() -> Vec<StageEntry> {
     vec![
-        Entry::of::<Ingest>(),
-        Entry::of::<Extract>(),
-        Entry::of::<Library>(),
-        Entry::of::<Train>(),
-        Entry::of::<Finetune>(),
-        Entry::of::<Export>(),
-        Entry::of::<Generate>(),
-        Entry::of::<Evaluate>(),
-        Entry::of::<Model>(),
-        Entry::of::<Plot>(),
-        Entry::of::<View>(),
+        StageEntry::of::<Ingest>(),
+        StageEntry::of::<Extract>(),
+        StageEntry::of::<Library>(),
+        StageEntry::of::<Train>(),
+        StageEntry::of::<Finetune>(),
+        StageEntry::of::<Export>(),
+        StageEntry::of::<Generate>(),
+        StageEntry::of::<Evaluate>(),
+        StageEntry::of::<Model>(),
+        StageEntry::of::<Plot>(),
+        StageEntry::of::<View>(),
         #[cfg(feature = "query")]
-        Entry::of::<Query>(),
-        Entry::of::<Compact>(),
-        Entry::of::<Vacuum>(),
+        StageEntry::of::<Query>(),
+        StageEntry::of::<Compact>(),
+        StageEntry::of::<Vacuum>(),
     ]
 }
 
@@ -237,15 +237,16 @@ fn run_stage<S: Stage>(matches: &ArgMatches) -> ExitCode {
 
 /// Returns whether the file that a stage writes is standard output.
 fn writes_to_standard_output(matches: &ArgMatches) -> bool {
-    let of_kind = matches.subcommand().is_some_and(|(_, kind)| writes_to_standard_output(kind));
+    let is_kind_output =
+        matches.subcommand().is_some_and(|(_, kind)| writes_to_standard_output(kind));
     let named = OUTPUTS.iter().filter_map(|id| matches.try_get_raw(id).ok().flatten());
-    of_kind || named.flatten().any(|value| is_standard_output(Path::new(value)))
+    is_kind_output || named.flatten().any(|value| is_standard_output(Path::new(value)))
 }
 
 /// Parameters that name one file to be written.
 const OUTPUTS: [&str; 2] = ["output", "report"];
 
-fn list_stages(entries: &[Entry]) -> anyhow::Result<Box<dyn Summary>> {
+fn list_stages(entries: &[StageEntry]) -> anyhow::Result<Box<dyn Summary>> {
     struct Stages(Vec<(&'static str, &'static str)>);
     impl Summary for Stages {
         fn write(&mut self, out: &mut dyn std::io::Write) -> std::io::Result<()> {

@@ -41,7 +41,7 @@ struct State {
 struct Count {
     what: String,
     unit: String,
-    /// What follows the rate.
+    /// The text after the rate.
     rate_unit: &'static str,
     done: u64,
     /// Of those, how many were done before the counting began.

@@ -62,7 +62,7 @@ pub fn run(
         (MAN, matches) => page(program, matches.get_one::<String>(STAGE).map(String::as_str)),
         _ => return None,
     };
-    Some(text.map(|text| Box::new(Printed(text)) as Box<dyn Summary>).map_err(Into::into))
+    Some(text.map(|text| Box::new(CapturedOutput(text)) as Box<dyn Summary>).map_err(Into::into))
 }
 
 fn page(program: Command, stage: Option<&str>) -> io::Result<Vec<u8>> {
@@ -79,9 +79,9 @@ fn page(program: Command, stage: Option<&str>) -> io::Result<Vec<u8>> {
     Ok(text)
 }
 
-struct Printed(Vec<u8>);
+struct CapturedOutput(Vec<u8>);
 
-impl Summary for Printed {
+impl Summary for CapturedOutput {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
         out.write_all(&self.0)
     }

@@ -20,7 +20,7 @@ pub enum BetaSchedule {
     Sqrt,
 }
 
-/// What the network predicts of x_t = √ᾱ x0 + √(1−ᾱ) ε.
+/// The prediction target of the network, given x_t = √ᾱ x0 + √(1−ᾱ) ε.
 #[derive(
     Clone, Copy, Debug, PartialEq, Eq, Hash, Default, clap::ValueEnum, Serialize, Deserialize,
 )]
@@ -41,7 +41,7 @@ pub enum Prediction {
 
 /// How the distance between a prediction and its target is measured.
 ///
-/// A name only: whoever differentiates the loss carries it out.
+/// A name only: the code that differentiates the loss implements it.
 #[derive(
     Clone, Copy, Debug, PartialEq, Eq, Hash, Default, clap::ValueEnum, Serialize, Deserialize,
 )]

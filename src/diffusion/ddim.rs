@@ -97,7 +97,7 @@ mod tests {
     #[test]
     fn the_linear_form_is_the_published_one_for_each_prediction() {
         for (t, next) in [(999, Some(799)), (400, Some(399)), (99, None)] {
-            let of = |prediction| ddim_linear(&schedule(prediction), t, next);
+            let linear_for = |prediction| ddim_linear(&schedule(prediction), t, next);
             let (from, to) = {
                 let schedule = schedule(Prediction::Epsilon);
                 (schedule.level(Some(t)), schedule.level(next))
@@ -106,12 +106,15 @@ mod tests {
             let (phi, phi_next) = (from.noise.atan2(from.signal), to.noise.atan2(to.signal));
             let ratio = to.signal / from.signal;
             let expected = [
-                (of(Prediction::Epsilon), (ratio, to.noise - from.noise * ratio)),
+                (linear_for(Prediction::Epsilon), (ratio, to.noise - from.noise * ratio)),
                 (
-                    of(Prediction::Sample),
+                    linear_for(Prediction::Sample),
                     (to.noise / from.noise, to.signal - from.signal * to.noise / from.noise),
                 ),
-                (of(Prediction::Velocity), ((phi - phi_next).cos(), -(phi - phi_next).sin())),
+                (
+                    linear_for(Prediction::Velocity),
+                    ((phi - phi_next).cos(), -(phi - phi_next).sin()),
+                ),
             ];
             for ((a, b), (want_a, want_b)) in expected {
                 assert!((a - want_a).abs() < 1e-12 * ratio, "{t} to {next:?}: {a}, {want_a}");

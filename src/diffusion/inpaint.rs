@@ -15,12 +15,12 @@ use super::schedule::Level;
 /// towards that of the conditional distribution but stops short of it: for two channels of one
 /// Gaussian with a correlation of 0.79, half way with DDPM, a third of the way with DDIM and η = 0.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Known {
+pub struct KnownValues {
     values: Array3<f32>,
     mask: Array3<bool>,
 }
 
-impl Known {
+impl KnownValues {
     /// Takes the values under a mask as known.
     ///
     /// # Shapes
@@ -106,16 +106,16 @@ mod tests {
     fn known_values_must_be_finite_under_the_mask_alone() {
         let values = arr3(&[[[1.0, f32::NAN], [f32::INFINITY, 2.0]]]);
         let mask = arr3(&[[[true, false], [false, true]]]);
-        assert!(Known::new(values.clone(), mask).is_ok());
+        assert!(KnownValues::new(values.clone(), mask).is_ok());
         let mask = arr3(&[[[true, false], [true, true]]]);
         assert_eq!(
-            Known::new(values.clone(), mask).expect_err("infinite").to_string(),
+            KnownValues::new(values.clone(), mask).expect_err("infinite").to_string(),
             "the known value at [0, 1, 0] is inf; every value under the mask must be finite: give \
              it a number or take it out of the mask"
         );
         let mask = arr3(&[[[true, false]]]);
         assert_eq!(
-            Known::new(values, mask).expect_err("shapes").to_string(),
+            KnownValues::new(values, mask).expect_err("shapes").to_string(),
             "the mask of known values has shape [1, 1, 2]; [1, 2, 2] is needed, the shape of the \
              values"
         );
@@ -123,7 +123,8 @@ mod tests {
 
     #[test]
     fn what_is_not_known_is_left_alone() {
-        let known = Known::new(arr3(&[[[3.0, 9.0]]]), arr3(&[[[true, false]]])).expect("known");
+        let known =
+            KnownValues::new(arr3(&[[[3.0, 9.0]]]), arr3(&[[[true, false]]])).expect("known");
         let level = Level { signal: 0.6, noise: 0.8 };
         let mut x_t = arr3(&[[[7.0, 7.5]]]);
         known.impose_noisy(&mut x_t, level, &arr3(&[[[0.5, 0.5]]]));

@@ -3,11 +3,11 @@
 use ndarray::{Array3, ArrayView3, Zip};
 
 use super::config::DiffusionError;
-use super::inpaint::Known;
+use super::inpaint::KnownValues;
 use super::process::epsilon_of;
 use super::sampler::SamplerConfig;
 use super::schedule::Schedule;
-use super::spacing::{Step, steps};
+use super::spacing::{SamplerStep, steps};
 
 /// Samples: turns noise x_T into x0, one call of the denoiser a step.
 ///
@@ -33,7 +33,7 @@ pub fn sample<E: From<DiffusionError>>(
     x: Array3<f32>,
     denoise: impl FnMut(ArrayView3<'_, f32>, usize) -> Result<Array3<f32>, E>,
     noise: impl FnMut(usize, &mut [f32]),
-    known: Option<&Known>,
+    known: Option<&KnownValues>,
 ) -> Result<Array3<f32>, E> {
     sample_refined(config, schedule, (x, schedule.len()), denoise, noise, known, None)
 }
@@ -58,7 +58,7 @@ pub fn sample_refined<E: From<DiffusionError>>(
     (mut x, n_left): (Array3<f32>, usize),
     mut denoise: impl FnMut(ArrayView3<'_, f32>, usize) -> Result<Array3<f32>, E>,
     mut noise: impl FnMut(usize, &mut [f32]),
-    known: Option<&Known>,
+    known: Option<&KnownValues>,
     mut refine: Option<Refine<'_>>,
 ) -> Result<Array3<f32>, E> {
     let n_left = n_left.min(schedule.len());
@@ -75,7 +75,7 @@ pub fn sample_refined<E: From<DiffusionError>>(
         noise(number, z.as_slice_mut().expect("an array made in standard order"));
     };
     let mut previous: Option<Array3<f32>> = None;
-    for (i, &Step { t, .. }) in steps.iter().enumerate() {
+    for (i, &SamplerStep { t, .. }) in steps.iter().enumerate() {
         let level = schedule.level(Some(t));
         if let Some(known) = known {
             draw(2 * i + 1, &mut z);
@@ -146,7 +146,7 @@ mod tests {
         Schedule::new(&config).expect("a schedule")
     }
 
-    fn run(sampler: Sampler, known: Option<&Known>) -> (Array3<f32>, Vec<usize>, Vec<usize>) {
+    fn run(sampler: Sampler, known: Option<&KnownValues>) -> (Array3<f32>, Vec<usize>, Vec<usize>) {
         let (mut visited, mut drawn) = (Vec::new(), Vec::new());
         let config = SamplerConfig { sampler, n_steps: 4, ..Default::default() };
         let x = Array3::from_shape_fn((2, 3, 5), |(i, j, k)| (i + 2 * j + 3 * k) as f32 - 9.0);
@@ -164,7 +164,7 @@ mod tests {
 
     #[test]
     fn draws_are_numbered_and_only_made_where_something_is_random() {
-        let known = Known::new(
+        let known = KnownValues::new(
             Array3::from_elem((2, 3, 5), 0.25),
             Array3::from_shape_fn((2, 3, 5), |(_, frame, _)| frame == 0),
         )
@@ -236,7 +236,7 @@ mod tests {
 
     #[test]
     fn bad_input_is_refused_in_whole_sentences() {
-        let message = |config: SamplerConfig, output: [usize; 3], known: Option<&Known>| {
+        let message = |config: SamplerConfig, output: [usize; 3], known: Option<&KnownValues>| {
             let denoise = |_: ArrayView3<'_, f32>, _| Ok(Array3::zeros(output));
             let result: Result<_, DiffusionError> =
                 sample(&config, &schedule(), Array3::zeros((2, 3, 5)), denoise, some_noise, known);
@@ -257,7 +257,7 @@ mod tests {
             "the denoiser's prediction has shape [2, 5, 3]; [2, 3, 5] is needed, the shape of the \
              sample"
         );
-        let known = Known::new(Array3::zeros((1, 3, 5)), Array3::from_elem((1, 3, 5), true))
+        let known = KnownValues::new(Array3::zeros((1, 3, 5)), Array3::from_elem((1, 3, 5), true))
             .expect("known values");
         assert_eq!(
             message(with(Sampler::DpmSolver, 4), [2, 3, 5], Some(&known)),

@@ -7,7 +7,7 @@ use super::ddim::ddim_update;
 use super::ddpm::posterior;
 use super::dpm_solver::dpm_solver_update;
 use super::schedule::Schedule;
-use super::spacing::{Spacing, Step, steps};
+use super::spacing::{SamplerStep, Spacing, steps};
 
 /// DPM-Solver++ takes its last step in first order below this many steps, as diffusers does.
 const LOWER_ORDER_FINAL_BELOW: usize = 15;
@@ -108,8 +108,8 @@ pub(super) struct Update {
 
 impl SamplerConfig {
     /// Returns the update of step i of `steps`.
-    pub(super) fn update(&self, schedule: &Schedule, steps: &[Step], i: usize) -> Update {
-        let Step { t, next } = steps[i];
+    pub(super) fn update(&self, schedule: &Schedule, steps: &[SamplerStep], i: usize) -> Update {
+        let SamplerStep { t, next } = steps[i];
         match self.sampler {
             Sampler::Ddpm => {
                 let posterior = posterior(schedule, t, next);

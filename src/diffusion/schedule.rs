@@ -5,7 +5,7 @@ use super::ddpm::posterior;
 
 /// Keeps the cosine schedule's ᾱ away from 1 at the first step.
 const COSINE_OFFSET: f64 = 0.008;
-/// What β of the cosine schedule is kept within.
+/// Bounds of β of the cosine schedule.
 const COSINE_BETAS: (f64, f64) = (1e-4, 0.9999);
 /// Below this ᾱ, 1/√ᾱ is 1e15: the estimate of x0 is noise in any precision.
 const SMALLEST_ALPHA_BAR: f64 = 1e-30;

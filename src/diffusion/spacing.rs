@@ -27,7 +27,7 @@ pub enum Spacing {
 
 /// One step of a sampler: from x_t to x at `next`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Step {
+pub struct SamplerStep {
     pub t: usize,
     /// Where the step leads; `None` is clean data, ᾱ = 1.
     pub next: Option<usize>,
@@ -42,7 +42,7 @@ pub struct Step {
 /// - linspace: round((n − 1 − i) (T−1)/(n−1)), and T − 1 where n is 1
 /// - reference: T − 1 − i ⌊T/n⌋
 ///
-/// They are those of NumPy's `arange`, `linspace` and `round` in exact arithmetic.
+/// The timesteps are those of NumPy's `arange`, `linspace` and `round` in exact arithmetic.
 ///
 /// # Errors
 /// An `n_steps` of 0 or above `n_train`.
@@ -74,11 +74,11 @@ pub fn steps(
     n_train: usize,
     n_steps: usize,
     spacing: Spacing,
-) -> Result<Vec<Step>, DiffusionError> {
+) -> Result<Vec<SamplerStep>, DiffusionError> {
     let t = timesteps(n_train, n_steps, spacing)?;
     let end = (spacing == Spacing::Reference).then_some(0);
     let next = t.iter().skip(1).map(|&t| Some(t)).chain([end]);
-    Ok(t.iter().zip(next).map(|(&t, next)| Step { t, next }).collect())
+    Ok(t.iter().zip(next).map(|(&t, next)| SamplerStep { t, next }).collect())
 }
 
 /// Returns a/b, b > 0, rounded to the nearest integer, halves to even.
@@ -99,12 +99,21 @@ mod tests {
 
     #[test]
     fn ten_of_a_thousand_are_those_of_the_paper() {
-        let of = |spacing| timesteps(1000, 10, spacing).expect("steps");
+        let ten_timesteps = |spacing| timesteps(1000, 10, spacing).expect("steps");
         // Table 2 counts from 1: 1, 101, .., 901; 1, 112, 223, .., 1000; 100, 200, .., 1000.
-        assert_eq!(of(Spacing::Leading), [900, 800, 700, 600, 500, 400, 300, 200, 100, 0]);
-        assert_eq!(of(Spacing::Linspace), [999, 888, 777, 666, 555, 444, 333, 222, 111, 0]);
-        assert_eq!(of(Spacing::Trailing), [999, 899, 799, 699, 599, 499, 399, 299, 199, 99]);
-        assert_eq!(of(Spacing::Reference), of(Spacing::Trailing));
+        assert_eq!(
+            ten_timesteps(Spacing::Leading),
+            [900, 800, 700, 600, 500, 400, 300, 200, 100, 0]
+        );
+        assert_eq!(
+            ten_timesteps(Spacing::Linspace),
+            [999, 888, 777, 666, 555, 444, 333, 222, 111, 0]
+        );
+        assert_eq!(
+            ten_timesteps(Spacing::Trailing),
+            [999, 899, 799, 699, 599, 499, 399, 299, 199, 99]
+        );
+        assert_eq!(ten_timesteps(Spacing::Reference), ten_timesteps(Spacing::Trailing));
         // 1000/3 is not whole: the reference's stride is 333, trailing rounds 666.67 and 333.33.
         assert_eq!(timesteps(1000, 3, Spacing::Reference), Ok(vec![999, 666, 333]));
         assert_eq!(timesteps(1000, 3, Spacing::Trailing), Ok(vec![999, 666, 332]));
@@ -112,12 +121,12 @@ mod tests {
 
     #[test]
     fn the_last_step_leads_to_clean_data_but_for_the_reference() {
-        let of = |spacing| steps(20, 2, spacing).expect("steps");
-        let step = |t, next| Step { t, next };
-        assert_eq!(of(Spacing::Trailing), [step(19, Some(9)), step(9, None)]);
-        assert_eq!(of(Spacing::Leading), [step(10, Some(0)), step(0, None)]);
-        assert_eq!(of(Spacing::Linspace), [step(19, Some(0)), step(0, None)]);
-        assert_eq!(of(Spacing::Reference), [step(19, Some(9)), step(9, Some(0))]);
+        let two_steps = |spacing| steps(20, 2, spacing).expect("steps");
+        let step = |t, next| SamplerStep { t, next };
+        assert_eq!(two_steps(Spacing::Trailing), [step(19, Some(9)), step(9, None)]);
+        assert_eq!(two_steps(Spacing::Leading), [step(10, Some(0)), step(0, None)]);
+        assert_eq!(two_steps(Spacing::Linspace), [step(19, Some(0)), step(0, None)]);
+        assert_eq!(two_steps(Spacing::Reference), [step(19, Some(9)), step(9, Some(0))]);
     }
 
     #[test]

@@ -44,14 +44,14 @@ mod tests {
     #[test]
     fn the_three_weights_are_one_weight_of_an_error_in_x0() {
         let t: Vec<usize> = (0..1000).step_by(37).collect();
-        let of = |prediction| {
+        let weights_for = |prediction| {
             let config = DiffusionConfig { prediction, ..Default::default() };
             let schedule = Schedule::new(&config).expect("a schedule");
             (min_snr_weights(&schedule, &t, 5.0).expect("weights"), schedule)
         };
-        let (epsilon, schedule) = of(Prediction::Epsilon);
-        let (sample, _) = of(Prediction::Sample);
-        let (velocity, _) = of(Prediction::Velocity);
+        let (epsilon, schedule) = weights_for(Prediction::Epsilon);
+        let (sample, _) = weights_for(Prediction::Sample);
+        let (velocity, _) = weights_for(Prediction::Velocity);
         for (i, &t) in t.iter().enumerate() {
             // An error e in x0 is √SNR e in ε and √(SNR+1) e in v.
             let snr = schedule.snr(t);

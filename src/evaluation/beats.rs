@@ -118,9 +118,9 @@ pub fn beat_alignment(
         }
     }
     let score = |width: usize, direction: usize| {
-        let of = &scores[width];
-        let shifted: Vec<f64> = of[1..].iter().map(|pair| pair[direction]).collect();
-        BeatScore::against_chance(WIDTHS_S[width], of[0][direction], &shifted)
+        let pairs = &scores[width];
+        let shifted: Vec<f64> = pairs[1..].iter().map(|pair| pair[direction]).collect();
+        BeatScore::against_chance(WIDTHS_S[width], pairs[0][direction], &shifted)
     };
     Some(BeatAlignment {
         n_motion_beats: motion.len(),

@@ -66,8 +66,8 @@ pub fn control_errors<S: AsRef<[f64]>>(samples: &[S], threshold: f64) -> Option<
     let is_above = |miss: &f64| !miss.is_finite() || *miss > threshold;
     let n_above = |misses: &[f64]| misses.iter().filter(|&miss| is_above(miss)).count();
     let sum = |misses: &[f64]| misses.iter().sum::<f64>();
-    let over_samples = |of: &dyn Fn(&[f64]) -> f64| {
-        samples.iter().map(|&misses| of(misses)).sum::<f64>() / samples.len() as f64
+    let over_samples = |statistic: &dyn Fn(&[f64]) -> f64| {
+        samples.iter().map(|&misses| statistic(misses)).sum::<f64>() / samples.len() as f64
     };
     let n_keyframes: usize = samples.iter().map(|misses| misses.len()).sum();
     let all_above: usize = samples.iter().map(|&misses| n_above(misses)).sum();

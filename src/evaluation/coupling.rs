@@ -28,7 +28,7 @@ const MIN_POWER: f64 = 1e-12;
 /// Real and imaginary part.
 type Complex = [f64; 2];
 
-/// What vertical velocity is known to owe to the bar.
+/// The known dependence of vertical velocity on the phase in the bar.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Coupling {
     /// The forward difference of h(φ, a), with which `library` constructs motion.

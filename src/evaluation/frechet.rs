@@ -6,7 +6,7 @@
 use ndarray::{Array1, Array2, ArrayView2, Axis};
 use serde::{Deserialize, Serialize};
 
-/// Features are too few to have a covariance below so many for each of their numbers.
+/// Least feature vectors per dimension for which a covariance is estimated.
 pub const MIN_PER_DIMENSION: usize = 10;
 
 /// Added to the diagonals of covariances of which one is singular, as in mint and GCD.

@@ -1,4 +1,4 @@
-//! Geometric features: the share of frames in which each of sixteen things is so.
+//! Geometric features: the fraction of frames for which each of sixteen predicates holds.
 //!
 //! After the features of skeletons of Müller, Röder and Clausen ("Efficient content-based retrieval of motion
 //! capture data", 2005), put into terms of one rigid body. Thresholds come from the ground truth and are kept
@@ -68,8 +68,8 @@ impl GeometricThresholds {
     /// Takes the quantiles over all frames of the ground truth, given in chunks; none without frames.
     pub fn fit<'a>(chunks: impl IntoIterator<Item = &'a Poses>) -> Option<Self> {
         let all: Vec<Quantities> = chunks.into_iter().flat_map(quantities).collect();
-        let quantile = |of: fn(&Quantities) -> f64, p: f64| {
-            percentile(&mut all.iter().map(of).collect::<Vec<_>>(), p)
+        let quantile = |quantity: fn(&Quantities) -> f64, p: f64| {
+            percentile(&mut all.iter().map(quantity).collect::<Vec<_>>(), p)
         };
         Some(Self {
             speed_q50_m_s: quantile(|x| x.speed, 50.0)?,
@@ -83,7 +83,7 @@ impl GeometricThresholds {
         })
     }
 
-    /// What is so of a frame, in the order of [`GEOMETRIC_NAMES`].
+    /// Returns whether each predicate holds for a frame, in the order of [`GEOMETRIC_NAMES`].
     fn hold(&self, x: &Quantities) -> [bool; 16] {
         let turns = |axis: usize| x.turn_rate[axis] > TURN_RATE_DEG_S.to_radians();
         [
@@ -107,7 +107,7 @@ impl GeometricThresholds {
     }
 }
 
-/// Returns the share of the frames of a chunk in which each of [`GEOMETRIC_NAMES`] is so, in [0, 1].
+/// Returns the fraction of the frames of a chunk for which each of [`GEOMETRIC_NAMES`] holds, in [0, 1].
 ///
 /// Climbing and diving are one feature, as are outward and inward: over a chunk a body that keeps its height
 /// and its place does as much of either. None for fewer than three frames.
@@ -125,7 +125,7 @@ pub fn geometric_features(poses: &Poses, thresholds: &GeometricThresholds) -> Op
     Some(counts.map(|count| count as f64 / all.len() as f64))
 }
 
-/// What the features look at, of one frame.
+/// The quantities of one frame that the features are computed from.
 struct Quantities {
     speed: f64,
     vertical_speed: f64,
@@ -242,19 +242,19 @@ mod tests {
                 .collect(),
         };
         let found = geometric_features(&poses, &THRESHOLDS).expect("frames");
-        let of =
+        let feature =
             |name: &str| found[GEOMETRIC_NAMES.iter().position(|n| *n == name).expect("a feature")];
         for name in ["speed_above_q50", "speed_above_q90", "climbing_or_diving", "rolling"] {
-            assert_eq!(of(name), 1.0, "{name}");
+            assert_eq!(feature(name), 1.0, "{name}");
         }
         for name in ["radial", "high", "speeding_up"] {
-            assert_eq!(of(name), 1.0, "{name}");
+            assert_eq!(feature(name), 1.0, "{name}");
         }
         assert_eq!(
-            (of("yawing"), of("pitching"), of("forward"), of("curved")),
+            (feature("yawing"), feature("pitching"), feature("forward"), feature("curved")),
             (0.0, 0.0, 0.0, 0.0)
         );
-        assert!(of("sideways") > 0.5, "as long as the roll leaves x aside");
+        assert!(feature("sideways") > 0.5, "as long as the roll leaves x aside");
     }
 
     #[test]

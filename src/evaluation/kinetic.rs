@@ -145,8 +145,8 @@ fn unit(axis: usize) -> Vector {
 }
 
 /// Mean over all frames but the first.
-fn mean_over(x: &[Vector], of: impl Fn(usize) -> f64) -> f64 {
-    (1..x.len()).map(of).sum::<f64>() / (x.len() - 1) as f64
+fn mean_over(x: &[Vector], value: impl Fn(usize) -> f64) -> f64 {
+    (1..x.len()).map(value).sum::<f64>() / (x.len() - 1) as f64
 }
 
 /// Mean of the differences of the window around frame `t`, of which there is at least one.

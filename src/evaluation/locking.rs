@@ -200,7 +200,7 @@ mod tests {
         assert_eq!(locking_against(&[], &ratios), None);
         let whole = [vec![Passage { signal: &signal, bars: &bars }]];
         assert_eq!(locking_against(&whole, &ratios[..1]), None);
-        // Whoever stands still is not locked, at this tempo as little as at others.
+        // Motion that stands still is not locked, at this tempo or at any other.
         let still = [0.0; 60];
         let found = locking_against(&[vec![Passage { signal: &still, bars: &bars }]], &ratios);
         assert_eq!(found.map(|x| (x.r2, x.effect, x.wrong_share)), Some((0.0, None, 1.0)));

@@ -12,9 +12,9 @@ use super::reference_statistics::{FeatureSet, ReferenceStatistics};
 use super::sanity::{Check, CheckSet, checks};
 use super::window_range::Posture;
 
-/// A window of motion as its numbers.
+/// The measured numbers of a window of motion.
 #[derive(Clone, Debug)]
-pub struct Measured {
+pub struct WindowMeasures {
     pub n_frames: usize,
     /// The reference's checks and the strict ones; with reference statistics, those of the training split's
     /// windows too.
@@ -35,7 +35,7 @@ pub struct Measured {
     features: Vec<Option<Array2<f64>>>,
 }
 
-impl Measured {
+impl WindowMeasures {
     /// Measures a window, `[T, 25]`.
     ///
     /// # Panics
@@ -111,7 +111,7 @@ mod tests {
     #[test]
     fn a_motion_is_measured_by_its_positions() {
         let mut frames = bounce(91);
-        let found = Measured::new(frames.view(), ChannelLimits::Wide, None);
+        let found = WindowMeasures::new(frames.view(), ChannelLimits::Wide, None);
         assert_eq!((found.n_frames, found.rise_m_s.len(), found.phase.len()), (91, 90, 91));
         assert_eq!((found.checks.len(), found.passes(CheckSet::Reference)), (13, true));
         // Four amplitudes a second, less what frames half a frame from the peaks miss.
@@ -123,7 +123,7 @@ mod tests {
         assert!(found.features(FeatureSet::Axes).is_none());
         // What the velocity channel says changes checks, not the speed.
         frames.column_mut(4).fill(90.0);
-        let lying = Measured::new(frames.view(), ChannelLimits::Wide, None);
+        let lying = WindowMeasures::new(frames.view(), ChannelLimits::Wide, None);
         assert_eq!(lying.mean_speed_m_s, found.mean_speed_m_s);
         assert!(!lying.passes(CheckSet::Reference) && !lying.passes(CheckSet::Strict));
     }
@@ -132,7 +132,7 @@ mod tests {
     fn a_motion_that_is_not_finite_has_checks_and_nothing_else() {
         let mut frames = bounce(31);
         frames[[7, 0]] = f32::NAN;
-        let found = Measured::new(frames.view(), ChannelLimits::Wide, None);
+        let found = WindowMeasures::new(frames.view(), ChannelLimits::Wide, None);
         assert_eq!((found.mean_speed_m_s, found.rise_m_s.len(), found.beats.len()), (None, 0, 0));
         assert_eq!(found.consistency, None);
         assert!(!found.passes(CheckSet::Strict));

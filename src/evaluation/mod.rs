@@ -25,7 +25,7 @@ pub mod verdict;
 pub mod window;
 pub mod window_range;
 
-pub use measured::Measured;
+pub use measured::WindowMeasures;
 pub use sanity::{
     Check, CheckSet, checks, derivative_error, holds_by_construction, holds_by_derivation,
 };

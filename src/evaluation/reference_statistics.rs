@@ -156,7 +156,7 @@ pub enum ReferenceError {
     Bounds,
 }
 
-/// What is known of the ground truth.
+/// Statistics of the ground truth.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ReferenceStatistics {
     pub version: u32,
@@ -189,7 +189,8 @@ impl ReferenceStatistics {
             all.extend(chunks(whole.len()).map(|chunk| part(&whole, chunk)));
         }
         let thresholds = GeometricThresholds::fit(&all)?;
-        let of = |set: FeatureSet| FeatureStatistics::fit(set.stacked(&all, &thresholds).view());
+        let statistics_of =
+            |set: FeatureSet| FeatureStatistics::fit(set.stacked(&all, &thresholds).view());
         Some(Self {
             version: REFERENCE_VERSION,
             data_hash,
@@ -200,11 +201,11 @@ impl ReferenceStatistics {
             body_radius_m: BODY_RADIUS_M,
             thresholds,
             window_range: WindowRange::fit(&postures)?,
-            axes: of(FeatureSet::Axes)?,
-            axes_compat: of(FeatureSet::AxesCompat)?,
-            markers: of(FeatureSet::Markers)?,
-            markers_compat: of(FeatureSet::MarkersCompat)?,
-            geometric: of(FeatureSet::Geometric)?,
+            axes: statistics_of(FeatureSet::Axes)?,
+            axes_compat: statistics_of(FeatureSet::AxesCompat)?,
+            markers: statistics_of(FeatureSet::Markers)?,
+            markers_compat: statistics_of(FeatureSet::MarkersCompat)?,
+            geometric: statistics_of(FeatureSet::Geometric)?,
         })
     }
 
@@ -213,7 +214,7 @@ impl ReferenceStatistics {
     /// Errors: [`ReferenceError`] for text that is not such an artefact, another version, and features of
     /// another size.
     pub fn from_json(text: &str) -> Result<Self, ReferenceError> {
-        /// What tells whether the rest can be read.
+        /// The version, which tells whether the rest can be read.
         #[derive(Deserialize)]
         struct Head {
             version: u32,

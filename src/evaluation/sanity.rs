@@ -58,7 +58,7 @@ mod strict {
 /// Differences are forward ones, as everywhere. A value that is not finite fails every check that it
 /// enters, and one of its own.
 pub fn checks(frames: ArrayView2<f32>, limits: ChannelLimits) -> Vec<Check> {
-    let m = Measured::of(frames, limits);
+    let m = CheckQuantities::of(frames, limits);
     let within = |x: f64, [low, high]: [f64; 2]| x >= low && x <= high;
     let check = |name, set, value: f64, threshold, passed, message: String| Check {
         name,
@@ -214,8 +214,8 @@ pub fn derivative_error(frames: ArrayView2<f32>, of: Channel, derivative: Channe
     (0..pairs).map(off).sum::<f64>() / (3 * pairs.max(1)) as f64
 }
 
-/// What the checks look at.
-struct Measured {
+/// The quantities of a motion that the checks compare with thresholds.
+struct CheckQuantities {
     norm: f64,
     phase: [f64; 2],
     jerk: f64,
@@ -228,7 +228,7 @@ struct Measured {
     n_falls: usize,
 }
 
-impl Measured {
+impl CheckQuantities {
     fn of(frames: ArrayView2<f32>, limits: ChannelLimits) -> Self {
         let n = frames.nrows();
         let vector = |channel: Channel, t: usize| -> [f64; 3] {

@@ -14,7 +14,7 @@ const HALF_COHERENT_M_S: f64 = 0.1;
 /// Tempi beside the music's own that locking is held against.
 const N_WRONG_TEMPI: usize = 12;
 
-/// What a motion scores.
+/// The score of a motion.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Score {
     /// From 0 to 1; none for motion that is not finite.
@@ -87,11 +87,11 @@ mod tests {
 
     #[test]
     fn motion_in_time_scores_above_motion_out_of_time() {
-        let of = |tempo| {
+        let score_at = |tempo| {
             let frames = bobbing(900, tempo);
             score(frames.view(), ChannelLimits::Wide, Some(&phase(900)), 0.1)
         };
-        let (right, wrong) = (of(1.0), of(0.93));
+        let (right, wrong) = (score_at(1.0), score_at(0.93));
         assert!(right.locking > Some(0.9) && wrong.locking < Some(0.1), "{right:?} {wrong:?}");
         assert!(right.total > wrong.total);
         let expected = (right.n_passed as f64 / 13.0 + 0.5 + right.locking.expect("beats")) / 3.0;

@@ -19,7 +19,7 @@ mod varied;
 use super::interval::Estimate;
 use super::metrics::Number;
 
-/// What a verdict is about.
+/// The quality that a verdict judges.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Quality {
     Sound,
@@ -71,7 +71,7 @@ impl Outcome {
     }
 }
 
-/// What a value must keep.
+/// The bound that a value must keep.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Rule {
     AtLeast(f64),
@@ -117,12 +117,12 @@ impl Rule {
 pub struct Test {
     pub name: &'static str,
     pub outcome: Outcome,
-    /// What was measured, in words.
+    /// The measured statistic, in words.
     pub statistic: String,
     pub estimate: Estimate,
     pub unit: &'static str,
     pub rule: Rule,
-    /// What the value is held against.
+    /// The value of comparison, in words.
     pub against: String,
     /// Probability by chance, and the same adjusted for the family of the verdict's tests (Holm).
     pub p: Option<f64>,

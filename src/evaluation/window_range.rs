@@ -14,7 +14,7 @@ use super::sanity::{Check, CheckSet};
 /// Percentage of the training windows that lie below an upper bound, and above a lower one.
 pub const RANGE_PERCENT: f64 = 99.5;
 
-/// What is looked at in a window; all from positions and orientations.
+/// Quantities of a window, all from positions and orientations.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Posture {
     /// Highest speed, m/s.

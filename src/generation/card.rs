@@ -102,7 +102,7 @@ pub struct ModelCard {
     pub unet: UNetConfig,
     pub decoder: DecoderConfig,
     pub diffusion: DiffusionConfig,
-    /// ᾱ of each step of the diffusion, for whoever samples without this program.
+    /// ᾱ of each step of the diffusion, for programs other than this one that sample from the model.
     pub alphas_cumprod: Vec<f64>,
     pub n_parameters: Networks<usize>,
     /// SHA-256 of each network's weights as f32, in the order in which its layers are made.
@@ -141,7 +141,7 @@ pub struct SamplingDefaults {
 /// Guidance of models whose card tells none, as release 0.1 sampled them.
 const GUIDANCE_WITHOUT_CARD: f64 = 4.0;
 
-/// What a model was made of.
+/// The run, training steps and data that a model was made from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Provenance {
     pub run: String,

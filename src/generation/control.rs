@@ -18,7 +18,7 @@ const SAME: f64 = 1e-6;
 
 /// A value that one channel must have at one frame; the channels of an orientation come together.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Wanted {
+pub enum WantedValue {
     /// A channel other than those of the orientation, by its place in a frame.
     Value { channel: usize, value: f64 },
     /// A unit quaternion.
@@ -49,7 +49,7 @@ pub enum ControlError {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Constraints {
     /// In order of frame.
-    wanted: Vec<(usize, Wanted)>,
+    wanted: Vec<(usize, WantedValue)>,
 }
 
 /// How far a motion is from one constraint.
@@ -61,7 +61,7 @@ pub struct Miss {
     pub error: f64,
 }
 
-impl Wanted {
+impl WantedValue {
     fn what(&self) -> &'static str {
         match self {
             Self::Value { channel, .. } => CHANNEL_NAMES[*channel],
@@ -96,19 +96,19 @@ impl Constraints {
     /// [`ControlError`] for the first that is outside the track or its channel's limits, or contradicts
     /// another.
     pub fn new(
-        mut wanted: Vec<(usize, Wanted)>,
+        mut wanted: Vec<(usize, WantedValue)>,
         n_frames: usize,
         limits: ChannelLimits,
     ) -> Result<Self, ControlError> {
         wanted.sort_by_key(|(frame, wanted)| (*frame, wanted.what()));
-        let mut kept: Vec<(usize, Wanted)> = Vec::with_capacity(wanted.len());
+        let mut kept: Vec<(usize, WantedValue)> = Vec::with_capacity(wanted.len());
         for (frame, wanted) in wanted {
             let what = || wanted.what().to_owned();
             if frame >= n_frames {
                 return Err(ControlError::Outside { what: what(), frame, n_frames });
             }
             let wanted = match wanted {
-                Wanted::Value { channel, value } => {
+                WantedValue::Value { channel, value } => {
                     let unit = channel_unit(channel).unwrap_or_default();
                     let group = Channel::ALL.into_iter().find(|c| c.range().contains(&channel));
                     let (low, high) = group.map_or((0.0, 0.0), |group| limits.bounds(group));
@@ -118,12 +118,12 @@ impl Constraints {
                     }
                     wanted
                 }
-                Wanted::Orientation(q) => {
+                WantedValue::Orientation(q) => {
                     let length = dot(q, q).sqrt();
                     if (length - 1.0).abs() > 0.01 || !length.is_finite() {
                         return Err(ControlError::Length { frame, length });
                     }
-                    Wanted::Orientation(normalize(q))
+                    WantedValue::Orientation(normalize(q))
                 }
             };
             match kept.last() {
@@ -161,13 +161,13 @@ impl Constraints {
         let (mut position_m, mut orientation) = ([0.0; 3], [1.0, 0.0, 0.0, 0.0]);
         for (_, wanted) in first {
             match *wanted {
-                Wanted::Value { channel, value }
+                WantedValue::Value { channel, value }
                     if Channel::Position.range().contains(&channel) =>
                 {
                     position_m[channel] = value;
                 }
-                Wanted::Orientation(q) => orientation = q,
-                Wanted::Value { .. } => {}
+                WantedValue::Orientation(q) => orientation = q,
+                WantedValue::Value { .. } => {}
             }
         }
         Placement::of(position_m, orientation)
@@ -185,7 +185,7 @@ impl Constraints {
         for channel in (0..MOTION_DIM).filter(|i| !Channel::Quaternion.range().contains(i)) {
             let errors =
                 self.in_range(first, frames.nrows()).filter_map(|(t, wanted)| match wanted {
-                    Wanted::Value { channel: of, value } if of == channel => {
+                    WantedValue::Value { channel: of, value } if of == channel => {
                         Some((t, [value - f64::from(frames[[t, channel]])]))
                     }
                     _ => None,
@@ -195,8 +195,10 @@ impl Constraints {
             }
         }
         let errors = self.in_range(first, frames.nrows()).filter_map(|(t, wanted)| match wanted {
-            Wanted::Orientation(q) => Some((t, rotation_vector(q, orientation(frames.view(), t)))),
-            Wanted::Value { .. } => None,
+            WantedValue::Orientation(q) => {
+                Some((t, rotation_vector(q, orientation(frames.view(), t))))
+            }
+            WantedValue::Value { .. } => None,
         });
         let corrections = spread(&errors.collect::<Vec<_>>(), frames.nrows());
         if corrections.is_empty() {
@@ -222,11 +224,13 @@ impl Constraints {
             HeldPoses { position: vec![[false; 3]; n_frames], orientation: vec![false; n_frames] };
         for (t, wanted) in self.in_range(0, n_frames) {
             match wanted {
-                Wanted::Value { channel, .. } if Channel::Position.range().contains(&channel) => {
+                WantedValue::Value { channel, .. }
+                    if Channel::Position.range().contains(&channel) =>
+                {
                     held.position[t][channel - Channel::Position.range().start] = true;
                 }
-                Wanted::Orientation(_) => held.orientation[t] = true,
-                Wanted::Value { .. } => {}
+                WantedValue::Orientation(_) => held.orientation[t] = true,
+                WantedValue::Value { .. } => {}
             }
         }
         held
@@ -234,12 +238,14 @@ impl Constraints {
 
     /// Returns how far a track's motion, `[T, 25]` in the world, is from each constraint.
     pub fn errors(&self, frames: ArrayView2<f32>) -> Vec<Miss> {
-        let error = |(t, wanted): (usize, Wanted)| Miss {
+        let error = |(t, wanted): (usize, WantedValue)| Miss {
             frame: t,
             what: wanted.what(),
             error: match wanted {
-                Wanted::Value { channel, value } => (value - f64::from(frames[[t, channel]])).abs(),
-                Wanted::Orientation(q) => {
+                WantedValue::Value { channel, value } => {
+                    (value - f64::from(frames[[t, channel]])).abs()
+                }
+                WantedValue::Orientation(q) => {
                     let v = rotation_vector(q, orientation(frames, t));
                     v.iter().map(|x| x * x).sum::<f64>().sqrt()
                 }
@@ -249,8 +255,8 @@ impl Constraints {
     }
 
     /// The constraints of some frames, which are counted from `first`.
-    fn in_range(&self, first: usize, n: usize) -> impl Iterator<Item = (usize, Wanted)> + '_ {
-        let inside = move |&(frame, wanted): &(usize, Wanted)| {
+    fn in_range(&self, first: usize, n: usize) -> impl Iterator<Item = (usize, WantedValue)> + '_ {
+        let inside = move |&(frame, wanted): &(usize, WantedValue)| {
             frame.checked_sub(first).filter(|t| *t < n).map(|t| (t, wanted))
         };
         self.wanted.iter().filter_map(inside)
@@ -301,15 +307,15 @@ fn rotation_vector(to: Quaternion, from: Quaternion) -> [f64; 3] {
 ///
 /// `before`: \[T, 25\]; positions and orientations are taken as they are, so that the track stands where
 /// that motion ended.
-pub fn continuing(before: ArrayView2<f32>, n: usize) -> Vec<(usize, Wanted)> {
+pub fn continuing(before: ArrayView2<f32>, n: usize) -> Vec<(usize, WantedValue)> {
     let first = before.nrows().saturating_sub(n);
     let mut wanted = Vec::new();
     for t in first..before.nrows() {
         for channel in Channel::Position.range() {
             let value = f64::from(before[[t, channel]]);
-            wanted.push((t - first, Wanted::Value { channel, value }));
+            wanted.push((t - first, WantedValue::Value { channel, value }));
         }
-        wanted.push((t - first, Wanted::Orientation(orientation(before, t))));
+        wanted.push((t - first, WantedValue::Orientation(orientation(before, t))));
     }
     wanted
 }
@@ -323,8 +329,8 @@ pub fn facing(heading_rad: f64) -> Quaternion {
 mod tests {
     use super::*;
 
-    fn value(frame: usize, channel: usize, value: f64) -> (usize, Wanted) {
-        (frame, Wanted::Value { channel, value })
+    fn value(frame: usize, channel: usize, value: f64) -> (usize, WantedValue) {
+        (frame, WantedValue::Value { channel, value })
     }
 
     /// Standing at (1, 0.9, 0), facing +Z.
@@ -336,7 +342,7 @@ mod tests {
         frames
     }
 
-    fn constraints(wanted: Vec<(usize, Wanted)>) -> Constraints {
+    fn constraints(wanted: Vec<(usize, WantedValue)>) -> Constraints {
         Constraints::new(wanted, 101, ChannelLimits::Wide).expect("constraints that can be kept")
     }
 
@@ -346,7 +352,7 @@ mod tests {
         let asked = constraints(vec![
             value(50, 0, 2.0),
             value(57, 0, 0.5),
-            (30, Wanted::Orientation(turned)),
+            (30, WantedValue::Orientation(turned)),
         ]);
         let mut frames = standing(101);
         assert!((asked.errors(frames.view())[0].error - 1.2).abs() < 1e-6);
@@ -390,7 +396,7 @@ mod tests {
         let asked = constraints(vec![
             value(0, 0, 3.0),
             value(0, 2, -1.0),
-            (0, Wanted::Orientation(facing(0.5))),
+            (0, WantedValue::Orientation(facing(0.5))),
         ]);
         let placement = asked.placement();
         assert_eq!((placement.x_m, placement.z_m), (3.0, -1.0));
@@ -414,7 +420,7 @@ mod tests {
 
     #[test]
     fn constraints_that_cannot_be_kept_are_named() {
-        let said = |wanted: Vec<(usize, Wanted)>| {
+        let said = |wanted: Vec<(usize, WantedValue)>| {
             let refused = Constraints::new(wanted, 101, ChannelLimits::Wide);
             refused.expect_err("no constraints").to_string()
         };
@@ -432,7 +438,7 @@ mod tests {
             "velocity_x at frame 7 is 60, allowed -50 to 50 m/s; correct the constraint"
         );
         assert_eq!(
-            said(vec![(7, Wanted::Orientation([1.0, 1.0, 0.0, 0.0]))]),
+            said(vec![(7, WantedValue::Orientation([1.0, 1.0, 0.0, 0.0]))]),
             "the orientation at frame 7 has length 1.4142; a quaternion has length 1"
         );
         let twice = constraints(vec![value(7, 1, 0.5), value(7, 1, 0.5)]);

@@ -20,10 +20,10 @@ pub struct EagerEngine {
     decoder_parameters: Parameters<f32>,
     /// Of the condition.
     scale: FeatureScale,
-    workers: Pool<Worker>,
+    workers: Pool<EagerWorker>,
 }
 
-struct Worker {
+struct EagerWorker {
     threads: Threads,
     arena: Arena<f32>,
 }
@@ -40,7 +40,7 @@ impl EagerEngine {
         (n_workers, n_threads): (NonZeroUsize, NonZeroUsize),
     ) -> std::io::Result<Self> {
         let worker =
-            |_| Ok(Worker { threads: Threads::start(n_threads)?, arena: Arena::default() });
+            |_| Ok(EagerWorker { threads: Threads::start(n_threads)?, arena: Arena::default() });
         let workers = (0..n_workers.get()).map(worker).collect::<std::io::Result<Vec<_>>>()?;
         Ok(Self {
             unet: UNet1D::new(config).0,
@@ -78,7 +78,7 @@ impl Engine for EagerEngine {
             Some(style) => style.iter().copied().collect(),
             None => vec![0.0; batch * self.style_dim],
         });
-        self.workers.with(|Worker { threads, arena }| {
+        self.workers.with(|EagerWorker { threads, arena }| {
             threads.run(|| {
                 let mut g = Eager::new(&self.unet_parameters, arena);
                 let x = g.input(&[batch, frames, channels], x.as_slice().expect("in order"));
@@ -102,7 +102,7 @@ impl Engine for EagerEngine {
 
     fn decode(&self, latent: ArrayView3<f32>) -> Result<Array3<f32>, EngineError> {
         let latent = latent.as_standard_layout();
-        self.workers.with(|Worker { threads, arena }| {
+        self.workers.with(|EagerWorker { threads, arena }| {
             threads.run(|| {
                 let mut g = Eager::new(&self.decoder_parameters, arena);
                 let x = g.input(latent.shape(), latent.as_slice().expect("in order"));

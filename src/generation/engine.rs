@@ -1,4 +1,4 @@
-//! What samplers ask of a model, whoever carries it out.
+//! The interface between samplers and a model, the same for every engine that runs it.
 
 use ndarray::{Array3, ArrayView2, ArrayView3};
 
@@ -6,7 +6,7 @@ use crate::diffusion::DiffusionError;
 use crate::model::GraphError;
 use crate::onnx::OnnxError;
 
-/// What a prediction is made from.
+/// The inputs of a prediction.
 #[derive(Clone, Copy, Debug)]
 pub struct Inputs<'a> {
     /// Noisy motion, normalised, \[batch, frames, 25\].
@@ -16,7 +16,7 @@ pub struct Inputs<'a> {
     /// Features as the table has them, then the clock of a network that hears it, \[batch, frames,
     /// condition_dim\].
     pub audio: ArrayView3<'a, f32>,
-    /// Samples that go without music, \[batch\]; nobody where empty.
+    /// Whether each sample goes without music, \[batch\]; empty where all have music.
     pub drop_audio: &'a [bool],
     /// Normalised style, \[batch, 8\], for a network that takes one.
     pub style: Option<ArrayView2<'a, f32>>,

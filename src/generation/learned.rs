@@ -72,22 +72,22 @@ impl MusicDigests {
     }
 }
 
-/// What a model learned from.
+/// The music that a model learned from.
 ///
 /// Digests are the first 16 hexadecimal digits of those in the table of phrases ([`ShortDigest`]).
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LearnedFrom {
     /// Fingerprint of the dataset.
     pub data: String,
-    /// What its weights were fitted to.
+    /// The music that its weights were fitted to.
     pub trained_on: MusicDigests,
-    /// What its checkpoints were chosen on.
+    /// The music that its checkpoints were chosen on.
     pub validated_on: MusicDigests,
     /// Whether the song of every phrase is known; if not, a song that is not listed may have been learned from.
     pub is_complete: bool,
 }
 
-/// What a phrase was used for in training.
+/// The use of a phrase in training.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Purpose {
     Training,

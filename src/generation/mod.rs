@@ -22,7 +22,7 @@ pub use card::{
     CardError, FileEntry, MAX_CARD_BYTES, MODEL_FORMAT, ModelCard, ModelFileName, Networks,
     Provenance, SamplingDefaults, file_names, is_name, own_channels, own_features,
 };
-pub use control::{Constraints, ControlError, Miss, REACH_FRAMES, Wanted, continuing, facing};
+pub use control::{Constraints, ControlError, Miss, REACH_FRAMES, WantedValue, continuing, facing};
 pub use eager::EagerEngine;
 pub use engine::{Engine, EngineError, Inputs};
 pub use learned::{LearnedFrom, MusicDigests, MusicSplit, Purpose, ShortDigest};
@@ -30,5 +30,7 @@ pub use pool::Pool;
 pub use retrieval::Retrieval;
 pub use runtime::{OnnxEngine, SessionPlan};
 pub use sampling::{Sampling, sample};
-pub use track::{Constrained, Generator, OVERLAP_FRAMES, Primed, RUN_WINDOWS, Track};
+pub use track::{
+    Generator, OVERLAP_FRAMES, PrimingMotion, RUN_WINDOWS, Track, WeightedConstraints,
+};
 pub use windows::Windows;

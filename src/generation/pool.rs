@@ -32,11 +32,11 @@ impl<T> Pool<T> {
 
     /// Borrows a thing for as long as `work` takes; it comes back even when `work` panics.
     pub fn with<R>(&self, work: impl FnOnce(&mut T) -> R) -> R {
-        struct Lent<'a, T> {
+        struct PoolLoan<'a, T> {
             pool: &'a Pool<T>,
             thing: Option<T>,
         }
-        impl<T> Drop for Lent<'_, T> {
+        impl<T> Drop for PoolLoan<'_, T> {
             fn drop(&mut self) {
                 let mut idle = self.pool.idle.lock().unwrap_or_else(PoisonError::into_inner);
                 idle.extend(self.thing.take());
@@ -51,7 +51,7 @@ impl<T> Pool<T> {
             }
         };
         drop(idle);
-        let mut lent = Lent { pool: self, thing: Some(thing) };
+        let mut lent = PoolLoan { pool: self, thing: Some(thing) };
         work(lent.thing.as_mut().expect("lent until it is dropped"))
     }
 }

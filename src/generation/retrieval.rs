@@ -45,10 +45,11 @@ impl Retrieval {
             return None;
         }
         let mut keys = Array2::from_shape_vec((n_phrases, width), rows).ok()?;
-        let of_feature = |j: usize| keys.slice(s![.., j..;FEATURE_DIM]).mapv(f64::from);
-        let mean = Array1::from_shape_fn(FEATURE_DIM, |j| of_feature(j).mean().unwrap_or(0.0));
+        let values_of_feature = |j: usize| keys.slice(s![.., j..;FEATURE_DIM]).mapv(f64::from);
+        let mean =
+            Array1::from_shape_fn(FEATURE_DIM, |j| values_of_feature(j).mean().unwrap_or(0.0));
         let weight = Array1::from_shape_fn(FEATURE_DIM, |j| {
-            let deviation = of_feature(j).std(0.0);
+            let deviation = values_of_feature(j).std(0.0);
             if deviation > MIN_DEVIATION { 1.0 / deviation } else { 0.0 }
         });
         for mut row in keys.rows_mut() {
@@ -68,7 +69,8 @@ impl Retrieval {
         self.keys.is_empty()
     }
 
-    /// Returns the phrase that is nearest to features, `[T, 163]`, and how far it is; the first of equals.
+    /// Returns the phrase that is nearest to features, `[T, 163]`, and its distance; among equal distances the
+    /// first phrase.
     ///
     /// `d² = mean over blocks and features of ((x - y) / s)²`, of the blocks that both have, x and y means
     /// over a block and s the standard deviation over the library. None for no frames, and where a feature is
@@ -114,11 +116,11 @@ fn blocks(features: ArrayView2<f32>) -> Vec<f32> {
 }
 
 fn standardised(blocks: ArrayView1<f32>, mean: &Array1<f64>, weight: &Array1<f64>) -> Array1<f32> {
-    let of = |(i, x): (usize, &f32)| {
+    let standardise = |(i, x): (usize, &f32)| {
         let j = i % FEATURE_DIM;
         ((f64::from(*x) - mean[j]) * weight[j]) as f32
     };
-    blocks.iter().enumerate().map(of).collect()
+    blocks.iter().enumerate().map(standardise).collect()
 }
 
 #[cfg(test)]

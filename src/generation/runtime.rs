@@ -8,7 +8,8 @@ use ndarray::{Array3, ArrayView3, s};
 use crate::audio::FEATURE_DIM;
 use crate::model::UNetConfig;
 use crate::onnx::{
-    DecoderNames, Device, Numbers, OnnxError, Runtime, Session, SessionOptions, Tensor, UNetNames,
+    DecoderNames, Device, NamedTensor, Numbers, OnnxError, Runtime, Session, SessionOptions,
+    UNetNames,
 };
 
 use super::engine::{Engine, EngineError, Inputs};
@@ -28,11 +29,11 @@ pub struct SessionPlan {
 /// A session does one run at a time, so a job that keeps N cores busy has N workers of one thread; a single
 /// motion is fastest with one worker of N threads.
 pub struct OnnxEngine {
-    workers: Pool<Worker>,
+    workers: Pool<OnnxWorker>,
     config: UNetConfig,
 }
 
-struct Worker {
+struct OnnxWorker {
     unet: Session,
     decoder: Session,
 }
@@ -56,7 +57,7 @@ impl OnnxEngine {
             is_optimized,
         };
         let worker = |_| {
-            let worker = Worker {
+            let worker = OnnxWorker {
                 unet: Session::open(runtime, unet, options(is_optimized))?,
                 decoder: Session::open(runtime, decoder, options(false))?,
             };
@@ -86,7 +87,11 @@ impl Engine for OnnxEngine {
         let t: Vec<i64> = inputs.t.iter().map(|&t| t as i64).collect();
         let mut given = vec![
             floats(UNetNames::X, inputs.x),
-            Tensor { name: UNetNames::T, shape: vec![batch], numbers: Numbers::Integer(t.into()) },
+            NamedTensor {
+                name: UNetNames::T,
+                shape: vec![batch],
+                numbers: Numbers::Integer(t.into()),
+            },
             floats(UNetNames::AUDIO, inputs.audio.slice_move(s![.., .., ..FEATURE_DIM])),
         ];
         if self.config.clock {
@@ -97,11 +102,15 @@ impl Engine for OnnxEngine {
             let drop: Vec<f32> =
                 inputs.drop_audio.iter().map(|&d| f32::from(u8::from(d))).collect();
             let numbers = Numbers::Float(drop.into());
-            given.push(Tensor { name: UNetNames::DROP_AUDIO, shape: vec![batch], numbers });
+            given.push(NamedTensor { name: UNetNames::DROP_AUDIO, shape: vec![batch], numbers });
         }
         if let Some(style) = inputs.style.filter(|_| self.config.style_dim > 0) {
             let numbers = Numbers::Float(style.iter().copied().collect::<Vec<_>>().into());
-            given.push(Tensor { name: UNetNames::STYLE, shape: style.shape().to_vec(), numbers });
+            given.push(NamedTensor {
+                name: UNetNames::STYLE,
+                shape: style.shape().to_vec(),
+                numbers,
+            });
         }
         let made = self.workers.with(|worker| worker.unet.run(&given, UNetNames::PREDICTION))?;
         to_array("the shape of the prediction", made, inputs.x.shape())
@@ -114,13 +123,13 @@ impl Engine for OnnxEngine {
     }
 }
 
-fn floats<'a>(name: &'static str, x: ArrayView3<'a, f32>) -> Tensor<'a> {
+fn floats<'a>(name: &'static str, x: ArrayView3<'a, f32>) -> NamedTensor<'a> {
     let shape = x.shape().to_vec();
     let numbers = match x.to_slice() {
         Some(numbers) => Cow::Borrowed(numbers),
         None => Cow::Owned(x.iter().copied().collect()),
     };
-    Tensor { name, shape, numbers: Numbers::Float(numbers) }
+    NamedTensor { name, shape, numbers: Numbers::Float(numbers) }
 }
 
 fn to_array(

@@ -28,7 +28,7 @@ pub const RUN_WINDOWS: usize = 4;
 /// Frames that neighbouring windows share, by default: one second.
 pub const OVERLAP_FRAMES: usize = 30;
 
-/// What motion is made with.
+/// The model and settings that motion is generated with.
 #[derive(Clone, Copy)]
 pub struct Generator<'a> {
     pub engine: &'a dyn Engine,
@@ -40,23 +40,24 @@ pub struct Generator<'a> {
     pub overlap_frames: usize,
 }
 
-/// What motion is made for.
+/// The conditions of a track that motion is generated for.
 #[derive(Clone, Copy, Debug)]
 pub struct Track<'a> {
-    /// What the network hears: features as the table has them, then the clock if it hears one, \[T, condition_dim\].
+    /// The condition of the network: features as the table has them, then the clock if it takes one,
+    /// \[T, condition_dim\].
     pub condition: ArrayView2<'a, f32>,
     /// Bar phase of the music, in [0, 1), \[T\]: motion is sampled with this phase, for a network that hears the clock.
     pub phase: Option<&'a [f64]>,
     pub seed: u64,
     /// Normalised style, for a model that takes one.
     pub style: Option<[f32; STYLE_DIM]>,
-    pub constraints: Option<Constrained<'a>>,
-    pub primed: Option<Primed<'a>>,
+    pub constraints: Option<WeightedConstraints<'a>>,
+    pub primed: Option<PrimingMotion<'a>>,
 }
 
 /// Constraints, and how strictly sampling keeps them.
 #[derive(Clone, Copy, Debug)]
-pub struct Constrained<'a> {
+pub struct WeightedConstraints<'a> {
     pub constraints: &'a Constraints,
     /// Share of the way that an estimate is bent at every step: 1 is in-painting.
     pub strength: f64,
@@ -64,7 +65,7 @@ pub struct Constrained<'a> {
 
 /// Motion that sampling begins from instead of noise alone.
 #[derive(Clone, Copy, Debug)]
-pub struct Primed<'a> {
+pub struct PrimingMotion<'a> {
     /// Motion for every window of the track, in its own place: windows × frames, \[n T, 25\] in metres.
     pub motion: ArrayView2<'a, f32>,
     /// Steps of the diffusion that are left to sample, out of all that were trained.
@@ -171,7 +172,7 @@ impl Generator<'_> {
             let (earlier, later) = motions.split_at_mut(i);
             agree(&mut earlier[i - 1], &mut later[0], run.shift(i));
         }
-        if let Some(Constrained { constraints, strength }) = track.constraints {
+        if let Some(WeightedConstraints { constraints, strength }) = track.constraints {
             let places = run.places(&motions);
             for ((i, motion), place) in run.range.clone().zip(&mut motions).zip(places) {
                 let frames = run.windows.frames(i);

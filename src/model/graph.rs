@@ -1,4 +1,4 @@
-//! The operations that a network may use, whoever carries them out.
+//! The operations that a network may use, the same for every interpreter and exporter.
 //!
 //! A network is written once over [`Graph`]. One interpreter runs it, one also differentiates it,
 //! one writes it down as ONNX, one counts what it costs. Sizes of batch and frames are the business

@@ -19,6 +19,6 @@ pub use graph::{
     Result,
 };
 pub use layers::{AttentionBlock, Conv1d, GroupNorm, LayerNorm, Linear, ResBlock};
-pub use outline::{Kept, Layer, Outline};
+pub use outline::{ActivationCounts, Layer, Outline};
 pub use parameter::{Init, Parameter, ParameterId, ParameterList, Role, Scope};
 pub use unet::{ConfigError, Preset, UNet1D, UNetConfig, UNetInputs};

@@ -38,7 +38,7 @@ pub struct Outline<'p> {
 
 /// Numbers of the activations that training keeps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Kept {
+pub struct ActivationCounts {
     /// Over the whole network.
     pub numbers: usize,
     /// At most within a part that is run again, on top of the others; 0 without checkpoints.
@@ -62,8 +62,8 @@ impl<'p> Outline<'p> {
     }
 
     /// Returns what training keeps of activations.
-    pub fn kept(&self) -> Kept {
-        Kept { numbers: self.kept, within_part: self.within_part }
+    pub fn kept(&self) -> ActivationCounts {
+        ActivationCounts { numbers: self.kept, within_part: self.within_part }
     }
 
     /// An input of a shape.

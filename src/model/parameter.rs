@@ -29,7 +29,7 @@ impl Init {
     }
 }
 
-/// What a parameter is, which decides how it is kept and whether it decays.
+/// The role of a parameter, which decides how it is kept and whether it decays.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Role {
     /// The weight of a linear layer, \[out, in\], or a convolution, \[out, in, taps\]; decays.

@@ -40,7 +40,7 @@ pub struct UNet1D {
     checkpoint: bool,
 }
 
-/// What a UNet is given.
+/// The inputs of a UNet.
 pub struct UNetInputs<'a, T> {
     /// Noisy motion, normalised, \[batch, frames, in_channels\].
     pub x: &'a T,
@@ -76,7 +76,7 @@ struct DecoderLevel {
     up: Option<Conv1d>,
 }
 
-/// What every level needs beside its frames.
+/// The conditions of every level.
 struct Conditions<T> {
     time: T,
     context: T,

@@ -29,7 +29,7 @@ const HEADERS: [&str; 12] = [
 const DOWNBEATS: [&str; 5] = ["downbeat", "down", "db", "bar", "d"];
 const BEATS: [&str; 2] = ["beat", "b"];
 
-/// What stands beside a time.
+/// The mark beside a time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Mark {
     Nothing,
@@ -161,7 +161,7 @@ impl Format {
         "a time in seconds"
     }
 
-    /// What stands beside a time.
+    /// Returns the mark beside a time.
     fn mark(&self, time_s: f64, fields: &[&str]) -> Result<Mark, &'static str> {
         match fields {
             [_] => Ok(Mark::Nothing),

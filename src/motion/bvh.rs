@@ -69,7 +69,7 @@ pub enum BvhError {
     },
 }
 
-/// What one channel of a joint moves; the number is the axis, 0 to 2 for x to z.
+/// The motion of one channel of a joint; the number is the axis, 0 to 2 for x to z.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum JointChannel {
     /// Translation along an axis, in file units.
@@ -122,7 +122,7 @@ impl Bvh {
         &self.joints
     }
 
-    /// What is read although it is not as the format has it.
+    /// Deviations from the format that are read all the same.
     pub fn notes(&self) -> &[BvhNote] {
         &self.notes
     }

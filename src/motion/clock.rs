@@ -28,10 +28,10 @@ const CENTRE_BPM: f64 = 120.0;
 /// Tempi outside are none of music: a phase that stands still or rushes tells no clock.
 const TEMPO_RANGE_BPM: std::ops::Range<f64> = 20.0..400.0;
 
-/// The tempo of a frame is that of so many frames on either side: a second.
+/// Frames on either side over which the tempo of a frame is taken: a second.
 const TEMPO_FRAMES: usize = 30;
 
-/// A phase may fall by so much, in bars, by rounding.
+/// Most by which a phase may fall by rounding, bars.
 const MAX_FALL_BARS: f64 = 1e-3;
 
 /// Returns the clock of frames with bar phase φ, \[T\] in bars: \[T, 10\], all zeros where φ tells no clock.

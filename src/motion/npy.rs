@@ -12,7 +12,7 @@ use std::io::{self, Read};
 
 pub use error::NpyError;
 pub(crate) use error::{clip, preview};
-use header::{Dtype, Header, Kind};
+use header::{Dtype, DtypeKind, Header};
 
 /// Most bytes one array may take in memory, and most that are read for it: 1 GiB.
 pub const MAX_ARRAY_BYTES: u64 = 1 << 30;
@@ -263,24 +263,30 @@ element!(f64);
 fn append<T: Element>(dtype: &Dtype, bytes: &[u8], values: &mut Vec<T>) {
     let big = dtype.big_endian;
     match (dtype.kind, dtype.size_bytes) {
-        (Kind::Float, 4) => extend(values, bytes, big, |b| T::from_f32(f32::from_le_bytes(b))),
-        (Kind::Float, 2) => {
+        (DtypeKind::Float, 4) => extend(values, bytes, big, |b| T::from_f32(f32::from_le_bytes(b))),
+        (DtypeKind::Float, 2) => {
             extend(values, bytes, big, |b| T::from_f32(half::f16::from_le_bytes(b).to_f32()));
         }
-        (Kind::Float, _) => extend(values, bytes, big, |b| T::from_f64(f64::from_le_bytes(b))),
-        (Kind::Bool, _) => extend(values, bytes, big, |[b]| T::from_u64(u64::from(b != 0))),
-        (Kind::Int, 1) => extend(values, bytes, big, |b| T::from_i64(i8::from_le_bytes(b).into())),
-        (Kind::Int, 2) => extend(values, bytes, big, |b| T::from_i64(i16::from_le_bytes(b).into())),
-        (Kind::Int, 4) => extend(values, bytes, big, |b| T::from_i64(i32::from_le_bytes(b).into())),
-        (Kind::Int, _) => extend(values, bytes, big, |b| T::from_i64(i64::from_le_bytes(b))),
-        (Kind::Uint, 1) => extend(values, bytes, big, |[b]| T::from_u64(b.into())),
-        (Kind::Uint, 2) => {
+        (DtypeKind::Float, _) => extend(values, bytes, big, |b| T::from_f64(f64::from_le_bytes(b))),
+        (DtypeKind::Bool, _) => extend(values, bytes, big, |[b]| T::from_u64(u64::from(b != 0))),
+        (DtypeKind::Int, 1) => {
+            extend(values, bytes, big, |b| T::from_i64(i8::from_le_bytes(b).into()))
+        }
+        (DtypeKind::Int, 2) => {
+            extend(values, bytes, big, |b| T::from_i64(i16::from_le_bytes(b).into()))
+        }
+        (DtypeKind::Int, 4) => {
+            extend(values, bytes, big, |b| T::from_i64(i32::from_le_bytes(b).into()))
+        }
+        (DtypeKind::Int, _) => extend(values, bytes, big, |b| T::from_i64(i64::from_le_bytes(b))),
+        (DtypeKind::Uint, 1) => extend(values, bytes, big, |[b]| T::from_u64(b.into())),
+        (DtypeKind::Uint, 2) => {
             extend(values, bytes, big, |b| T::from_u64(u16::from_le_bytes(b).into()));
         }
-        (Kind::Uint, 4) => {
+        (DtypeKind::Uint, 4) => {
             extend(values, bytes, big, |b| T::from_u64(u32::from_le_bytes(b).into()));
         }
-        (Kind::Uint, _) => extend(values, bytes, big, |b| T::from_u64(u64::from_le_bytes(b))),
+        (DtypeKind::Uint, _) => extend(values, bytes, big, |b| T::from_u64(u64::from_le_bytes(b))),
     }
 }
 

@@ -120,7 +120,7 @@ impl<W: Write + Seek> NpzWriter<W> {
     /// Adds an array of `shape`, whose values come in C order.
     ///
     /// # Errors
-    /// What the output says.
+    /// The error of the output.
     ///
     /// # Panics
     /// If the values are not as many as the shape says.
@@ -156,7 +156,7 @@ impl<W: Write + Seek> NpzWriter<W> {
     /// Ends the archive and returns the output.
     ///
     /// # Errors
-    /// What the output says.
+    /// The error of the output.
     pub fn finish(self) -> io::Result<W> {
         Ok(self.archive.finish()?)
     }

@@ -55,7 +55,7 @@ pub enum BeatsPerBarSource {
     Given,
     /// The highest beat number.
     Numbers,
-    /// Nobody said it: [`DEFAULT_BEATS_PER_BAR`].
+    /// Not stated: [`DEFAULT_BEATS_PER_BAR`].
     Default,
 }
 
@@ -275,8 +275,8 @@ mod tests {
         assert!(phase.iter().zip(want).all(|(p, w)| (p - w).abs() < 1e-12), "{phase:?}");
         // The whole song says the same of these times.
         let song = Beats::new(vec![0.0, 0.25, 0.75, 1.25, 1.75], Some(vec![2, 3, 4, 5, 1]), None);
-        let of_song = bar_phase(&[0.25, 0.5, 0.75, 1.25, 1.75], &song.unwrap());
-        assert!(phase.iter().zip(of_song).all(|(p, w)| (p - w).abs() < 1e-12));
+        let phase_of_song = bar_phase(&[0.25, 0.5, 0.75, 1.25, 1.75], &song.unwrap());
+        assert!(phase.iter().zip(phase_of_song).all(|(p, w)| (p - w).abs() < 1e-12));
     }
 
     #[test]

@@ -33,7 +33,7 @@ use super::channels::{Channel, MOTION_DIM};
 use super::kinematics::{Poses, forward_differences, frames_of};
 use super::phase::WRAP_BARS;
 use super::quaternion::Quaternion;
-use fusion::Measured;
+use fusion::FusionMeasurements;
 use smoothing::{Polynomials, moving_average};
 
 /// Channel groups that the reference clamps and smooths: all that are vectors.
@@ -109,7 +109,7 @@ pub fn process_holding(
 /// Puts the poses that agree best with all that was decoded in the place of the decoded ones.
 fn fuse(config: &PostProcessConfig, frames: &mut Array2<f32>, held: &HeldPoses) -> Displacement {
     let variances = config.fusion_variances.unwrap_or_default();
-    let measured = Measured::of(frames.view());
+    let measured = FusionMeasurements::of(frames.view());
     let shifts_m = measured.shifts(&variances, held);
     let mut position_m = measured.position.clone();
     for (p, shift) in position_m.as_flattened_mut().iter_mut().zip(shifts_m.as_flattened()) {
@@ -247,17 +247,17 @@ fn smooth_columns(
 
 fn vectors(frames: &Array2<f32>, channel: Channel) -> Vec<[f64; 3]> {
     let start = channel.range().start;
-    let of_row = |row: ndarray::ArrayView1<'_, f32>| {
+    let to_vector = |row: ndarray::ArrayView1<'_, f32>| {
         std::array::from_fn(|axis| f64::from(row[start + axis]))
     };
-    frames.rows().into_iter().map(of_row).collect()
+    frames.rows().into_iter().map(to_vector).collect()
 }
 
 fn quaternions(frames: &Array2<f32>) -> Vec<Quaternion> {
     let start = Channel::Quaternion.range().start;
-    let of_row =
+    let to_quaternion =
         |row: ndarray::ArrayView1<'_, f32>| std::array::from_fn(|c| f64::from(row[start + c]));
-    frames.rows().into_iter().map(of_row).collect()
+    frames.rows().into_iter().map(to_quaternion).collect()
 }
 
 fn write_vectors(frames: &mut Array2<f32>, channel: Channel, vectors: &[[f64; 3]]) {

@@ -16,7 +16,7 @@ pub const STYLE_DIM: usize = super::channels::Channel::Style.width();
 /// Length of the averaging window, frames; shorter clips use their own length.
 pub const WINDOW_FRAMES: usize = 60;
 
-/// What one style channel measures and how it is squashed.
+/// The quantity that one style channel measures and how it is squashed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StyleChannel {
     /// Short name of the quantity.

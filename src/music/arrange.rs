@@ -155,7 +155,7 @@ fn note(
     }
 }
 
-/// Who plays beside the melody.
+/// The accompaniment of a melody.
 struct Player {
     per_bar: usize,
     beat_ticks: u32,

@@ -52,7 +52,7 @@ pub fn compose(seed: u64, index: u64) -> Score {
     let style = style_of(seed, index);
     let mut tempo_chance = stream(TEMPO);
     let (bpm, drift) = tempo(style, &mut tempo_chance);
-    let song = Song::draw(style, bpm, &mut stream(PLAN));
+    let song = SongPlan::draw(style, bpm, &mut stream(PLAN));
     let n_bars = song.sections.iter().map(|planned| planned.section.n_bars).sum();
     let n_beats = song.pickup_beats + n_bars * style.beats_per_bar as usize;
     let tempi_bpm = drifting(bpm, n_beats, drift, &mut tempo_chance);
@@ -103,7 +103,7 @@ fn tempo(style: &Style, chance: &mut Chance) -> (f64, Drift) {
     (bpm, drift)
 }
 
-/// What plays in a section.
+/// The layers that play in a section.
 #[derive(Clone, Copy, Debug)]
 struct Layers {
     drums: Amount,
@@ -115,7 +115,7 @@ struct Layers {
 
 /// A section as it is going to be played.
 #[derive(Clone, Debug)]
-struct Planned {
+struct SectionPlan {
     section: Section,
     layers: Layers,
     loudness: f64,
@@ -123,9 +123,9 @@ struct Planned {
     rises: bool,
 }
 
-/// What a song has decided before its first note.
+/// The decisions on a song before its first note.
 #[derive(Clone, Debug)]
-struct Song {
+struct SongPlan {
     style: &'static Style,
     key: u8,
     swing: f64,
@@ -135,10 +135,10 @@ struct Song {
     fill_every: usize,
     /// Chords of verses and of choruses, a bar each.
     loops: [Vec<Vec<Chord>>; 2],
-    sections: Vec<Planned>,
+    sections: Vec<SectionPlan>,
 }
 
-impl Song {
+impl SongPlan {
     fn draw(style: &'static Style, bpm: f64, chance: &mut Chance) -> Self {
         let key = chance.below(12) as u8;
         let transposed = |bars: Vec<Vec<Chord>>| -> Vec<Vec<Chord>> {
@@ -171,7 +171,7 @@ impl Song {
     }
 
     /// Returns the bars of a section, each with its number in the section.
-    fn bars(&self, planned: &Planned) -> impl Iterator<Item = (usize, Bar)> + use<> {
+    fn bars(&self, planned: &SectionPlan) -> impl Iterator<Item = (usize, Bar)> + use<> {
         let bar_beats = self.style.beats_per_bar as usize;
         let begin = self.pickup_beats + planned.section.first_bar * bar_beats;
         let loudness = planned.loudness;
@@ -282,8 +282,8 @@ impl Song {
     }
 }
 
-/// Draws the sections of a song of so many times four bars.
-fn sections(n_fours: usize, chance: &mut Chance) -> Vec<Planned> {
+/// Draws the sections of a song of `n_fours` times four bars.
+fn sections(n_fours: usize, chance: &mut Chance) -> Vec<SectionPlan> {
     use SectionKind::{Break, Chorus, Intro, Outro, Verse};
     let mut kinds = vec![(Intro, 1)];
     let mut left = n_fours.saturating_sub(2).max(1);
@@ -314,7 +314,7 @@ fn sections(n_fours: usize, chance: &mut Chance) -> Vec<Planned> {
         let leads_to_chorus = kinds.get(i + 1).is_some_and(|(kind, _)| *kind == Chorus);
         let (layers, loudness) = layers(kind, chance);
         let rises = kind == Break && leads_to_chorus && chance.below(2) == 0;
-        Planned { section, layers, loudness, rises }
+        SectionPlan { section, layers, loudness, rises }
     };
     kinds.iter().enumerate().map(planned).collect()
 }

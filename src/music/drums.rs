@@ -77,7 +77,7 @@ pub(super) fn velocity(letter: u8) -> f64 {
     }
 }
 
-/// What a drummer does at the end of four or eight bars.
+/// The fill of a drummer at the end of four or eight bars.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fill {
     /// Snare in sixteenths, louder and louder.

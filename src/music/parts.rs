@@ -72,7 +72,14 @@ impl Feel<'_> {
     }
 
     /// Returns a tone over some steps of a bar.
-    fn tone(&self, voice: Voice, bar: Bar, over: Over, pitch: u8, chance: &mut Chance) -> Note {
+    fn tone(
+        &self,
+        voice: Voice,
+        bar: Bar,
+        over: ToneSteps,
+        pitch: u8,
+        chance: &mut Chance,
+    ) -> Note {
         let onset_beats = self.place(bar, over.step);
         let whole = self.place(bar, over.step + over.n_steps) - onset_beats;
         Note {
@@ -88,15 +95,15 @@ impl Feel<'_> {
 
 /// The steps of a tone.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Over {
+struct ToneSteps {
     step: usize,
     n_steps: usize,
     velocity: f64,
 }
 
 /// Returns the tones of a pattern with their letters: `-` goes on with the one before.
-fn tones(pattern: &str) -> Vec<(Over, u8)> {
-    let mut found: Vec<(Over, u8)> = Vec::new();
+fn tones(pattern: &str) -> Vec<(ToneSteps, u8)> {
+    let mut found: Vec<(ToneSteps, u8)> = Vec::new();
     let mut is_held = false;
     for (step, letter) in pattern.bytes().enumerate() {
         match (letter, found.last_mut()) {
@@ -104,7 +111,7 @@ fn tones(pattern: &str) -> Vec<(Over, u8)> {
             (b'-' | b'.', _) => is_held = false,
             _ => {
                 let velocity = if step % STEPS_PER_BEAT == 0 { 0.9 } else { 0.75 };
-                found.push((Over { step, n_steps: 1, velocity }, letter));
+                found.push((ToneSteps { step, n_steps: 1, velocity }, letter));
                 is_held = true;
             }
         }
@@ -154,7 +161,8 @@ pub fn comping(
         let Some(chord) = chord_at(chords, over.step, feel.n_steps()) else { continue };
         let voiced = chord.voiced(CHORDS_LOWEST);
         let one = letter.checked_sub(b'0').map(usize::from).filter(|i| *i < 10);
-        let over = Over { velocity: over.velocity * if one.is_some() { 0.9 } else { 0.7 }, ..over };
+        let over =
+            ToneSteps { velocity: over.velocity * if one.is_some() { 0.9 } else { 0.7 }, ..over };
         for (i, &pitch) in voiced.iter().enumerate() {
             if one.is_none_or(|tone| tone % voiced.len() == i) {
                 notes.push(feel.tone(Voice::Chords, bar, over, pitch, chance));
@@ -168,7 +176,7 @@ pub fn pad(feel: &Feel, bar: Bar, chords: &[Chord], chance: &mut Chance, notes: 
     for (i, chord) in chords.iter().enumerate() {
         let step = i * feel.n_steps() / chords.len();
         let end = (i + 1) * feel.n_steps() / chords.len();
-        let over = Over { step, n_steps: end - step, velocity: 0.5 };
+        let over = ToneSteps { step, n_steps: end - step, velocity: 0.5 };
         for pitch in chord.voiced(CHORDS_LOWEST + 5) {
             notes.push(feel.tone(Voice::Pad, bar, over, pitch, chance));
         }
@@ -179,7 +187,7 @@ pub fn pad(feel: &Feel, bar: Bar, chords: &[Chord], chance: &mut Chance, notes: 
 #[derive(Clone, Debug)]
 pub struct Riff {
     /// Of every bar: the tones, whether each belongs to the chord, and its place in the scale.
-    bars: Vec<Vec<(Over, bool, usize)>>,
+    bars: Vec<Vec<(ToneSteps, bool, usize)>>,
     scale: Vec<u8>,
 }
 

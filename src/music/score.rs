@@ -2,7 +2,7 @@
 
 use super::tempo::TempoMap;
 
-/// What a note is played on.
+/// The instrument of a note.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Voice {
     Kick,
@@ -62,7 +62,7 @@ pub struct Note {
     pub late_s: f64,
 }
 
-/// What a stretch of whole bars is in a song.
+/// The kind of a section of whole bars in a song.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum SectionKind {
     Intro,

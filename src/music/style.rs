@@ -9,9 +9,9 @@ use super::styles;
 /// One bar of drums: a pattern for every voice that plays.
 pub type Groove = &'static [(Voice, &'static str)];
 
-/// What lies off the grid when a style swings.
+/// The subdivision that a style swings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Swung {
+pub enum SwingGrid {
     Eighths,
     Sixteenths,
 }
@@ -23,7 +23,7 @@ pub struct Style {
     pub beats_per_bar: u32,
     /// Lowest and highest tempo, in beats per minute.
     pub tempo_bpm: (f64, f64),
-    pub swung: Swung,
+    pub swung: SwingGrid,
     /// Least and most share of a pair of notes that the first one takes; 0.5 is even.
     pub swing: (f64, f64),
     /// Whether people play it, whose tempo drifts and whose hits are not on the grid to the millisecond.
@@ -55,8 +55,8 @@ impl Style {
     /// With s the share of the first, a pair of length L is warped to s·L and (1−s)·L.
     pub fn swing_beats(&self, beats: f64, share: f64) -> f64 {
         let pair = match self.swung {
-            Swung::Eighths => 1.0,
-            Swung::Sixteenths => 0.5,
+            SwingGrid::Eighths => 1.0,
+            SwingGrid::Sixteenths => 0.5,
         };
         let begin = (beats / pair).floor() * pair;
         let at = (beats - begin) / pair;
@@ -107,11 +107,11 @@ mod tests {
     #[test]
     fn swing_moves_the_second_of_a_pair() {
         let style = |swung| Style { swung, ..styles::FOUR[0] };
-        let found =
-            [0.0, 0.25, 0.5, 0.75, 1.0].map(|beats| style(Swung::Eighths).swing_beats(beats, 0.75));
+        let found = [0.0, 0.25, 0.5, 0.75, 1.0]
+            .map(|beats| style(SwingGrid::Eighths).swing_beats(beats, 0.75));
         assert_eq!(found, [0.0, 0.375, 0.75, 0.875, 1.0]);
-        let found =
-            [0.0, 0.25, 0.5, 0.75].map(|beats| style(Swung::Sixteenths).swing_beats(beats, 0.625));
+        let found = [0.0, 0.25, 0.5, 0.75]
+            .map(|beats| style(SwingGrid::Sixteenths).swing_beats(beats, 0.625));
         assert_eq!(found, [0.0, 0.3125, 0.5, 0.8125]);
     }
 }

@@ -85,7 +85,7 @@ pub struct Builder<'p> {
     used: BTreeMap<String, usize>,
     /// Weights and constants that exist, by what they are.
     known: BTreeMap<(String, Use), String>,
-    /// What the nodes that come are called after.
+    /// The prefix of the names of the nodes that follow.
     label: String,
 }
 

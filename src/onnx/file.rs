@@ -24,14 +24,14 @@ const PAGE_BYTES: usize = 4096;
 #[derive(Clone, Debug)]
 pub struct ModelFile {
     pub graph: Graph,
-    /// What is told of the model: key and value.
+    /// Metadata of the model: key and value.
     pub metadata: BTreeMap<String, String>,
     pub description: String,
 }
 
 /// A model as bytes.
 #[derive(Clone, Debug)]
-pub struct Encoded {
+pub struct EncodedModel {
     pub model: Bytes,
     /// The weights, if they lie in a file of their own.
     pub weights: Option<Bytes>,
@@ -53,7 +53,7 @@ impl ModelFile {
     }
 
     /// Returns the bytes; weights of more than `embedded_bytes` go into a file called `weights_name`.
-    pub fn encode(self, weights_name: &str, embedded_bytes: usize) -> Encoded {
+    pub fn encode(self, weights_name: &str, embedded_bytes: usize) -> EncodedModel {
         let mut model = self.into_message();
         let tensors = model.graph.iter_mut().flat_map(|graph| &mut graph.initializer);
         let n_bytes: usize = tensors.map(|tensor| tensor.raw_data.len()).sum();
@@ -77,7 +77,7 @@ impl ModelFile {
             }
             weights = Some(Bytes::from(file));
         }
-        Encoded { model: Bytes::from(model.encode_to_vec()), weights }
+        EncodedModel { model: Bytes::from(model.encode_to_vec()), weights }
     }
 }
 

@@ -6,7 +6,7 @@ use super::builder::{Axes, Builder, Form, Use, Value};
 use super::literals::{float, integer, integers, word};
 use super::proto::DataType;
 
-/// What is added to the score of a key that does not count: e^(it) is 0 in f32.
+/// The number that is added to the score of a masked key: e^(it) is 0 in f32.
 const MASKED: f64 = -1e9;
 
 impl Builder<'_> {

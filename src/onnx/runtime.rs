@@ -26,7 +26,7 @@ pub struct Runtime {
     library: PathBuf,
 }
 
-/// What is loaded; a process has one onnxruntime.
+/// The onnxruntime that is loaded; a process has one.
 static LOADED: Mutex<Option<Runtime>> = Mutex::new(None);
 
 impl Runtime {
@@ -134,7 +134,7 @@ fn candidates() -> Vec<PathBuf> {
     folders().into_iter().flat_map(in_folder).collect()
 }
 
-/// What a session runs on.
+/// The device that a session runs on.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Device {
     /// The first of cuda, coreml and directml that the library has, else the processor.

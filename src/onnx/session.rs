@@ -34,7 +34,7 @@ pub struct Session {
 
 /// An input: its name, sizes and numbers.
 #[derive(Clone, Debug)]
-pub struct Tensor<'a> {
+pub struct NamedTensor<'a> {
     pub name: &'static str,
     pub shape: Vec<usize>,
     pub numbers: Numbers<'a>,
@@ -132,7 +132,7 @@ impl Session {
     /// [`OnnxError::Run`] with what onnxruntime says.
     pub fn run(
         &mut self,
-        inputs: &[Tensor],
+        inputs: &[NamedTensor],
         output: &str,
     ) -> Result<(Vec<usize>, Vec<f32>), OnnxError> {
         let Self { session, place } = self;

@@ -4,9 +4,9 @@ use super::axis::StepAxis;
 use super::curve::{self, DOT_PX};
 use super::frame;
 use super::reduce::{self, Extent};
-use super::scene::{Item, Point, Rect, Scene};
+use super::scene::{Point, Rect, Scene, SceneItem};
 use super::style::{BLUE, CURVE_PX, GREEN, GRID, HAIRLINE_PX, INK, PAPER, PURPLE, Rgb, VERMILLION};
-use super::value_axis::{Scale, ValueAxis};
+use super::value_axis::{ValueAxis, ValueScale};
 
 /// How dark the band from the least to the greatest value of each column is: lighter than where it
 /// has a panel of its own.
@@ -27,9 +27,9 @@ const HEAD_SHARE: f64 = 0.98;
 /// Space above the greatest value of a linear axis, as a factor.
 const HEADROOM: f64 = 1.05;
 
-/// What a curve tells, which decides how it looks.
+/// The kind of a curve, which decides how it looks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Kind {
+pub(super) enum CurveKind {
     Steps,
     /// Of the decoder, where each network has its own value.
     DecoderSteps,
@@ -38,7 +38,7 @@ pub(super) enum Kind {
     Validation,
 }
 
-impl Kind {
+impl CurveKind {
     /// Every kind, those first that lie below the others.
     pub const ALL: [Self; 5] =
         [Self::Steps, Self::DecoderSteps, Self::Epochs, Self::LiveValidation, Self::Validation];
@@ -68,15 +68,15 @@ impl Kind {
 }
 
 /// A curve as it is drawn: stretches without a gap, of steps and values there.
-struct Curve {
-    kind: Kind,
+struct TrainingCurve {
+    kind: CurveKind,
     runs: Vec<Vec<(f64, Extent)>>,
     has_dots: bool,
 }
 
 /// The curves of a panel.
-pub(super) struct Chart {
-    curves: Vec<Curve>,
+pub(super) struct TrainingChart {
+    curves: Vec<TrainingCurve>,
     /// `None` without a value to show.
     axis: Option<ValueAxis>,
     best: Option<(u64, f64)>,
@@ -86,26 +86,26 @@ pub(super) struct Chart {
     pub peak: Option<f64>,
 }
 
-impl Chart {
+impl TrainingChart {
     /// Brings curves, each of (steps done, value), to the `width_px` that they have room on.
     ///
     /// `best` is marked if the scale has a place for it.
     pub fn new<'a>(
-        scale: Scale,
-        curves: impl IntoIterator<Item = (Kind, &'a [(u64, f64)])>,
+        scale: ValueScale,
+        curves: impl IntoIterator<Item = (CurveKind, &'a [(u64, f64)])>,
         best: Option<(u64, f64)>,
         n_steps: u64,
         width_px: f64,
     ) -> Self {
         let mut n_left_out = 0;
-        let curves: Vec<Curve> = curves
+        let curves: Vec<TrainingCurve> = curves
             .into_iter()
             .map(|(kind, points)| {
                 let held = || points.iter().copied().filter(|&(_, value)| scale.holds(value));
                 let n_held = held().count();
                 n_left_out += (points.len() - n_held) as u64;
                 let has_dots = kind.has_dots() && n_held as f64 * MIN_DOT_GAP_PX <= width_px;
-                Curve { kind, runs: runs(kind, held, n_held, n_steps, width_px), has_dots }
+                TrainingCurve { kind, runs: runs(kind, held, n_held, n_steps, width_px), has_dots }
             })
             .filter(|curve| !curve.runs.is_empty())
             .collect();
@@ -114,7 +114,7 @@ impl Chart {
         Self { curves, axis, best, n_left_out, peak }
     }
 
-    pub fn kinds(&self) -> impl Iterator<Item = Kind> {
+    pub fn kinds(&self) -> impl Iterator<Item = CurveKind> {
         self.curves.iter().map(|curve| curve.kind)
     }
 
@@ -158,7 +158,7 @@ pub(super) fn ring(scene: &mut Scene, at: Point) {
 /// Returns the stretches of a curve: of values at every step one point per column, with gaps where
 /// there are none; of values at some steps all of them, unless they are closer than can be drawn.
 fn runs<I: Iterator<Item = (u64, f64)>>(
-    kind: Kind,
+    kind: CurveKind,
     held: impl Fn() -> I,
     n_held: usize,
     n_steps: u64,
@@ -183,14 +183,14 @@ fn runs<I: Iterator<Item = (u64, f64)>>(
 }
 
 /// Returns the axis that shows the curves, and the greatest value if that is beyond it.
-fn axis(scale: Scale, curves: &[Curve]) -> (Option<ValueAxis>, Option<f64>) {
+fn axis(scale: ValueScale, curves: &[TrainingCurve]) -> (Option<ValueAxis>, Option<f64>) {
     let extents = || curves.iter().flat_map(|curve| curve.runs.iter().flatten()).map(|(_, e)| e);
     if extents().next().is_none() {
         return (None, None);
     }
     let low = extents().map(|e| e.min).fold(f64::INFINITY, f64::min);
     let high = extents().map(|e| e.max).fold(f64::NEG_INFINITY, f64::max);
-    if scale == Scale::Log {
+    if scale == ValueScale::Log {
         return (Some(ValueAxis::log(low, high)), None);
     }
     let mut means: Vec<f64> = extents().map(|e| e.mean).collect();
@@ -207,7 +207,7 @@ fn axis(scale: Scale, curves: &[Curve]) -> (Option<ValueAxis>, Option<f64>) {
 fn band(
     scene: &mut Scene,
     run: &[(f64, Extent)],
-    kind: Kind,
+    kind: CurveKind,
     steps: &StepAxis,
     y: impl Fn(f64) -> f64,
 ) {
@@ -217,14 +217,14 @@ fn band(
     let upper = run.iter().map(|&(step, e)| [steps.x(step), y(e.max)]);
     let lower = run.iter().rev().map(|&(step, e)| [steps.x(step), y(e.min)]);
     let points = upper.chain(lower).collect();
-    scene.items.push(Item::Polygon { points, color: kind.color(), opacity: BAND_OPACITY });
+    scene.items.push(SceneItem::Polygon { points, color: kind.color(), opacity: BAND_OPACITY });
 }
 
 /// Draws the means of a stretch.
 fn line(
     scene: &mut Scene,
     run: &[(f64, Extent)],
-    curve: &Curve,
+    curve: &TrainingCurve,
     steps: &StepAxis,
     y: impl Fn(f64) -> f64,
 ) {
@@ -235,7 +235,7 @@ fn line(
         points.iter().for_each(|&point| scene.dot(point, width_px, color));
     }
     if points.len() > 1 {
-        scene.items.push(Item::Polyline { points, color, width_px: curve.kind.width_px() });
+        scene.items.push(SceneItem::Polyline { points, color, width_px: curve.kind.width_px() });
     }
 }
 
@@ -243,12 +243,17 @@ fn line(
 mod tests {
     use super::*;
 
-    fn chart(scale: Scale, kind: Kind, points: &[(u64, f64)], n_steps: u64) -> Chart {
-        Chart::new(scale, [(kind, points)], None, n_steps, 100.0)
+    fn chart(
+        scale: ValueScale,
+        kind: CurveKind,
+        points: &[(u64, f64)],
+        n_steps: u64,
+    ) -> TrainingChart {
+        TrainingChart::new(scale, [(kind, points)], None, n_steps, 100.0)
     }
 
     /// Returns the steps and means of each stretch of a chart's first curve.
-    fn means(chart: &Chart) -> Vec<Vec<(f64, f64)>> {
+    fn means(chart: &TrainingChart) -> Vec<Vec<(f64, f64)>> {
         let runs = chart.curves.first().map(|curve| curve.runs.as_slice()).unwrap_or_default();
         runs.iter().map(|run| run.iter().map(|&(step, e)| (step, e.mean)).collect()).collect()
     }
@@ -256,34 +261,36 @@ mod tests {
     #[test]
     fn a_step_without_a_value_is_a_gap_and_a_validation_is_none() {
         let points = [(1, 4.0), (2, 2.0), (4, f64::NAN), (5, 1.0), (6, -3.0)];
-        let steps = chart(Scale::Log, Kind::Steps, &points, 6);
+        let steps = chart(ValueScale::Log, CurveKind::Steps, &points, 6);
         assert_eq!(means(&steps), [vec![(1.0, 4.0), (2.0, 2.0)], vec![(5.0, 1.0)]]);
         assert_eq!(steps.n_left_out, 2);
-        let validation = chart(Scale::Log, Kind::Validation, &points, 6);
+        let validation = chart(ValueScale::Log, CurveKind::Validation, &points, 6);
         assert_eq!(means(&validation), [vec![(1.0, 4.0), (2.0, 2.0), (5.0, 1.0)]]);
-        let linear = chart(Scale::Linear, Kind::Steps, &points, 6);
+        let linear = chart(ValueScale::Linear, CurveKind::Steps, &points, 6);
         assert_eq!((linear.n_left_out, means(&linear).len()), (1, 2));
     }
 
     #[test]
     fn many_steps_are_brought_to_columns_of_two_pixels() {
         let points: Vec<_> = (1..=1000).map(|step| (step, (step % 20) as f64 + 1.0)).collect();
-        for kind in [Kind::Steps, Kind::Epochs] {
-            let chart = chart(Scale::Log, kind, &points, 1000);
+        for kind in [CurveKind::Steps, CurveKind::Epochs] {
+            let chart = chart(ValueScale::Log, kind, &points, 1000);
             let means = means(&chart);
             assert_eq!((means.len(), means[0].len()), (1, 50), "{kind:?}");
             // Steps 1 to 20, whose values are 2 to 20 and 1.
             assert_eq!(means[0][0], (10.5, 10.5), "{kind:?}");
         }
-        let validation = chart(Scale::Log, Kind::Validation, &points[..12], 1000);
+        let validation = chart(ValueScale::Log, CurveKind::Validation, &points[..12], 1000);
         assert!(!validation.curves[0].has_dots, "12 dots on 100 px");
-        assert!(chart(Scale::Log, Kind::Validation, &points[..11], 1000).curves[0].has_dots);
+        assert!(
+            chart(ValueScale::Log, CurveKind::Validation, &points[..11], 1000).curves[0].has_dots
+        );
     }
 
     #[test]
     fn nothing_to_show_is_no_axis() {
         for points in [&[][..], &[(1, 0.0), (2, f64::INFINITY)]] {
-            let chart = chart(Scale::Log, Kind::Steps, points, 2);
+            let chart = chart(ValueScale::Log, CurveKind::Steps, points, 2);
             assert_eq!((chart.axis, chart.kinds().count()), (None, 0));
             assert_eq!(chart.n_left_out, points.len() as u64);
         }
@@ -292,11 +299,11 @@ mod tests {
     #[test]
     fn a_few_peaks_do_not_press_a_linear_axis_down() {
         let mut points: Vec<_> = (1..=100).map(|step| (step, 1.0)).collect();
-        assert_eq!(chart(Scale::Linear, Kind::Steps, &points, 100).peak, None);
+        assert_eq!(chart(ValueScale::Linear, CurveKind::Steps, &points, 100).peak, None);
         points[7].1 = 50.0;
-        let peaked = chart(Scale::Linear, Kind::Steps, &points, 100);
+        let peaked = chart(ValueScale::Linear, CurveKind::Steps, &points, 100);
         assert_eq!((peaked.peak, peaked.axis), (Some(50.0), Some(ValueAxis::linear(0.0, 2.0))));
-        let log = chart(Scale::Log, Kind::Steps, &points, 100);
+        let log = chart(ValueScale::Log, CurveKind::Steps, &points, 100);
         assert_eq!((log.peak, log.axis), (None, Some(ValueAxis::log(1.0, 50.0))));
     }
 
@@ -304,7 +311,14 @@ mod tests {
     fn the_best_is_marked_where_it_has_a_place() {
         let points = [(1, 2.0), (2, 1.0)];
         let marked = |best| {
-            Chart::new(Scale::Log, [(Kind::Validation, &points[..])], best, 2, 100.0).has_best()
+            TrainingChart::new(
+                ValueScale::Log,
+                [(CurveKind::Validation, &points[..])],
+                best,
+                2,
+                100.0,
+            )
+            .has_best()
         };
         assert_eq!([None, Some((2, 1.0)), Some((2, 0.0))].map(marked), [false, true, false]);
     }

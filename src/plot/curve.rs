@@ -5,7 +5,7 @@ use ndarray::ArrayView1;
 use super::axis::{self, TimeAxis};
 use super::frame;
 use super::reduce::{self, Extent};
-use super::scene::{Item, Point, Rect, Scene};
+use super::scene::{Point, Rect, Scene, SceneItem};
 use super::style::{BLUE, CURVE_PX, GRID, HAIRLINE_PX, SCALE, VERMILLION};
 
 /// How dark the area under a curve is, and the band from the least to the greatest value of each
@@ -51,7 +51,7 @@ pub(super) fn draw(
         let lower = run.iter().rev().map(|&(i, e)| [x(i), floor(&e)]);
         let points: Vec<Point> = upper.chain(lower).collect();
         let opacity = if is_reduced { BAND_OPACITY } else { AREA_OPACITY };
-        scene.items.push(Item::Polygon { points, color: BLUE, opacity });
+        scene.items.push(SceneItem::Polygon { points, color: BLUE, opacity });
     }
     for &mark in marks {
         scene.vertical(mark, rect.top, rect.bottom(), HAIRLINE_PX, VERMILLION);
@@ -60,7 +60,7 @@ pub(super) fn draw(
         let points: Vec<Point> = run.iter().map(|&(i, e)| [x(i), y(e.mean)]).collect();
         match points.as_slice() {
             &[alone] => scene.dot(alone, DOT_PX, BLUE),
-            _ => scene.items.push(Item::Polyline { points, color: BLUE, width_px: CURVE_PX }),
+            _ => scene.items.push(SceneItem::Polyline { points, color: BLUE, width_px: CURVE_PX }),
         }
     }
 }

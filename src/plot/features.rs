@@ -12,7 +12,7 @@ use super::{Format, Picture, PlotError, check_width, frame, header, heatmap, wri
 /// Features of a file, or of an excerpt, and what is known of its beats.
 #[derive(Clone, Copy, Debug)]
 pub struct FeaturesPlot<'a> {
-    /// What stands over the plot, for example the file's name.
+    /// The title of the plot, for example the file's name.
     pub title: &'a str,
     /// `[n_frames, 163]`: mel 128, chroma 12, mfcc 20, rms, spectral_centroid, onset_strength.
     /// Values that are not finite are shown as missing.

@@ -4,7 +4,7 @@ use ndarray::{Array2, ArrayView2};
 
 use super::axis::number;
 use super::colormap::{self, Palette};
-use super::scene::{Anchor, Image, Item, Rect, Scene};
+use super::scene::{Anchor, Image, Rect, Scene, SceneItem};
 use super::style::{CAP_HEIGHT, INK, SCALE, TEXT_PX};
 use super::{frame, reduce};
 
@@ -20,7 +20,7 @@ const SHOWN_SHARE: f64 = 0.995;
 
 /// How numbers become colours.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Scale {
+pub(super) enum ColorScale {
     /// From 0 to 1, or further where values go further.
     Amount,
     /// As far below 0 as above.
@@ -35,17 +35,17 @@ struct Ends {
 }
 
 /// Draws `values`, `[n_frames, n_rows]` with row 0 at the bottom, and the colour bar beside them.
-pub(super) fn draw(scene: &mut Scene, rect: Rect, values: ArrayView2<'_, f32>, scale: Scale) {
+pub(super) fn draw(scene: &mut Scene, rect: Rect, values: ArrayView2<'_, f32>, scale: ColorScale) {
     let columns = reduce::means(values, n_columns(values.nrows(), rect.width));
     let (palette, ends) = match scale {
-        Scale::Amount => (colormap::amounts(), amount_ends(&columns)),
-        Scale::Deviation => (colormap::deviations(), deviation_ends(&columns)),
+        ColorScale::Amount => (colormap::amounts(), amount_ends(&columns)),
+        ColorScale::Deviation => (colormap::deviations(), deviation_ends(&columns)),
     };
     if columns.is_empty() {
         frame::nothing(scene, rect, "no frames");
     } else {
         let image = image(&columns, &palette, &ends);
-        scene.items.push(Item::Image { rect, image });
+        scene.items.push(SceneItem::Image { rect, image });
     }
     bar(scene, rect, &palette, &ends, scale);
 }
@@ -91,12 +91,12 @@ fn image(columns: &Array2<f32>, palette: &Palette, ends: &Ends) -> Image {
     Image { n_columns, n_rows, indices, palette: Box::new(*palette) }
 }
 
-fn bar(scene: &mut Scene, beside: Rect, palette: &Palette, ends: &Ends, scale: Scale) {
+fn bar(scene: &mut Scene, beside: Rect, palette: &Palette, ends: &Ends, scale: ColorScale) {
     let left = beside.right() + BAR_GAP_PX;
     let rect = Rect { left, top: beside.top, width: BAR_PX, height: beside.height };
     let indices: Vec<u8> = (0..colormap::MISSING_INDEX).rev().collect();
     let image = Image { n_columns: 1, n_rows: indices.len(), indices, palette: Box::new(*palette) };
-    scene.items.push(Item::Image { rect, image });
+    scene.items.push(SceneItem::Image { rect, image });
     let mut label = |text: &str, cap_top: f64| {
         let at = [rect.right() + BAR_LABEL_GAP_PX, cap_top + CAP_HEIGHT * TEXT_PX];
         scene.text(at, Anchor::Start, text, TEXT_PX, INK);
@@ -104,7 +104,7 @@ fn bar(scene: &mut Scene, beside: Rect, palette: &Palette, ends: &Ends, scale: S
     let (below, above) = if ends.is_cut { ("≤ ", "≥ ") } else { ("", "") };
     label(&format!("{above}{}", number(ends.high)), rect.top);
     label(&format!("{below}{}", number(ends.low)), rect.bottom() - CAP_HEIGHT * TEXT_PX);
-    if scale == Scale::Deviation {
+    if scale == ColorScale::Deviation {
         label("0", rect.top + (rect.height - CAP_HEIGHT * TEXT_PX) / 2.0);
     }
 }

@@ -4,7 +4,7 @@ use super::axis::{TimeAxis, number};
 use super::curve;
 use super::frame::{self, PANEL_GAP_PX, PLOT_TOP_PX};
 use super::header::{self, Fact, LINE_PX, counted};
-use super::motion_chart::Chart;
+use super::motion_chart::MotionChart;
 use super::motion_panel::MotionPanel;
 use super::motion_path::FloorPath;
 use super::scene::{Rect, Scene};
@@ -16,7 +16,7 @@ use crate::units::{FPS, frames_to_s};
 /// A motion, or an excerpt, and what is known of its beats.
 #[derive(Clone, Copy, Debug)]
 pub struct MotionPlot<'a> {
-    /// What stands over the plot, for example the name of the phrase.
+    /// The title of the plot, for example the name of the phrase.
     pub title: &'a str,
     /// Values that are not finite are gaps.
     pub motion: &'a Trajectory,
@@ -141,7 +141,7 @@ fn draw_curves(
         let time = grid.time(i, plot);
         let (left, width, height) = (time.left, time.width, grid.height);
         let rect = Rect { left, top: top + PLOT_TOP_PX, width, height };
-        let chart = Chart::new(panel, plot.motion, plot.jerk_limit_m_s3, width);
+        let chart = MotionChart::new(panel, plot.motion, plot.jerk_limit_m_s3, width);
         chart.heading(scene, rect);
         let (_, beats_x) = beats(plot.beat_times_s, &time);
         // The bars are read off the phase; elsewhere beats would be lines among lines.

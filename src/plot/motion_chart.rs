@@ -6,7 +6,7 @@ use super::axis::{self, Tick, TimeAxis, number};
 use super::curve::{self, DOT_PX};
 use super::motion_panel::MotionPanel;
 use super::reduce::{self, Extent};
-use super::scene::{Anchor, Item, Point, Rect, Scene};
+use super::scene::{Anchor, Point, Rect, Scene, SceneItem};
 use super::style::{
     BLUE, CAP_HEIGHT, CURVE_PX, GREEN, GRID, HAIRLINE_PX, INK, PURPLE, Rgb, TEXT_PX, VERMILLION,
 };
@@ -23,7 +23,7 @@ const BAND_OPACITY: f64 = 0.2;
 const PAD_SHARE: f64 = 0.05;
 /// Norms beyond this factor of 1 are no quaternions, and have an axis from 0.
 const MAX_NORM_FACTOR: f64 = 2.0;
-/// The log axis of jerk ends so far below its head: nobody looks for less.
+/// Lower end of the log axis of jerk as a share of its head; smaller values are of no interest.
 const JERK_SHARE: f64 = 1e-6;
 /// Least distance of two labels on the axis of norms.
 const LABEL_PX: f64 = 20.0;
@@ -41,7 +41,7 @@ const LEGEND_UP_PX: f64 = 12.0;
 const AXES: [(&str, Rgb); 3] = [("x", BLUE), ("y", GREEN), ("z", PURPLE)];
 const W: (&str, Rgb) = ("w", INK);
 
-/// What one curve shows.
+/// The values of one curve.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Line {
     /// Empty where the heading says it all.
@@ -53,7 +53,7 @@ pub(super) struct Line {
 
 /// Returns the curves of a panel; none of [`MotionPanel::Path`].
 pub(super) fn lines(panel: MotionPanel, motion: &Trajectory) -> Vec<Line> {
-    let of = |channel: Channel, parts: &[(&'static str, Rgb)]| -> Vec<Line> {
+    let lines_of = |channel: Channel, parts: &[(&'static str, Rgb)]| -> Vec<Line> {
         let group = motion.channel(channel);
         let columns = group.columns().into_iter().zip(parts);
         columns
@@ -62,12 +62,12 @@ pub(super) fn lines(panel: MotionPanel, motion: &Trajectory) -> Vec<Line> {
     };
     let alone = |values: Array1<f32>| vec![Line { label: "", color: BLUE, values }];
     match panel {
-        MotionPanel::Position => of(Channel::Position, &AXES),
-        MotionPanel::Velocity => of(Channel::Velocity, &AXES),
-        MotionPanel::Acceleration => of(Channel::Acceleration, &AXES),
-        MotionPanel::AngularVelocity => of(Channel::AngularVelocity, &AXES),
-        MotionPanel::Quaternion => of(Channel::Quaternion, &[&[W][..], &AXES].concat()),
-        MotionPanel::Phase => of(Channel::Phase, &[("", BLUE)]),
+        MotionPanel::Position => lines_of(Channel::Position, &AXES),
+        MotionPanel::Velocity => lines_of(Channel::Velocity, &AXES),
+        MotionPanel::Acceleration => lines_of(Channel::Acceleration, &AXES),
+        MotionPanel::AngularVelocity => lines_of(Channel::AngularVelocity, &AXES),
+        MotionPanel::Quaternion => lines_of(Channel::Quaternion, &[&[W][..], &AXES].concat()),
+        MotionPanel::Phase => lines_of(Channel::Phase, &[("", BLUE)]),
         MotionPanel::QuaternionNorm => {
             let quaternions = motion.channel(Channel::Quaternion);
             let rows = quaternions.rows().into_iter();
@@ -128,16 +128,16 @@ impl Axis {
 }
 
 /// A curve as it is drawn: stretches without a gap, each of columns and values there.
-struct Curve {
+struct MotionCurve {
     label: &'static str,
     color: Rgb,
     runs: Vec<Vec<(usize, Extent)>>,
 }
 
 /// The curves of a panel.
-pub(super) struct Chart {
+pub(super) struct MotionChart {
     panel: MotionPanel,
-    curves: Vec<Curve>,
+    curves: Vec<MotionCurve>,
     n_columns: usize,
     is_reduced: bool,
     /// `None` without a value to show.
@@ -146,7 +146,7 @@ pub(super) struct Chart {
     limit: Option<f64>,
 }
 
-impl Chart {
+impl MotionChart {
     /// Brings the curves of a panel to the `width_px` that they have room on; `jerk_limit_m_s3` is
     /// marked in the panel of jerk.
     pub fn new(
@@ -160,9 +160,9 @@ impl Chart {
             let columns = reduce::extents(line.values.view(), n_columns);
             let runs = curve::runs(&columns);
             let runs = if panel == MotionPanel::Phase { parted_at_bars(runs) } else { runs };
-            Curve { label: line.label, color: line.color, runs }
+            MotionCurve { label: line.label, color: line.color, runs }
         };
-        let curves: Vec<Curve> = lines(panel, motion).into_iter().map(curve).collect();
+        let curves: Vec<MotionCurve> = lines(panel, motion).into_iter().map(curve).collect();
         let limit = match panel {
             MotionPanel::QuaternionNorm => Some(1.0),
             MotionPanel::Jerk => Some(jerk_limit_m_s3).filter(|x| x.is_finite() && *x > 0.0),
@@ -174,8 +174,10 @@ impl Chart {
 
     /// Writes heading, unit and legend over the panel at `rect`.
     pub fn heading(&self, scene: &mut Scene, rect: Rect) {
-        let labelled: Vec<&Curve> = self.curves.iter().filter(|c| !c.label.is_empty()).collect();
-        let width = |curve: &&Curve| KEY_PX + KEY_GAP_PX + font::width_px(curve.label, TEXT_PX);
+        let labelled: Vec<&MotionCurve> =
+            self.curves.iter().filter(|c| !c.label.is_empty()).collect();
+        let width =
+            |curve: &&MotionCurve| KEY_PX + KEY_GAP_PX + font::width_px(curve.label, TEXT_PX);
         let gaps = labelled.len().saturating_sub(1) as f64 * ENTRY_GAP_PX;
         let mut x = rect.right() - labelled.iter().map(width).sum::<f64>() - gaps;
         let limit = self.limit.filter(|_| self.panel == MotionPanel::Jerk);
@@ -191,7 +193,11 @@ impl Chart {
         for curve in labelled {
             let y = base - CAP_HEIGHT * TEXT_PX / 2.0;
             let points = vec![[x, y], [x + KEY_PX, y]];
-            scene.items.push(Item::Polyline { points, color: curve.color, width_px: CURVE_PX });
+            scene.items.push(SceneItem::Polyline {
+                points,
+                color: curve.color,
+                width_px: CURVE_PX,
+            });
             let at = [x + KEY_PX + KEY_GAP_PX, base];
             scene.text(at, Anchor::Start, curve.label, TEXT_PX, INK);
             x += width(&curve) + ENTRY_GAP_PX;
@@ -218,7 +224,7 @@ impl Chart {
                     let lower = run.iter().rev().map(|&(i, e)| [x(i), y(e.min)]);
                     let points: Vec<Point> = upper.chain(lower).collect();
                     let (color, opacity) = (curve.color, BAND_OPACITY);
-                    scene.items.push(Item::Polygon { points, color, opacity });
+                    scene.items.push(SceneItem::Polygon { points, color, opacity });
                 }
             }
         }
@@ -234,7 +240,9 @@ impl Chart {
                 let color = curve.color;
                 match points.as_slice() {
                     &[alone] => scene.dot(alone, DOT_PX, color),
-                    _ => scene.items.push(Item::Polyline { points, color, width_px: CURVE_PX }),
+                    _ => {
+                        scene.items.push(SceneItem::Polyline { points, color, width_px: CURVE_PX })
+                    }
                 }
             }
         }
@@ -259,7 +267,7 @@ fn parted_at_bars(runs: Vec<Vec<(usize, Extent)>>) -> Vec<Vec<(usize, Extent)>> 
 }
 
 /// Returns the axis that shows the curves; `None` without a value.
-fn axis_of(panel: MotionPanel, curves: &[Curve], limit: Option<f64>) -> Option<Axis> {
+fn axis_of(panel: MotionPanel, curves: &[MotionCurve], limit: Option<f64>) -> Option<Axis> {
     let extents = || curves.iter().flat_map(|c| c.runs.iter().flatten()).map(|(_, e)| e);
     extents().next()?;
     let low = extents().map(|e| e.min).fold(f64::INFINITY, f64::min);
@@ -340,14 +348,15 @@ mod tests {
             6 => f32::NAN,
             t => (t as f32 * 0.3).fract(),
         });
-        let chart = Chart::new(MotionPanel::Phase, &phase, 50_000.0, 400.0);
+        let chart = MotionChart::new(MotionPanel::Phase, &phase, 50_000.0, 400.0);
         let lengths: Vec<_> = chart.curves[0].runs.iter().map(Vec::len).collect();
         assert_eq!(lengths, [4, 2, 2]);
     }
 
     #[test]
     fn axes_hold_what_belongs_to_the_panel() {
-        let axis = |panel, motion: &Trajectory| Chart::new(panel, motion, 50_000.0, 400.0).axis;
+        let axis =
+            |panel, motion: &Trajectory| MotionChart::new(panel, motion, 50_000.0, 400.0).axis;
         let still = motion(4, Channel::Quaternion, |_, i| [1.0, 0.0, 0.0, 0.0][i]);
         let near = |low: f64, high: f64| Some(Axis::Values(ValueAxis::linear(low, high)));
         assert_eq!(axis(MotionPanel::Quaternion, &still), near(-1.0, 1.0));
@@ -366,6 +375,6 @@ mod tests {
         let axis = axis(MotionPanel::Position, &sunk).unwrap();
         assert!((axis.up(-2.0) - 0.1 / 2.2).abs() < 1e-12 && axis.up(0.0) < 1.0);
         let nothing = motion(3, Channel::Position, |_, _| f32::NAN);
-        assert!(Chart::new(MotionPanel::Position, &nothing, 50_000.0, 400.0).axis.is_none());
+        assert!(MotionChart::new(MotionPanel::Position, &nothing, 50_000.0, 400.0).axis.is_none());
     }
 }

@@ -93,18 +93,18 @@ impl MotionPanel {
 
     /// Returns the unit of the vertical axis; empty without one.
     pub(super) fn unit(self) -> &'static str {
-        let of = |channel: Channel| match channel.unit() {
+        let unit_of = |channel: Channel| match channel.unit() {
             "1" => "",
             unit => unit,
         };
         match self {
-            Self::Position | Self::Path => of(Channel::Position),
-            Self::Velocity => of(Channel::Velocity),
-            Self::Quaternion | Self::QuaternionNorm => of(Channel::Quaternion),
-            Self::Phase => of(Channel::Phase),
+            Self::Position | Self::Path => unit_of(Channel::Position),
+            Self::Velocity => unit_of(Channel::Velocity),
+            Self::Quaternion | Self::QuaternionNorm => unit_of(Channel::Quaternion),
+            Self::Phase => unit_of(Channel::Phase),
             Self::Jerk => "m/s³",
-            Self::Acceleration => of(Channel::Acceleration),
-            Self::AngularVelocity => of(Channel::AngularVelocity),
+            Self::Acceleration => unit_of(Channel::Acceleration),
+            Self::AngularVelocity => unit_of(Channel::AngularVelocity),
         }
     }
 }

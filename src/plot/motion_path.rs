@@ -1,7 +1,7 @@
 //! The path of a motion as it is seen from above.
 
 use super::axis::{self, Tick};
-use super::scene::{Anchor, Item, Point, Rect, Scene};
+use super::scene::{Anchor, Point, Rect, Scene, SceneItem};
 use super::style::{
     BLUE, CAP_HEIGHT, CURVE_PX, GREEN, GRID, HAIRLINE_PX, INK, MUTED, TEXT_PX, VERMILLION,
 };
@@ -10,7 +10,7 @@ use crate::motion::quaternion::{dot, normalize, rotate};
 use crate::motion::{Channel, Trajectory};
 use crate::units::FPS;
 
-/// What is shown around the path, as a share of its longer side, and the least side that is shown.
+/// The margin around the path, as a share of its longer side, and the least side that is shown.
 const PAD_SHARE: f64 = 0.08;
 const MIN_SIDE_M: f64 = 0.5;
 /// Room for a tick of either axis.
@@ -134,7 +134,7 @@ impl FloorPath {
                 &[alone] => scene.dot(alone, MARK_DOT_PX, BLUE),
                 _ => {
                     let (color, width_px) = (BLUE, CURVE_PX);
-                    scene.items.push(Item::Polyline { points, color, width_px });
+                    scene.items.push(SceneItem::Polyline { points, color, width_px });
                 }
             }
         }
@@ -142,7 +142,7 @@ impl FloorPath {
             let Some(from) = self.places_m[t].map(|place| map.at(place)) else { continue };
             let to = [from[0] + x * MARK_LENGTH_PX, from[1] + z * MARK_LENGTH_PX];
             let (points, color, width_px) = (vec![from, to], MUTED, MARK_PX);
-            scene.items.push(Item::Polyline { points, color, width_px });
+            scene.items.push(SceneItem::Polyline { points, color, width_px });
             scene.dot(from, MARK_DOT_PX, MUTED);
         }
         let mut places = self.places_m.iter().flatten();

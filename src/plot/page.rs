@@ -5,7 +5,7 @@ use ndarray::s;
 use super::axis::TimeAxis;
 use super::features::FeaturesPlot;
 use super::header::{self, Fact};
-use super::heatmap::{self, Scale};
+use super::heatmap::{self, ColorScale};
 use super::panel::Panel;
 use super::scene::{Anchor, Rect, Scene};
 use super::style::{
@@ -116,9 +116,9 @@ impl Page {
         let values = plot.values.slice(s![.., panel.columns()]);
         match panel {
             Panel::Mel | Panel::Chroma => {
-                heatmap::draw(&mut self.scene, rect, values, Scale::Amount);
+                heatmap::draw(&mut self.scene, rect, values, ColorScale::Amount);
             }
-            Panel::Mfcc => heatmap::draw(&mut self.scene, rect, values, Scale::Deviation),
+            Panel::Mfcc => heatmap::draw(&mut self.scene, rect, values, ColorScale::Deviation),
             Panel::Rms | Panel::SpectralCentroid | Panel::OnsetStrength => {
                 let marks = match panel {
                     Panel::OnsetStrength => self.beats.x.as_slice(),

@@ -5,7 +5,7 @@ use tiny_skia::{
     Stroke, Transform,
 };
 
-use super::scene::{Image, Item, Point, Rect, Scene, text_start_x};
+use super::scene::{Image, Point, Rect, Scene, SceneItem, text_start_x};
 use super::style::{PAPER, Rgb, SCALE};
 use super::{PlotError, font, png};
 
@@ -30,23 +30,23 @@ pub(super) fn write(scene: &Scene) -> Result<Vec<u8>, PlotError> {
     png::rgb(width, height, &pixels)
 }
 
-fn draw(page: &mut Pixmap, item: &Item) {
+fn draw(page: &mut Pixmap, item: &SceneItem) {
     let scale = Transform::from_scale(SCALE as f32, SCALE as f32);
     match item {
-        Item::Area { rect, color, opacity } => {
+        SceneItem::Area { rect, color, opacity } => {
             let (width, height) = (rect.width as f32, rect.height as f32);
             let rect = tiny_skia::Rect::from_xywh(rect.left as f32, rect.top as f32, width, height);
             if let Some(rect) = rect {
                 page.fill_rect(rect, &paint(*color, *opacity), scale, None);
             }
         }
-        Item::Polygon { points, color, opacity } => {
+        SceneItem::Polygon { points, color, opacity } => {
             if let Some(path) = path(points, true) {
                 let paint = paint(*color, *opacity);
                 page.fill_path(&path, &paint, FillRule::Winding, scale, None);
             }
         }
-        Item::Polyline { points, color, width_px } => {
+        SceneItem::Polyline { points, color, width_px } => {
             if let Some(path) = path(points, false) {
                 let stroke = Stroke {
                     width: *width_px as f32,
@@ -57,14 +57,14 @@ fn draw(page: &mut Pixmap, item: &Item) {
                 page.stroke_path(&path, &paint(*color, 1.0), &stroke, scale, None);
             }
         }
-        Item::Text { at, anchor, text, size_px, color } => {
+        SceneItem::Text { at, anchor, text, size_px, color } => {
             let scale = f64::from(SCALE);
             let x = text_start_x(*at, *anchor, text, *size_px) * scale;
             font::draw(text, size_px * scale, x, at[1] * scale, |x, y, coverage| {
                 blend(page, x, y, *color, coverage);
             });
         }
-        Item::Image { rect, image } => draw_image(page, rect, image),
+        SceneItem::Image { rect, image } => draw_image(page, rect, image),
     }
 }
 

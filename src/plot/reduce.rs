@@ -42,7 +42,7 @@ pub(super) fn means(values: ArrayView2<'_, f32>, max_columns: usize) -> Array2<f
     means
 }
 
-/// What a curve does within a column.
+/// The extent of a curve within a column.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Extent {
     pub min: f64,

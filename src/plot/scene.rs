@@ -38,7 +38,7 @@ pub(super) enum Anchor {
 
 /// One thing on the page.
 #[derive(Clone, Debug)]
-pub(super) enum Item {
+pub(super) enum SceneItem {
     Area {
         rect: Rect,
         color: Rgb,
@@ -83,14 +83,14 @@ pub(super) struct Image {
 pub(super) struct Scene {
     pub width_px: f64,
     pub height_px: f64,
-    /// What the page shows, for readers that cannot see it.
+    /// A description of the page, for readers that cannot see it.
     pub title: String,
-    pub items: Vec<Item>,
+    pub items: Vec<SceneItem>,
 }
 
 impl Scene {
     pub fn area(&mut self, rect: Rect, color: Rgb, opacity: f64) {
-        self.items.push(Item::Area { rect, color, opacity });
+        self.items.push(SceneItem::Area { rect, color, opacity });
     }
 
     /// Adds a horizontal line of `width_px` whose upper edge is at `top`.
@@ -110,12 +110,12 @@ impl Scene {
     pub fn dot(&mut self, [x, y]: Point, width_px: f64, color: Rgb) {
         // A thick line with round ends that hardly goes anywhere.
         let points = vec![[x - 0.01, y], [x + 0.01, y]];
-        self.items.push(Item::Polyline { points, color, width_px });
+        self.items.push(SceneItem::Polyline { points, color, width_px });
     }
 
     pub fn text(&mut self, at: Point, anchor: Anchor, text: &str, size_px: f64, color: Rgb) {
         if !text.is_empty() {
-            self.items.push(Item::Text { at, anchor, text: text.to_owned(), size_px, color });
+            self.items.push(SceneItem::Text { at, anchor, text: text.to_owned(), size_px, color });
         }
     }
 }

@@ -11,7 +11,7 @@ pub(super) type Rgb = [u8; 3];
 pub(super) const PAPER: Rgb = [255, 255, 255];
 /// Titles, headings and tick labels.
 pub(super) const INK: Rgb = [0x1f, 0x23, 0x28];
-/// What explains rather than names.
+/// The color of explanations.
 pub(super) const MUTED: Rgb = [0x5c, 0x64, 0x70];
 /// Axis and tick lines.
 pub(super) const AXIS: Rgb = [0x8a, 0x92, 0x9c];

@@ -8,7 +8,7 @@ use std::fmt::{self, Write as _};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 
-use super::scene::{Anchor, Item, Point, Rect, Scene};
+use super::scene::{Anchor, Point, Rect, Scene, SceneItem};
 use super::style::{PAPER, Rgb};
 use super::{PlotError, png};
 
@@ -36,13 +36,18 @@ pub(super) fn write(scene: &Scene) -> Result<Vec<u8>, PlotError> {
     Ok(out.into_bytes())
 }
 
-fn write_item(out: &mut String, item: &Item) -> Result<(), PlotError> {
+fn write_item(out: &mut String, item: &SceneItem) -> Result<(), PlotError> {
     match item {
-        Item::Area { rect, color, opacity } => line(
+        SceneItem::Area { rect, color, opacity } => line(
             out,
-            format_args!("<rect {} fill=\"{}\"{}/>", Place(rect), Hex(*color), Opacity(*opacity)),
+            format_args!(
+                "<rect {} fill=\"{}\"{}/>",
+                RectAttributes(rect),
+                Hex(*color),
+                Opacity(*opacity)
+            ),
         ),
-        Item::Polygon { points, color, opacity } => line(
+        SceneItem::Polygon { points, color, opacity } => line(
             out,
             format_args!(
                 "<polygon points=\"{}\" fill=\"{}\"{}/>",
@@ -51,7 +56,7 @@ fn write_item(out: &mut String, item: &Item) -> Result<(), PlotError> {
                 Opacity(*opacity)
             ),
         ),
-        Item::Polyline { points, color, width_px } => line(
+        SceneItem::Polyline { points, color, width_px } => line(
             out,
             format_args!(
                 "<polyline points=\"{}\" fill=\"none\" stroke=\"{}\" stroke-width=\"{}\" \
@@ -61,7 +66,7 @@ fn write_item(out: &mut String, item: &Item) -> Result<(), PlotError> {
                 Number(*width_px)
             ),
         ),
-        Item::Text { at, anchor, text, size_px, color } => line(
+        SceneItem::Text { at, anchor, text, size_px, color } => line(
             out,
             format_args!(
                 "<text x=\"{}\" y=\"{}\" font-size=\"{}\" fill=\"{}\"{}>{}</text>",
@@ -77,12 +82,12 @@ fn write_item(out: &mut String, item: &Item) -> Result<(), PlotError> {
                 Escaped(text)
             ),
         ),
-        Item::Image { rect, image } => line(
+        SceneItem::Image { rect, image } => line(
             out,
             format_args!(
                 "<image {} preserveAspectRatio=\"none\" style=\"image-rendering:pixelated\" \
                  xlink:href=\"data:image/png;base64,{}\"/>",
-                Place(rect),
+                RectAttributes(rect),
                 STANDARD.encode(png::indexed(image)?)
             ),
         ),
@@ -123,9 +128,9 @@ impl fmt::Display for Opacity {
     }
 }
 
-struct Place<'a>(&'a Rect);
+struct RectAttributes<'a>(&'a Rect);
 
-impl fmt::Display for Place<'_> {
+impl fmt::Display for RectAttributes<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (x, y) = (Number(self.0.left), Number(self.0.top));
         let (width, height) = (Number(self.0.width), Number(self.0.height));

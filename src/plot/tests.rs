@@ -7,7 +7,7 @@ use ndarray::{Array2, ArrayView2};
 
 use super::features::scene;
 use super::panel::FEATURE_DIM;
-use super::scene::{Item, Rect, Scene, text_start_x};
+use super::scene::{Rect, Scene, SceneItem, text_start_x};
 use super::style::CAP_HEIGHT;
 use super::*;
 
@@ -47,7 +47,7 @@ fn decode(bytes: &[u8]) -> (usize, usize, Vec<u8>) {
 /// Returns the texts of a scene with the boxes in which they are, as high as a capital.
 fn texts(scene: &Scene) -> Vec<(String, Rect)> {
     let texts = scene.items.iter().filter_map(|item| match item {
-        Item::Text { at, anchor, text, size_px, .. } => {
+        SceneItem::Text { at, anchor, text, size_px, .. } => {
             let left = text_start_x(*at, *anchor, text, *size_px);
             let (width, height) = (font::width_px(text, *size_px), size_px * CAP_HEIGHT);
             Some((text.clone(), Rect { left, top: at[1] - height, width, height }))
@@ -59,7 +59,7 @@ fn texts(scene: &Scene) -> Vec<(String, Rect)> {
 
 fn images(scene: &Scene) -> Vec<Rect> {
     let images = scene.items.iter().filter_map(|item| match item {
-        Item::Image { rect, .. } => Some(*rect),
+        SceneItem::Image { rect, .. } => Some(*rect),
         _ => None,
     });
     images.collect()

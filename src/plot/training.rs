@@ -1,26 +1,26 @@
 //! The plot of a training run's losses.
 
 use super::axis::{StepAxis, number};
-use super::chart::{self, BAND_OPACITY, Chart, Kind};
+use super::chart::{self, BAND_OPACITY, CurveKind, TrainingChart};
 use super::curve::{self, DOT_PX};
 use super::frame::{self, PANEL_GAP_PX, PLOT_TOP_PX};
 use super::header::{self, Fact, LINE_PX, counted};
-use super::scene::{Anchor, Item, Rect, Scene};
+use super::scene::{Anchor, Rect, Scene, SceneItem};
 use super::style::{CAP_HEIGHT, INK, LEFT_PX, MARGIN_PX, MUTED, PART_PX, TEXT_PX};
 use super::training_panel::{TrainingPanel, TrainingStage};
-use super::value_axis::Scale;
+use super::value_axis::ValueScale;
 use super::{Format, Picture, PlotError, check_width, font, write};
 
 /// A run, as far as it is drawn.
 #[derive(Clone, Copy, Debug)]
 pub struct TrainingPlot<'a> {
-    /// What stands over the plot: the run's name.
+    /// The title of the plot: the run's name.
     pub title: &'a str,
     /// Stages to draw, from the top.
     pub stages: &'a [StageCurves],
 }
 
-/// What was logged of a stage.
+/// The logged rows of a stage.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StageCurves {
     pub stage: TrainingStage,
@@ -66,13 +66,13 @@ impl PanelCurves {
         }
     }
 
-    fn of(&self, kind: Kind) -> &[(u64, f64)] {
+    fn of(&self, kind: CurveKind) -> &[(u64, f64)] {
         match kind {
-            Kind::Steps => &self.steps,
-            Kind::DecoderSteps => &self.decoder_steps,
-            Kind::Epochs => &self.epochs,
-            Kind::LiveValidation => &self.live_validation,
-            Kind::Validation => &self.validation,
+            CurveKind::Steps => &self.steps,
+            CurveKind::DecoderSteps => &self.decoder_steps,
+            CurveKind::Epochs => &self.epochs,
+            CurveKind::LiveValidation => &self.live_validation,
+            CurveKind::Validation => &self.validation,
         }
     }
 }
@@ -139,7 +139,7 @@ struct Stage<'a> {
     /// Panels side by side, and the width of each.
     n_columns: usize,
     width: f64,
-    charts: Vec<Chart>,
+    charts: Vec<TrainingChart>,
 }
 
 impl<'a> Stage<'a> {
@@ -150,9 +150,9 @@ impl<'a> Stage<'a> {
             && half >= MIN_COLUMN_PX;
         let (n_columns, width) = if is_grid { (2, half) } else { (1, right - left) };
         let charts = curves.panels.iter().map(|panel| {
-            let kinds = Kind::ALL.into_iter().map(|kind| (kind, panel.of(kind)));
+            let kinds = CurveKind::ALL.into_iter().map(|kind| (kind, panel.of(kind)));
             let best = curves.best.filter(|_| panel.panel == TrainingPanel::Loss);
-            Chart::new(panel.panel.scale(), kinds, best, curves.n_steps, width)
+            TrainingChart::new(panel.panel.scale(), kinds, best, curves.n_steps, width)
         });
         let charts = charts.collect();
         Self { curves, left, right, n_columns, width, charts }
@@ -197,13 +197,13 @@ impl<'a> Stage<'a> {
     /// Draws what each kind of curve looks like, with the first line at `base`; returns the number of
     /// lines.
     fn legend(&self, scene: &mut Scene, base: f64) -> usize {
-        let is_drawn = |kind: &Kind| self.charts.iter().any(|c| c.kinds().any(|k| k == *kind));
-        let mut entries: Vec<(Option<Kind>, String)> = Kind::ALL
+        let is_drawn = |kind: &CurveKind| self.charts.iter().any(|c| c.kinds().any(|k| k == *kind));
+        let mut entries: Vec<(Option<CurveKind>, String)> = CurveKind::ALL
             .into_iter()
             .filter(is_drawn)
             .map(|kind| (Some(kind), self.label(kind)))
             .collect();
-        if self.charts.iter().any(Chart::has_best) {
+        if self.charts.iter().any(TrainingChart::has_best) {
             entries.push((None, "best".to_owned()));
         }
         let widths: Vec<f64> = entries
@@ -221,32 +221,32 @@ impl<'a> Stage<'a> {
     }
 
     /// Draws a key of the legend from `x` on, around `y`; without a kind that of the best value.
-    fn key(&self, scene: &mut Scene, kind: Option<Kind>, x: f64, y: f64) {
+    fn key(&self, scene: &mut Scene, kind: Option<CurveKind>, x: f64, y: f64) {
         let middle = [x + KEY_PX / 2.0, y];
         let Some(kind) = kind else { return chart::ring(scene, middle) };
         let color = kind.color();
-        if kind == Kind::Steps && self.steps_per_column() > 1.0 {
+        if kind == CurveKind::Steps && self.steps_per_column() > 1.0 {
             let (top, height) = (y - KEY_BAND_PX / 2.0, KEY_BAND_PX);
             scene.area(Rect { left: x, top, width: KEY_PX, height }, color, BAND_OPACITY);
         }
         let points = vec![[x, y], [x + KEY_PX, y]];
-        scene.items.push(Item::Polyline { points, color, width_px: kind.width_px() });
+        scene.items.push(SceneItem::Polyline { points, color, width_px: kind.width_px() });
         if kind.has_dots() {
             scene.dot(middle, DOT_PX, color);
         }
     }
 
-    fn label(&self, kind: Kind) -> String {
+    fn label(&self, kind: CurveKind) -> String {
         let n = self.steps_per_column();
         let has_live = self.curves.panels.iter().any(|panel| !panel.live_validation.is_empty());
         match kind {
-            Kind::Steps if n > 1.0 => format!("mean and range of {n:.0} steps"),
-            Kind::Steps => "steps".to_owned(),
-            Kind::DecoderSteps => "decoder’s learning rate".to_owned(),
-            Kind::Epochs => "mean of an epoch".to_owned(),
-            Kind::Validation if has_live => "validation, averaged weights".to_owned(),
-            Kind::Validation => "validation".to_owned(),
-            Kind::LiveValidation => "validation, live weights".to_owned(),
+            CurveKind::Steps if n > 1.0 => format!("mean and range of {n:.0} steps"),
+            CurveKind::Steps => "steps".to_owned(),
+            CurveKind::DecoderSteps => "decoder’s learning rate".to_owned(),
+            CurveKind::Epochs => "mean of an epoch".to_owned(),
+            CurveKind::Validation if has_live => "validation, averaged weights".to_owned(),
+            CurveKind::Validation => "validation".to_owned(),
+            CurveKind::LiveValidation => "validation, live weights".to_owned(),
         }
     }
 
@@ -288,12 +288,12 @@ impl<'a> Stage<'a> {
             _ if self.charts.len() == 1 => ALONE_PX,
             _ if self.n_columns > 1 => GRID_PX,
             TrainingPanel::Loss => LOSS_PX,
-            _ if panel.scale() == Scale::Log => PART_LOSS_PX,
+            _ if panel.scale() == ValueScale::Log => PART_LOSS_PX,
             _ => SMALL_PX,
         }
     }
 
-    fn heading(&self, scene: &mut Scene, rect: Rect, panel: TrainingPanel, chart: &Chart) {
+    fn heading(&self, scene: &mut Scene, rect: Rect, panel: TrainingPanel, chart: &TrainingChart) {
         let peak = chart.peak.map(|peak| format!("up to {}, beyond the axis", number(peak)));
         let meaning = [panel.meaning(), peak.as_deref().unwrap_or_default()];
         let long =

@@ -2,7 +2,7 @@
 
 use std::str::FromStr;
 
-use super::value_axis::Scale;
+use super::value_axis::ValueScale;
 use super::{PlotError, names_of, panel_named};
 
 /// A stage of training.
@@ -177,10 +177,10 @@ impl TrainingPanel {
     }
 
     /// Returns how values become heights: losses differ by factors.
-    pub(super) fn scale(self) -> Scale {
+    pub(super) fn scale(self) -> ValueScale {
         match self {
-            Self::GradientNorm | Self::LearningRate => Scale::Linear,
-            _ => Scale::Log,
+            Self::GradientNorm | Self::LearningRate => ValueScale::Linear,
+            _ => ValueScale::Log,
         }
     }
 

@@ -4,14 +4,14 @@ use super::axis::{self, Tick, fixed};
 
 /// How values become heights.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Scale {
+pub(super) enum ValueScale {
     /// Even, from 0 or below.
     Linear,
     /// Each factor of ten as high as the next; for values above 0.
     Log,
 }
 
-impl Scale {
+impl ValueScale {
     /// Returns whether a value has a place on the scale.
     pub fn holds(self, value: f64) -> bool {
         value.is_finite() && (self == Self::Linear || value > 0.0)
@@ -38,7 +38,7 @@ const MAX_PLAIN_CHARS: usize = 6;
 /// A vertical axis from its foot to its head.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct ValueAxis {
-    scale: Scale,
+    scale: ValueScale,
     /// Ends; decimal logarithms of them on a log axis.
     low: f64,
     high: f64,
@@ -49,22 +49,22 @@ impl ValueAxis {
     pub fn linear(low: f64, high: f64) -> Self {
         let low = low.min(0.0);
         let high = if high > low && high > 0.0 { high } else { low + 1.0 };
-        Self { scale: Scale::Linear, low, high }
+        Self { scale: ValueScale::Linear, low, high }
     }
 
     /// Returns a log axis that has room around `low` and `high`, both above 0.
     pub fn log(low: f64, high: f64) -> Self {
         let (low, high) = (low.log10(), high.log10());
         let pad = (PAD_SHARE * (high - low)).max(MIN_PAD_DECADES);
-        Self { scale: Scale::Log, low: low - pad, high: high + pad }
+        Self { scale: ValueScale::Log, low: low - pad, high: high + pad }
     }
 
     /// Returns how far up the axis a value is, 0 at the foot and 1 at the head; values beyond the ends
     /// are at the ends.
     pub fn up(&self, value: f64) -> f64 {
         let place = match self.scale {
-            Scale::Linear => value,
-            Scale::Log => value.log10(),
+            ValueScale::Linear => value,
+            ValueScale::Log => value.log10(),
         };
         // Halves, since the difference of two numbers may be beyond the greatest.
         let above = |x: f64| x / 2.0 - self.low / 2.0;
@@ -75,12 +75,12 @@ impl ValueAxis {
     pub fn ticks(&self, height_px: f64) -> Vec<Tick> {
         let max_ticks = (height_px / (MIN_LABEL_PX + 2.0)).floor().max(2.0) as usize;
         match self.scale {
-            Scale::Linear => shortened(axis::ticks(self.low, self.high, max_ticks)),
-            Scale::Log => self.log_ticks(height_px, max_ticks),
+            ValueScale::Linear => shortened(axis::ticks(self.low, self.high, max_ticks)),
+            ValueScale::Log => self.log_ticks(height_px, max_ticks),
         }
     }
 
-    /// Returns 1, 2 and 5 times the powers of ten if these have room, else the powers or every so many
+    /// Returns 1, 2 and 5 times the powers of ten if these have room, else the powers or every nth
     /// of them; round numbers where the axis is too short for three of those.
     fn log_ticks(&self, height_px: f64, max_ticks: usize) -> Vec<Tick> {
         let fits = |ticks: &[Tick]| {
@@ -238,7 +238,7 @@ mod tests {
     #[test]
     fn scales_hold_what_they_can_show() {
         let values = [1.0, 0.0, -1.0, f64::NAN, f64::INFINITY];
-        assert_eq!(values.map(|v| Scale::Log.holds(v)), [true, false, false, false, false]);
-        assert_eq!(values.map(|v| Scale::Linear.holds(v)), [true, true, true, false, false]);
+        assert_eq!(values.map(|v| ValueScale::Log.holds(v)), [true, false, false, false, false]);
+        assert_eq!(values.map(|v| ValueScale::Linear.holds(v)), [true, true, true, false, false]);
     }
 }

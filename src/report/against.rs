@@ -4,10 +4,10 @@ use super::comparison::{Change, Pair, counts, family, pairs};
 use super::html::{Escaped, put};
 use super::names::{music, words};
 use super::numbers::{MISSING, difference, interval, value};
-use super::{Against, Metric, Report, ordered};
+use super::{ComparedRun, Metric, Report, ordered};
 
 /// Writes the section: settings that differ, numbers that differ, and folded away all others.
-pub(super) fn section(out: &mut String, report: &Report, against: &Against) {
+pub(super) fn section(out: &mut String, report: &Report, against: &ComparedRun) {
     let run = Escaped(&against.run);
     put!(out, "<section id=\"against\">\n<h2>Compared with {run}</h2>\n");
     settings(out, against);
@@ -31,7 +31,7 @@ pub(super) fn section(out: &mut String, report: &Report, against: &Against) {
     put!(out, "</section>\n");
 }
 
-fn settings(out: &mut String, against: &Against) {
+fn settings(out: &mut String, against: &ComparedRun) {
     if against.settings.is_empty() {
         put!(out, "<p>Both runs have the same settings.</p>\n");
         return;
@@ -54,7 +54,7 @@ fn settings(out: &mut String, against: &Against) {
     put!(out, "</tbody></table></div>\n");
 }
 
-fn table(out: &mut String, against: &Against, pairs: &[Pair]) {
+fn table(out: &mut String, against: &ComparedRun, pairs: &[Pair]) {
     put!(
         out,
         "<div class=\"scroll\"><table>\n<thead><tr><th scope=\"col\">metric</th><th scope=\"col\">{}</th>\
@@ -107,11 +107,11 @@ fn row(out: &mut String, pair: &Pair) {
 
 #[cfg(test)]
 mod tests {
-    use super::super::Paired;
+    use super::super::PairedNumber;
     use super::super::example::{metric, with_interval};
     use super::*;
 
-    fn told(here: Vec<Metric>, against: &Against) -> String {
+    fn told(here: Vec<Metric>, against: &ComparedRun) -> String {
         let mut out = String::new();
         section(&mut out, &Report { metrics: here, ..Report::default() }, against);
         out
@@ -119,15 +119,16 @@ mod tests {
 
     #[test]
     fn what_differs_is_seen_and_the_rest_is_folded_away() {
-        let of = |x: f64| with_interval(metric("generated", "all", "fid_k", "axes", Some(x)), x, x);
+        let fid_metric =
+            |x: f64| with_interval(metric("generated", "all", "fid_k", "axes", Some(x)), x, x);
         let jerk = |x| Metric {
             unit: "m/s³".to_owned(),
             ..metric("generated", "held_out", "jerk_mean", "", x)
         };
-        let against = Against {
+        let against = ComparedRun {
             run: "<old>".to_owned(),
-            metrics: vec![of(2.5), jerk(Some(3.0))],
-            paired: vec![Paired {
+            metrics: vec![fid_metric(2.5), jerk(Some(3.0))],
+            paired: vec![PairedNumber {
                 metric: "fid_k".to_owned(),
                 variant: "axes".to_owned(),
                 split: "all".to_owned(),
@@ -139,7 +140,7 @@ mod tests {
             }],
             settings: vec![("steps".to_owned(), "20".to_owned(), "<50>".to_owned())],
         };
-        let told = told(vec![of(1.5), jerk(Some(4.0))], &against);
+        let told = told(vec![fid_metric(1.5), jerk(Some(4.0))], &against);
         let (seen, folded) = told.split_once("<details>").expect("details");
         for wanted in [
             "<h2>Compared with &lt;old&gt;</h2>",
@@ -163,9 +164,14 @@ mod tests {
 
     #[test]
     fn without_pairs_nothing_is_called_better() {
-        let of = |x: f64| with_interval(metric("generated", "all", "fid_k", "axes", Some(x)), x, x);
-        let against = Against { run: "b".to_owned(), metrics: vec![of(9.5)], ..Against::default() };
-        let told = told(vec![of(1.5)], &against);
+        let fid_metric =
+            |x: f64| with_interval(metric("generated", "all", "fid_k", "axes", Some(x)), x, x);
+        let against = ComparedRun {
+            run: "b".to_owned(),
+            metrics: vec![fid_metric(9.5)],
+            ..ComparedRun::default()
+        };
+        let told = told(vec![fid_metric(1.5)], &against);
         assert!(told.contains("<p>No number is paired song by song, so that none is called"));
         assert!(told.contains("<p>Nothing is shown to differ.</p>"));
         assert!(!told.contains("good") && !told.contains(">better<"), "{told}");
@@ -173,7 +179,7 @@ mod tests {
 
     #[test]
     fn nothing_in_common_is_said_so() {
-        let told = told(Vec::new(), &Against { run: "b".to_owned(), ..Against::default() });
+        let told = told(Vec::new(), &ComparedRun { run: "b".to_owned(), ..ComparedRun::default() });
         assert_eq!(
             told,
             "<section id=\"against\">\n<h2>Compared with b</h2>\n<p>Both runs have the same settings.</p>\n\

@@ -16,13 +16,13 @@ const FOOT_PX: f64 = 16.0;
 const BAR_PX: f64 = 6.0;
 
 /// Writes the channels of one split as a figure with a bar for what was generated and one for held-out real
-/// motion; where neither has numbers, for whoever has.
+/// motion; where neither has numbers, for every subject that has.
 pub(super) fn bars(out: &mut String, rows: &[&Row], caption: &str) {
     let shown = shown(rows);
-    let of_shown = |row: &Row| -> Vec<Option<f64>> {
+    let shown_values = |row: &Row| -> Vec<Option<f64>> {
         shown.iter().map(|subject| row.of(subject).and_then(Metric::finite)).collect()
     };
-    let longest = rows.iter().flat_map(|row| of_shown(row)).flatten().fold(0.0, f64::max);
+    let longest = rows.iter().flat_map(|row| shown_values(row)).flatten().fold(0.0, f64::max);
     let room = WIDTH_PX - NAMES_PX - VALUES_PX;
     let length = |x: f64| if longest > 0.0 { (x / longest).max(0.0) * room } else { 0.0 };
     let bottom = rows.len() as f64 * ROW_PX;
@@ -54,7 +54,7 @@ pub(super) fn bars(out: &mut String, rows: &[&Row], caption: &str) {
             NAMES_PX - 6.0,
             Escaped(&words(row.variant))
         );
-        let values = of_shown(row);
+        let values = shown_values(row);
         for (j, (subject, value)) in shown.iter().zip(&values).enumerate() {
             let y = top + 2.0 + j as f64 * BAR_PX;
             put!(

@@ -15,8 +15,8 @@ const SIDE_PX: f64 = 5.0;
 const DOT_PX: f64 = 2.4;
 const OWN_DOT_PX: f64 = 3.4;
 
-/// Values of which the largest is so many times the smallest are on a scale of logarithms; beyond that the
-/// smallest is a zero that was rounded.
+/// Ratios of the largest value to the smallest for which the scale is logarithmic; beyond them the smallest is a
+/// zero that was rounded.
 const LOG_RATIOS: std::ops::Range<f64> = 30.0..1e9;
 /// Fewer values than this are no comparison.
 const MIN_VALUES: usize = 2;
@@ -193,14 +193,20 @@ mod tests {
 
     #[test]
     fn one_number_is_no_comparison_nor_are_equal_ones() {
-        let of = |x: Option<f64>| metric("generated", "all", "fid_k", "axes", x);
-        assert_eq!(chart(&[of(Some(1.0)), of(None), of(Some(f64::NAN))]), "");
-        assert_eq!(chart(&[of(Some(0.0)), of(Some(0.0))]), "");
-        let told = chart(&[of(Some(7.0)), with_interval(of(Some(7.0)), 6.0, 8.0)]);
+        let fid_metric = |x: Option<f64>| metric("generated", "all", "fid_k", "axes", x);
+        assert_eq!(
+            chart(&[fid_metric(Some(1.0)), fid_metric(None), fid_metric(Some(f64::NAN))]),
+            ""
+        );
+        assert_eq!(chart(&[fid_metric(Some(0.0)), fid_metric(Some(0.0))]), "");
+        let told = chart(&[fid_metric(Some(7.0)), with_interval(fid_metric(Some(7.0)), 6.0, 8.0)]);
         assert_eq!(told.matches("<circle cx=\"95.0\"").count(), 2, "{told}");
-        assert!(chart(&[of(Some(-1.0)), of(Some(1.0))]).contains("class=\"zero\" d=\"M95.0 "));
+        assert!(
+            chart(&[fid_metric(Some(-1.0)), fid_metric(Some(1.0))])
+                .contains("class=\"zero\" d=\"M95.0 ")
+        );
         // A rounded zero is no reason for fourteen decades.
-        assert!(!chart(&[of(Some(1e-14)), of(Some(1.0))]).contains("log"));
+        assert!(!chart(&[fid_metric(Some(1e-14)), fid_metric(Some(1.0))]).contains("log"));
     }
 
     #[test]

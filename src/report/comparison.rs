@@ -3,12 +3,12 @@
 use super::meaning::is_compat;
 use super::names::OWN;
 use super::rows::{Row, rows};
-use super::{Against, Better, Metric, Paired, Report};
+use super::{BetterDirection, ComparedRun, Metric, PairedNumber, Report};
 
 /// A paired difference with a lower p, adjusted by Holm, is not put down to chance.
 pub(super) const SIGNIFICANT_P: f64 = 0.05;
 
-/// What two numbers say of each other.
+/// The outcome of comparing two numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Change {
     Worse,
@@ -57,7 +57,7 @@ pub(super) struct Pair<'a> {
     pub there: &'a Metric,
     pub here: &'a Metric,
     /// The difference song by song, of a number that has it.
-    pub paired: Option<&'a Paired>,
+    pub paired: Option<&'a PairedNumber>,
     /// Here less there: the mean over songs where they are paired.
     pub difference: Option<f64>,
     pub change: Change,
@@ -77,7 +77,7 @@ impl Pair<'_> {
 
 /// Returns the numbers that both runs have: those that differ first, the worse before the better, and
 /// otherwise in the order of the tables.
-pub(super) fn pairs<'a>(report: &'a Report, against: &'a Against) -> Vec<Pair<'a>> {
+pub(super) fn pairs<'a>(report: &'a Report, against: &'a ComparedRun) -> Vec<Pair<'a>> {
     let there: Vec<Row> = rows(&against.metrics, &[OWN]);
     let counterpart = |here: &Row| {
         let key = |row: &Row<'a>| [row.metric, row.variant, row.split, row.unit];
@@ -87,7 +87,7 @@ pub(super) fn pairs<'a>(report: &'a Report, against: &'a Against) -> Vec<Pair<'a
         found.cells[0]
     };
     let paired = |here: &Metric| {
-        let is_it = |paired: &&Paired| {
+        let is_it = |paired: &&PairedNumber| {
             paired.metric == here.metric
                 && paired.variant == here.variant
                 && paired.split == here.split
@@ -105,7 +105,7 @@ pub(super) fn pairs<'a>(report: &'a Report, against: &'a Against) -> Vec<Pair<'a
     pairs
 }
 
-fn pair<'a>(there: &'a Metric, here: &'a Metric, paired: Option<&'a Paired>) -> Pair<'a> {
+fn pair<'a>(there: &'a Metric, here: &'a Metric, paired: Option<&'a PairedNumber>) -> Pair<'a> {
     let (Some(a), Some(b)) = (there.finite(), here.finite()) else {
         let change = Change::NotMeasured;
         return Pair { there, here, paired: None, difference: None, change };
@@ -116,15 +116,15 @@ fn pair<'a>(there: &'a Metric, here: &'a Metric, paired: Option<&'a Paired>) -> 
         None => Change::NotPaired,
         Some(paired) if difference == 0.0 || !is_significant(paired) => Change::NotShown,
         Some(_) => match (here.better, difference > 0.0) {
-            (Better::Neither, _) => Change::Differs,
-            (Better::Higher, true) | (Better::Lower, false) => Change::Better,
-            (Better::Higher, false) | (Better::Lower, true) => Change::Worse,
+            (BetterDirection::Neither, _) => Change::Differs,
+            (BetterDirection::Higher, true) | (BetterDirection::Lower, false) => Change::Better,
+            (BetterDirection::Higher, false) | (BetterDirection::Lower, true) => Change::Worse,
         },
     };
     Pair { there, here, paired, difference: Some(difference), change }
 }
 
-fn is_significant(paired: &Paired) -> bool {
+fn is_significant(paired: &PairedNumber) -> bool {
     paired.p_holm.is_some_and(|p| p < SIGNIFICANT_P)
 }
 
@@ -145,7 +145,7 @@ pub(super) fn counts(pairs: &[Pair]) -> String {
 }
 
 /// Returns what the words of a comparison rest on.
-pub(super) fn family(against: &Against) -> String {
+pub(super) fn family(against: &ComparedRun) -> String {
     let n = against.paired.iter().filter(|paired| paired.p_holm.is_some()).count();
     match n {
         0 => "No number is paired song by song, so that none is called better or worse".to_owned(),
@@ -169,14 +169,14 @@ mod tests {
         metric("generated", "all", name, "", Some(value))
     }
 
-    fn by_song(name: &str, difference: f64, p_holm: Option<f64>) -> Paired {
-        Paired {
+    fn by_song(name: &str, difference: f64, p_holm: Option<f64>) -> PairedNumber {
+        PairedNumber {
             metric: name.to_owned(),
             split: "all".to_owned(),
             difference,
             p_holm,
             n_songs: 7,
-            ..Paired::default()
+            ..PairedNumber::default()
         }
     }
 
@@ -238,17 +238,20 @@ mod tests {
             metric("shuffled", "all", "locking_r2", "", Some(0.7)),
         ];
         let report = Report { metrics: here, ..Report::default() };
-        let elsewhere = Paired { split: "held_out".to_owned(), ..by_song("jerk_p95", 1.0, None) };
-        let compat =
-            Paired { variant: "axes_compat".to_owned(), ..by_song("fid_k", -0.4, Some(0.01)) };
+        let elsewhere =
+            PairedNumber { split: "held_out".to_owned(), ..by_song("jerk_p95", 1.0, None) };
+        let compat = PairedNumber {
+            variant: "axes_compat".to_owned(),
+            ..by_song("fid_k", -0.4, Some(0.01))
+        };
         let paired = vec![
             by_song("fid_g", -0.4, Some(0.01)),
             by_song("pass_rate", -0.4, Some(0.02)),
-            Paired { p_holm: Some(0.01), ..elsewhere },
+            PairedNumber { p_holm: Some(0.01), ..elsewhere },
             by_song("locking_r2", 0.0, None),
             compat,
         ];
-        let against = Against { metrics: there, paired, ..Against::default() };
+        let against = ComparedRun { metrics: there, paired, ..ComparedRun::default() };
         let pairs = pairs(&report, &against);
         let found: Vec<_> = pairs.iter().map(|p| (p.here.metric.as_str(), p.change)).collect();
         let wanted = [
@@ -265,7 +268,7 @@ mod tests {
             "4 numbers are compared song by song, and p is Holm's over all of them; one is called better, \
              worse or different only where p is below 0.05"
         );
-        let none = Against::default();
+        let none = ComparedRun::default();
         assert!(family(&none).ends_with("so that none is called better or worse"));
     }
 }

@@ -1,7 +1,8 @@
 //! A small report, and parts of others, for tests.
 
 use super::{
-    Against, CheckLine, Metric, Outcome, Paired, Report, Verdict, VerdictTest, Worst, better,
+    CheckLine, ComparedRun, Metric, Outcome, PairedNumber, Report, Verdict, VerdictTest,
+    WorstMotion, better,
 };
 
 /// Returns a number without an interval, of a hundred things.
@@ -67,7 +68,7 @@ pub(super) fn verdict(
 
 /// Returns the verdicts on motion that tumbles: one lost, two open and one won.
 fn verdicts() -> Vec<Verdict> {
-    let of =
+    let verdict_test =
         |name: &str, outcome, value: f64, (low, high), (rule, limit): (&str, f64)| VerdictTest {
             ci_low: Some(low),
             ci_high: Some(high),
@@ -81,39 +82,39 @@ fn verdicts() -> Vec<Verdict> {
         message:
             "0.31 of the windows are as upright as training motion; held-out real motion has 0.97."
                 .to_owned(),
-        ..of("upright", Outcome::Lost, 0.31, (0.24, 0.39), ("at least", 0.92))
+        ..verdict_test("upright", Outcome::Lost, 0.31, (0.24, 0.39), ("at least", 0.92))
     };
     let jerk = VerdictTest {
         statistic: "jerk over that of real motion".to_owned(),
         against: "held-out real motion 1.02".to_owned(),
         message: "The jerk is 4.1 times that of real motion, at most 1.5 is asked.".to_owned(),
-        ..of("jerk", Outcome::Lost, 4.1, (3.75, 4.5), ("at most", 1.5))
+        ..verdict_test("jerk", Outcome::Lost, 4.1, (3.75, 4.5), ("at most", 1.5))
     };
     let height = VerdictTest {
         statistic: "share of the windows that are as high as training motion".to_owned(),
         against: "held-out real motion 0.95".to_owned(),
         message: "0.94 of the windows are as high as training motion.".to_owned(),
-        ..of("height", Outcome::Won, 0.94, (0.91, 0.97), ("at least", 0.9))
+        ..verdict_test("height", Outcome::Won, 0.94, (0.91, 0.97), ("at least", 0.9))
     };
     let other_music = VerdictTest {
         statistic: "probability of as strong a coupling with the music of other songs".to_owned(),
         against: "the same motions with the music of other songs 0.02".to_owned(),
         message: "Coupling is above that with other music: p 0.004, below 0.05 is asked."
             .to_owned(),
-        ..of("other_music", Outcome::Won, 0.004, (0.002, 0.008), ("below", 0.05))
+        ..verdict_test("other_music", Outcome::Won, 0.004, (0.002, 0.008), ("below", 0.05))
     };
     let untrained = VerdictTest {
         statistic: "coupling less that of the untrained network".to_owned(),
         value: None,
         message: "4 songs are too few to hold it against the untrained network; 6 are needed."
             .to_owned(),
-        ..of("untrained", Outcome::Open, 0.0, (0.0, 0.0), ("above", 0.0))
+        ..verdict_test("untrained", Outcome::Open, 0.0, (0.0, 0.0), ("above", 0.0))
     };
     let spread = VerdictTest {
         statistic: "diversity over that of held-out real motion".to_owned(),
         against: "held-out real motion 1".to_owned(),
         message: "Motions differ as much as real ones: 0.97 of their distance.".to_owned(),
-        ..of("diversity", Outcome::Won, 0.97, (0.93, 1.04), ("at least", 0.8))
+        ..verdict_test("diversity", Outcome::Won, 0.97, (0.93, 1.04), ("at least", 0.8))
     };
     vec![
         verdict("varied", "held_out", Outcome::Won, vec![spread]),
@@ -161,19 +162,19 @@ pub(super) fn example() -> Report {
             metric("generated", "held_out", "diversity", "axes", Some(3.0)),
             Metric { unit: "m/s³".to_owned(), ..jerk },
         ],
-        worst: vec![Worst {
+        worst: vec![WorstMotion {
             name: "song 3".to_owned(),
             facts: vec![("seed".to_owned(), "7".to_owned())],
             failed: vec!["Mean jerk: 512".to_owned()],
             svg: "<svg xmlns=\"http://www.w3.org/2000/svg\"/>".to_owned(),
         }],
-        against: Some(Against {
+        against: Some(ComparedRun {
             run: "before".to_owned(),
             metrics: vec![
                 with_interval(fid_k("generated", 3.5), 3.25, 3.75),
                 locked("generated", "locking_p", 0.25),
             ],
-            paired: vec![Paired {
+            paired: vec![PairedNumber {
                 metric: "fid_k".to_owned(),
                 variant: "axes".to_owned(),
                 split: "held_out".to_owned(),

@@ -1,7 +1,7 @@
 //! What the metrics mean, and under which heading they stand: the one place that knows.
 
-use super::Better;
-use Better::{Higher, Lower, Neither};
+use super::BetterDirection;
+use BetterDirection::{Higher, Lower, Neither};
 use Section::{Asked, Music, Other, Real, Sound, Varied};
 
 /// A question that numbers answer, and that of the verdicts which rest on them.
@@ -47,15 +47,15 @@ impl Section {
 pub(super) const VERDICTS: [(&str, Section); 4] =
     [("sound", Sound), ("like_real", Real), ("follows_music", Music), ("varied", Varied)];
 
-/// What a metric means.
+/// The meaning of a metric.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Meaning {
     pub metric: &'static str,
     pub section: Section,
-    pub better: Better,
-    /// What is measured.
+    pub better: BetterDirection,
+    /// The measured quantity.
     pub text: &'static str,
-    /// What chance gives, or what is perfect.
+    /// The value by chance, or the perfect one.
     pub ideal: &'static str,
 }
 
@@ -190,7 +190,7 @@ const MEANINGS: [Meaning; 44] = [
 const fn of(
     metric: &'static str,
     section: Section,
-    better: Better,
+    better: BetterDirection,
     text: &'static str,
     ideal: &'static str,
 ) -> Meaning {
@@ -226,7 +226,7 @@ pub(super) fn is_compat(variant: &str) -> bool {
 }
 
 /// Returns which way a metric is better; neither for one that is not known.
-pub fn better(metric: &str) -> Better {
+pub fn better(metric: &str) -> BetterDirection {
     meaning_of(metric).better
 }
 

@@ -68,7 +68,7 @@ pub struct VerdictTest {
     /// Its name in tables, such as `other_music`.
     pub test: String,
     pub outcome: Outcome,
-    /// What is measured, in words.
+    /// The measured statistic, in words.
     pub statistic: String,
     /// None where there is too little to tell; such a test is not shown as won.
     pub value: Option<f64>,
@@ -85,7 +85,7 @@ pub struct VerdictTest {
     pub message: String,
 }
 
-/// What tests say together of one question about a run.
+/// The answer of several tests to one question about a run.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Verdict {
     /// `sound`, `like_real`, `follows_music` or `varied`.
@@ -99,7 +99,7 @@ pub struct Verdict {
 
 /// Which way a number is better.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Better {
+pub enum BetterDirection {
     Higher,
     Lower,
     /// Neither: where the nearest to real motion is best, and where a number is there to read others by.
@@ -110,7 +110,7 @@ pub enum Better {
 /// One measured number, as the table `metrics` has it.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Metric {
-    /// Whose number it is: `generated`, or what it is compared with, such as `held_out_truth`.
+    /// The subject that was measured: `generated`, or what it is compared with, such as `held_out_truth`.
     pub subject: String,
     /// Which music: `all`, `held_out`, `validation`, `trained_on` or `unknown`.
     pub split: String,
@@ -123,12 +123,12 @@ pub struct Metric {
     /// Ends of its 95 % interval.
     pub ci_low: Option<f64>,
     pub ci_high: Option<f64>,
-    /// What was counted.
+    /// How many items were measured.
     pub n: i64,
     /// How it was measured.
     pub protocol: String,
     /// What [`better`] says of the metric, or what is known of one that it does not know.
-    pub better: Better,
+    pub better: BetterDirection,
 }
 
 impl Metric {
@@ -175,7 +175,7 @@ pub struct CheckLine {
 
 /// A motion worth looking at.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Worst {
+pub struct WorstMotion {
     pub name: String,
     /// Names and values, in the order in which they are listed.
     pub facts: Vec<(String, String)>,
@@ -187,7 +187,7 @@ pub struct Worst {
 
 /// A number of what was generated in both runs, compared song by song.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Paired {
+pub struct PairedNumber {
     pub metric: String,
     pub variant: String,
     pub split: String,
@@ -204,16 +204,16 @@ pub struct Paired {
 
 /// Another run to compare with.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Against {
+pub struct ComparedRun {
     pub run: String,
     pub metrics: Vec<Metric>,
     /// Differences of the numbers that could be paired by song.
-    pub paired: Vec<Paired>,
+    pub paired: Vec<PairedNumber>,
     /// Settings that differ: name, there, here.
     pub settings: Vec<(String, String, String)>,
 }
 
-/// What a report tells.
+/// The content of a report.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Report {
     pub title: String,
@@ -225,6 +225,6 @@ pub struct Report {
     pub notes: Vec<String>,
     pub checks: Vec<CheckLine>,
     pub metrics: Vec<Metric>,
-    pub worst: Vec<Worst>,
-    pub against: Option<Against>,
+    pub worst: Vec<WorstMotion>,
+    pub against: Option<ComparedRun>,
 }

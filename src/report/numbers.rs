@@ -1,6 +1,6 @@
 //! How numbers are written: three significant figures, and ASCII alone, so that they can be copied.
 
-/// What stands for a number that is not there.
+/// The text in place of a number that is missing.
 pub(super) const MISSING: &str = "–";
 
 /// Exponents of ten of the numbers that are written out.

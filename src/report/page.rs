@@ -4,7 +4,7 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 
 use super::html::{Escaped, put};
-use super::{Report, Worst, against, panel, sanity, tables};
+use super::{Report, WorstMotion, against, panel, sanity, tables};
 
 /// The page, with slots such as `{{title}}`.
 const TEMPLATE: &str = include_str!("page.html");
@@ -73,7 +73,7 @@ fn links(out: &mut String, report: &Report) {
     }
 }
 
-fn worst(out: &mut String, motions: &[Worst]) {
+fn worst(out: &mut String, motions: &[WorstMotion]) {
     if motions.is_empty() {
         return;
     }
@@ -97,7 +97,7 @@ fn worst(out: &mut String, motions: &[Worst]) {
 }
 
 /// Writes the picture as an image, in which nothing can run or be asked of a network.
-fn picture(out: &mut String, motion: &Worst) {
+fn picture(out: &mut String, motion: &WorstMotion) {
     if motion.svg.is_empty() {
         return;
     }
@@ -114,7 +114,8 @@ mod tests {
     use super::super::example::{example, metric, with_interval};
     use super::super::names::SUBJECTS;
     use super::super::{
-        Against, BY_CONSTRUCTION, CheckLine, Metric, Outcome, Paired, Verdict, VerdictTest,
+        BY_CONSTRUCTION, CheckLine, ComparedRun, Metric, Outcome, PairedNumber, Verdict,
+        VerdictTest,
     };
     use super::*;
 
@@ -168,13 +169,18 @@ mod tests {
         let mut report = example();
         for (i, (subject, _)) in SUBJECTS.into_iter().enumerate() {
             let x = 0.1 + 0.1 * i as f64;
-            let of = |name, value| metric(subject, "held_out", name, "", value);
-            let coupled = with_interval(of("coupling_ratio", Some(x)), x - 0.05, x + 0.05);
+            let held_out_metric = |name, value| metric(subject, "held_out", name, "", value);
+            let coupled =
+                with_interval(held_out_metric("coupling_ratio", Some(x)), x - 0.05, x + 0.05);
             let relocked = Metric {
                 protocol: format!("the phase was relocked, {BY_CONSTRUCTION}"),
-                ..of("phase_error", None)
+                ..held_out_metric("phase_error", None)
             };
-            report.metrics.extend([coupled, relocked, of("share_upright", Some(1.1 - x))]);
+            report.metrics.extend([
+                coupled,
+                relocked,
+                held_out_metric("share_upright", Some(1.1 - x)),
+            ]);
         }
         std::fs::write(file, page(&report)).expect("written");
     }
@@ -263,20 +269,20 @@ mod tests {
                 ..CheckLine::default()
             }],
             metrics: metrics.clone(),
-            worst: vec![Worst {
+            worst: vec![WorstMotion {
                 name: own(),
                 facts: vec![(own(), own())],
                 failed: vec![own()],
                 svg: own(),
             }],
-            against: Some(Against {
+            against: Some(ComparedRun {
                 run: own(),
-                paired: vec![Paired {
+                paired: vec![PairedNumber {
                     metric: own(),
                     variant: own(),
                     split: own(),
                     difference: 1.0,
-                    ..Paired::default()
+                    ..PairedNumber::default()
                 }],
                 metrics,
                 settings: vec![(own(), own(), own())],

@@ -3,7 +3,7 @@
 use super::html::{Escaped, put};
 use super::names::words;
 use super::numbers::{MISSING, interval};
-use super::verdicts::{Shown, measured, shown};
+use super::verdicts::{VerdictView, measured, shown};
 use super::{Outcome, Report, VerdictTest, ordered};
 
 /// Writes the verdicts, lost ones first, and the caveats below them.
@@ -22,7 +22,7 @@ pub(super) fn section(out: &mut String, report: &Report) {
     put!(out, "</section>\n");
 }
 
-fn one(out: &mut String, verdict: &Shown) {
+fn one(out: &mut String, verdict: &VerdictView) {
     put!(out, "<article class=\"verdict {}\">\n<h2>", verdict.outcome.name());
     badge(out, verdict.outcome);
     put!(out, " {}", Escaped(&verdict.question));

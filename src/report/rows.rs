@@ -2,7 +2,7 @@
 
 use super::meaning::{self, is_asked, is_compat};
 use super::names::{self, ALL, HELD_OUT, OWN, is_truth};
-use super::{Better, Metric};
+use super::{BetterDirection, Metric};
 
 /// A number of every subject.
 #[derive(Clone, Debug, PartialEq)]
@@ -16,8 +16,8 @@ pub(super) struct Row<'a> {
 }
 
 impl Row<'_> {
-    pub fn better(&self) -> Better {
-        self.cells.iter().flatten().next().map_or(Better::Neither, |metric| metric.better)
+    pub fn better(&self) -> BetterDirection {
+        self.cells.iter().flatten().next().map_or(BetterDirection::Neither, |metric| metric.better)
     }
 
     pub fn is_compat(&self) -> bool {
@@ -106,7 +106,7 @@ fn lend_truths(rows: &mut Vec<Row>) {
 
 /// Sorts by metric, variant and split; what is not known stays as it comes.
 fn sort(rows: &mut [Row], metrics: &[Metric]) {
-    let first = |of: &dyn Fn(&Metric) -> bool| metrics.iter().position(of);
+    let first = |is_match: &dyn Fn(&Metric) -> bool| metrics.iter().position(is_match);
     rows.sort_by_cached_key(|row| {
         (
             meaning::order(row.metric),
@@ -128,21 +128,21 @@ pub(super) fn find<'a>(
     [metric, variant]: [&str; 2],
     split: &str,
 ) -> Option<&'a Metric> {
-    let of = || {
+    let candidates = || {
         metrics
             .iter()
             .filter(move |m| m.subject == subject && m.metric == metric && m.variant == variant)
     };
-    of().find(|m| m.split == split).or_else(|| of().next())
+    candidates().find(|m| m.split == split).or_else(|| candidates().next())
 }
 
 /// Returns the split of which a number of what was generated is told first: of those that there are, the
 /// music that the model learned least from.
 pub(super) fn telling_split<'a>(metrics: &'a [Metric], [metric, variant]: [&str; 2]) -> &'a str {
     let is_it = |m: &&Metric| m.subject == OWN && m.metric == metric && m.variant == variant;
-    let of = || metrics.iter().filter(is_it).map(|metric| metric.split.as_str());
-    let first = TELLING.into_iter().find_map(|wanted| of().find(|split| *split == wanted));
-    first.or_else(|| of().next()).unwrap_or(ALL)
+    let splits = || metrics.iter().filter(is_it).map(|metric| metric.split.as_str());
+    let first = TELLING.into_iter().find_map(|wanted| splits().find(|split| *split == wanted));
+    first.or_else(|| splits().next()).unwrap_or(ALL)
 }
 
 #[cfg(test)]
@@ -236,11 +236,15 @@ mod tests {
         assert_eq!(telling_split(&metrics, ["fid_g", ""]), "held_out");
         assert_eq!(telling_split(&metrics, ["diversity", "axes"]), "all");
         assert_eq!(telling_split(&metrics, ["fid_k", "axes"]), "all");
-        let of = |split: &str| metric("generated", split, "fid_g", "", Some(1.0));
-        assert_eq!(telling_split(&[of("all"), of("unknown"), of("validation")], ["fid_g", ""]), {
-            "validation"
-        });
-        assert_eq!(telling_split(&[of("trained_on")], ["fid_g", ""]), "trained_on");
+        let fid_metric = |split: &str| metric("generated", split, "fid_g", "", Some(1.0));
+        assert_eq!(
+            telling_split(
+                &[fid_metric("all"), fid_metric("unknown"), fid_metric("validation")],
+                ["fid_g", ""]
+            ),
+            { "validation" }
+        );
+        assert_eq!(telling_split(&[fid_metric("trained_on")], ["fid_g", ""]), "trained_on");
         let found = find(&metrics, "generated", ["fid_g", ""], "all").map(|m| m.value);
         assert_eq!(found, Some(Some(1.0)));
     }

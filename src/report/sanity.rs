@@ -20,7 +20,7 @@ const BAR_PX: f64 = 90.0;
 
 /// How many motions passed every check of a set.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Passed {
+pub(super) enum PassCount {
     Exactly {
         n_passed: usize,
         n: usize,
@@ -35,13 +35,13 @@ pub(super) enum Passed {
     NotMeasured,
 }
 
-impl Passed {
+impl PassCount {
     /// Looks for the pass rate of all motions, `strict_raw` of a set at a stage and `strict` of what it
     /// became in the end, then at the checks of the set that could have failed.
     pub fn of(report: &Report, stage: &str, set: &str) -> Self {
-        let of_stage = format!("{set}_{stage}");
+        let stage_variant = format!("{set}_{stage}");
         let named = |variant: &str| find(&report.metrics, OWN, ["pass_rate", variant], ALL);
-        let rate = named(&of_stage).or_else(|| named(set).filter(|_| stage == FINAL));
+        let rate = named(&stage_variant).or_else(|| named(set).filter(|_| stage == FINAL));
         if let Some((rate, n)) = rate.and_then(|metric| Some((metric.finite()?, metric.n))) {
             let n_passed = (rate * n as f64).round();
             return Self::Exactly {
@@ -66,13 +66,13 @@ impl Passed {
 
     /// Returns it in a few words: `118 of 120 (98.3 %)`.
     pub fn words(self) -> String {
-        let of = |n_passed: usize, n: usize| match n {
+        let share_text = |n_passed: usize, n: usize| match n {
             0 => format!("{n_passed} of {n}"),
             _ => format!("{n_passed} of {n} ({})", percent(n_passed as f64 / n as f64)),
         };
         match self {
-            Self::Exactly { n_passed, n } => of(n_passed, n),
-            Self::AtMost { n_passed, n } => format!("at most {}", of(n_passed, n)),
+            Self::Exactly { n_passed, n } => share_text(n_passed, n),
+            Self::AtMost { n_passed, n } => format!("at most {}", share_text(n_passed, n)),
             Self::ByConstruction => format!("all are true {BY_CONSTRUCTION}"),
             Self::NotMeasured => "not measured".to_owned(),
         }
@@ -148,7 +148,7 @@ pub(super) fn section(out: &mut String, report: &Report) {
                  says</th></tr></thead>\n<tbody>\n",
                 Escaped(&capitalized(set)),
                 Escaped(&words(stage)),
-                Escaped(&Passed::of(report, stage, set).words())
+                Escaped(&PassCount::of(report, stage, set).words())
             );
             for line in lines(report, stage, set) {
                 row(out, line);
@@ -210,7 +210,7 @@ mod tests {
     use super::*;
 
     fn passed(report: &Report, set: &str) -> String {
-        Passed::of(report, "final", set).words()
+        PassCount::of(report, "final", set).words()
     }
 
     #[test]
@@ -227,17 +227,17 @@ mod tests {
         assert_eq!(passed(&report, "reference"), "9 of 10 (90 %)");
         assert_eq!(passed(&report, "strict"), "at most 4 of 10 (40 %)");
         assert_eq!(passed(&report, "other"), "not measured");
-        let of = |split: &str, rate: f64, n: i64| Metric {
+        let pass_rate = |split: &str, rate: f64, n: i64| Metric {
             n,
             ..metric("generated", split, "pass_rate", "strict", Some(rate))
         };
-        report.metrics = vec![of("held_out", 0.5, 4), of("all", 0.3, 10)];
+        report.metrics = vec![pass_rate("held_out", 0.5, 4), pass_rate("all", 0.3, 10)];
         assert_eq!(passed(&report, "strict"), "3 of 10 (30 %)");
         // The rate of what came out in the end says nothing of what was decoded.
-        assert_eq!(Passed::of(&report, "raw", "strict"), Passed::NotMeasured);
+        assert_eq!(PassCount::of(&report, "raw", "strict"), PassCount::NotMeasured);
         let rate = metric("generated", "all", "pass_rate", "strict_raw", Some(0.25));
         report.metrics.push(Metric { n: 8, ..rate });
-        assert_eq!(Passed::of(&report, "raw", "strict").words(), "2 of 8 (25 %)");
+        assert_eq!(PassCount::of(&report, "raw", "strict").words(), "2 of 8 (25 %)");
         assert_eq!(passed(&report, "strict"), "3 of 10 (30 %)");
     }
 
@@ -280,7 +280,7 @@ mod tests {
         assert_eq!(stages(&checks), ["raw", "final", "draft"]);
         let report = Report { checks, ..Report::default() };
         let passed = ["raw", "final", "draft", "other"]
-            .map(|stage| Passed::of(&report, stage, "strict").words());
+            .map(|stage| PassCount::of(&report, stage, "strict").words());
         assert_eq!(
             passed,
             ["2 of 9 (22.2 %)", "8 of 9 (88.9 %)", "1 of 9 (11.1 %)", "not measured"]

@@ -5,9 +5,9 @@ use super::meaning::{CHANNELS, Section, meaning_of};
 use super::names::{self, music, words};
 use super::numbers::{MISSING, interval, value};
 use super::rows::{Row, rows, subjects};
-use super::{BY_CONSTRUCTION, Better, Metric, Report, channels, chart};
+use super::{BY_CONSTRUCTION, BetterDirection, Metric, Report, channels, chart};
 
-/// What is said over variants that reproduce a published formula.
+/// The note on variants that reproduce a published formula.
 const COMPAT: &str = "These reproduce a published formula that has a defect, a misplaced parenthesis in \
                       its acceleration, and are only for comparison with published numbers.";
 
@@ -32,11 +32,11 @@ pub(super) fn metrics(out: &mut String, report: &Report) {
     legend(out, &subjects);
     let rows = rows(&report.metrics, &subjects);
     for section in sections(report) {
-        let of_section: Vec<&Row> =
+        let section_rows: Vec<&Row> =
             rows.iter().filter(|row| meaning_of(row.metric).section == section).collect();
         put!(out, "<section id=\"{}\">\n<h2>{}</h2>\n", section.id(), section.heading());
         let (channels, numbers): (Vec<&Row>, Vec<&Row>) =
-            of_section.into_iter().partition(|row| row.metric == CHANNELS);
+            section_rows.into_iter().partition(|row| row.metric == CHANNELS);
         let (compat, plain): (Vec<&Row>, Vec<&Row>) =
             numbers.into_iter().partition(|row| row.is_compat());
         table(out, &plain, &subjects);
@@ -104,9 +104,9 @@ fn table(out: &mut String, rows: &[&Row], subjects: &[&str]) {
 fn heading(out: &mut String, row: &Row, n_columns: usize) {
     let meaning = meaning_of(row.metric);
     let way = match row.better() {
-        Better::Higher => "<em>↑ higher is better</em>",
-        Better::Lower => "<em>↓ lower is better</em>",
-        Better::Neither => "",
+        BetterDirection::Higher => "<em>↑ higher is better</em>",
+        BetterDirection::Lower => "<em>↓ lower is better</em>",
+        BetterDirection::Neither => "",
     };
     put!(
         out,
@@ -187,8 +187,8 @@ fn channel_figures(out: &mut String, rows: &[&Row]) {
         meaning.ideal
     );
     for split in splits {
-        let of_split: Vec<&Row> = rows.iter().copied().filter(|row| row.split == split).collect();
-        channels::bars(out, &of_split, &music(split));
+        let split_rows: Vec<&Row> = rows.iter().copied().filter(|row| row.split == split).collect();
+        channels::bars(out, &split_rows, &music(split));
     }
     put!(out, "</div>\n");
 }

@@ -6,9 +6,9 @@ use super::comparison::{Pair, counts, family, pairs};
 use super::names::{ALL, music, words};
 use super::numbers::{difference, short, value};
 use super::rows::{Row, rows, subjects, telling_split};
-use super::sanity::{FINAL, Passed, SETS, lines, sets, stages};
+use super::sanity::{FINAL, PassCount, SETS, lines, sets, stages};
 use super::verdicts::shown;
-use super::{Against, BY_CONSTRUCTION, CheckLine, Outcome, Report};
+use super::{BY_CONSTRUCTION, CheckLine, ComparedRun, Outcome, Report};
 
 /// No line has more characters.
 const MAX_COLUMNS: usize = 120;
@@ -77,7 +77,7 @@ fn sanity(out: &mut String, report: &Report) {
         all.push(FINAL);
     }
     for stage in all {
-        let [reference, strict] = SETS.map(|set| Passed::of(report, stage, set).words());
+        let [reference, strict] = SETS.map(|set| PassCount::of(report, stage, set).words());
         put_line(
             out,
             format_args!("sanity, {stage} motion: reference {reference}, strict {strict}"),
@@ -137,7 +137,7 @@ fn key_row<'a>(
     rows: &'a [Row<'a>],
     [metric, variant]: [&str; 2],
 ) -> Option<&'a Row<'a>> {
-    let of = |variant: &str| {
+    let row_of_variant = |variant: &str| {
         let split = match metric {
             "pass_rate" => ALL,
             _ => telling_split(&report.metrics, [metric, variant]),
@@ -147,10 +147,10 @@ fn key_row<'a>(
         found.clone().find(|row| row.split == split).or_else(|| found.next())
     };
     let other = || rows.iter().find(|row| row.metric == metric && !row.is_compat());
-    of(variant).or_else(|| match metric {
+    row_of_variant(variant).or_else(|| match metric {
         // Sets of checks are not variants of one number.
         "pass_rate" => None,
-        _ => of(other()?.variant),
+        _ => row_of_variant(other()?.variant),
     })
 }
 
@@ -160,11 +160,12 @@ fn table(out: &mut String, lines: &[Vec<String>]) {
     let width = |i: usize| lines.iter().map(|line| line[i].chars().count()).max().unwrap_or(0);
     let mut widths: Vec<usize> = (0..n_cells).map(width).collect();
     let Some(names) = widths.first().copied() else { return };
-    let of_values = |widths: &[usize]| widths[1..].iter().map(|n| n + GAP.len()).sum::<usize>();
-    while widths.len() > 2 && names.min(MIN_NAME_COLUMNS) + of_values(&widths) > MAX_COLUMNS {
+    let width_of_values =
+        |widths: &[usize]| widths[1..].iter().map(|n| n + GAP.len()).sum::<usize>();
+    while widths.len() > 2 && names.min(MIN_NAME_COLUMNS) + width_of_values(&widths) > MAX_COLUMNS {
         widths.pop();
     }
-    widths[0] = names.min(MAX_COLUMNS.saturating_sub(of_values(&widths)));
+    widths[0] = names.min(MAX_COLUMNS.saturating_sub(width_of_values(&widths)));
     for line in lines {
         let mut text = format!("{:<1$}", fitted(&line[0], widths[0]), widths[0]);
         for (cell, width) in line.iter().zip(&widths).skip(1) {
@@ -178,7 +179,7 @@ fn table(out: &mut String, lines: &[Vec<String>]) {
     }
 }
 
-fn compared(out: &mut String, report: &Report, against: &Against) {
+fn compared(out: &mut String, report: &Report, against: &ComparedRun) {
     let pairs = pairs(report, against);
     out.push('\n');
     if pairs.is_empty() {
@@ -239,8 +240,8 @@ fn put_wrapped(out: &mut String, text: &str) {
 
 /// Returns a text from outside with replacement characters for what would command a terminal.
 fn inert(text: &str) -> String {
-    let of = |c: char| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c };
-    text.chars().map(of).collect()
+    let inert_character = |c: char| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c };
+    text.chars().map(inert_character).collect()
 }
 
 /// Returns a text of at most `n` characters, with `…` for what is cut off.
@@ -349,10 +350,10 @@ open  Is it like real motion? not measured
         let lost = VerdictTest { message: long.clone(), ..test(&long, Outcome::Lost, 1.0, 0.5) };
         report.verdicts = vec![verdict(&long, &long, Outcome::Lost, vec![lost])];
         report.notes = vec![long.clone()];
-        report.against = Some(Against {
+        report.against = Some(ComparedRun {
             run: long.clone(),
             settings: vec![(long.clone(), long.clone(), long)],
-            ..Against::default()
+            ..ComparedRun::default()
         });
         let text = terminal(&report);
         let lengths: Vec<usize> = text.lines().map(|line| line.chars().count()).collect();
@@ -380,7 +381,7 @@ open  Is it like real motion? not measured
                 unit: hostile.to_owned(),
                 ..metric(hostile, "all", "fid_k", hostile, Some(1.0))
             }],
-            against: Some(Against { run: hostile.to_owned(), ..Against::default() }),
+            against: Some(ComparedRun { run: hostile.to_owned(), ..ComparedRun::default() }),
             ..Report::default()
         };
         let text = terminal(&report);

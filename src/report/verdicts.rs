@@ -75,7 +75,7 @@ impl Verdict {
 
 /// A verdict as it is shown.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Shown<'a> {
+pub(super) struct VerdictView<'a> {
     pub outcome: Outcome,
     /// The question in plain words.
     pub question: String,
@@ -84,7 +84,7 @@ pub(super) struct Shown<'a> {
     pub tests: &'a [VerdictTest],
 }
 
-impl<'a> Shown<'a> {
+impl<'a> VerdictView<'a> {
     fn of(verdict: &'a Verdict) -> Self {
         Self {
             outcome: verdict.settled(),
@@ -143,20 +143,19 @@ fn question(verdict: &str) -> String {
 
 /// Returns the verdicts in the order in which they are shown; of those that every run has, a missing one is
 /// open.
-pub(super) fn shown(report: &Report) -> Vec<Shown<'_>> {
+pub(super) fn shown(report: &Report) -> Vec<VerdictView<'_>> {
     let order = |name: &str| {
         VERDICTS.iter().position(|(known, _)| *known == name).unwrap_or(VERDICTS.len())
     };
     let is_missing = |name: &&str| report.verdicts.iter().all(|found| found.verdict != **name);
     let missing = VERDICTS.iter().map(|(name, _)| *name).filter(is_missing).map(|name| {
         let (question, songs) = (question(name), String::new());
-        (order(name), 0, Shown { outcome: Outcome::Open, question, songs, tests: &[] })
+        (order(name), 0, VerdictView { outcome: Outcome::Open, question, songs, tests: &[] })
     });
-    let measured = report
-        .verdicts
-        .iter()
-        .map(|verdict| (order(&verdict.verdict), split_order(&verdict.split), Shown::of(verdict)));
-    let mut all: Vec<(usize, usize, Shown)> = measured.chain(missing).collect();
+    let measured = report.verdicts.iter().map(|verdict| {
+        (order(&verdict.verdict), split_order(&verdict.split), VerdictView::of(verdict))
+    });
+    let mut all: Vec<(usize, usize, VerdictView)> = measured.chain(missing).collect();
     let rank = |outcome| Outcome::ALL.iter().position(|known| *known == outcome);
     all.sort_by_key(|(verdict, split, shown)| (rank(shown.outcome), *verdict, *split));
     all.into_iter().map(|(.., shown)| shown).collect()
@@ -175,7 +174,7 @@ mod tests {
 
     #[test]
     fn a_verdict_is_won_only_where_every_test_is() {
-        let of = |outcome: Outcome, tests: &[Outcome]| {
+        let settled_outcome = |outcome: Outcome, tests: &[Outcome]| {
             let tests = tests.iter().map(|outcome| test("t", *outcome, 0.5, 1.0)).collect();
             verdict("varied", "all", outcome, tests).settled()
         };
@@ -191,7 +190,7 @@ mod tests {
             (Lost, &[], Lost),
         ];
         for (outcome, tests, wanted) in cases {
-            assert_eq!(of(outcome, tests), wanted, "{outcome:?} {tests:?}");
+            assert_eq!(settled_outcome(outcome, tests), wanted, "{outcome:?} {tests:?}");
         }
         // A win that rests on no number.
         for value in [None, Some(f64::NAN)] {
@@ -237,7 +236,8 @@ mod tests {
 
     #[test]
     fn the_reason_is_that_of_the_worst_test() {
-        let of = |outcome, tests| Shown::of(&verdict("sound", "all", outcome, tests)).reason_of();
+        let reason_for =
+            |outcome, tests| VerdictView::of(&verdict("sound", "all", outcome, tests)).reason_of();
         let said = |text: &str, test: VerdictTest| VerdictTest { message: text.to_owned(), ..test };
         let tests = vec![
             said("A little over.", test("a", Lost, 1.1, 1.0)),
@@ -247,26 +247,26 @@ mod tests {
             said("Nothing known.", VerdictTest { limit: None, ..test("e", Lost, 9.0, 1.0) }),
             said("Too few.", VerdictTest { value: None, ..test("f", Open, 0.0, 1.0) }),
         ];
-        let (reason, counts, order) = of(Lost, tests);
+        let (reason, counts, order) = reason_for(Lost, tests);
         assert_eq!(reason, "Of the wrong sign.");
         assert_eq!(counts, "6 tests: 4 lost, 1 open, 1 won");
         assert_eq!(order, ["c", "d", "a", "e"]);
 
         let empty = VerdictTest { value: None, ..test("f", Open, 0.0, 0.25) };
-        let (reason, counts, _) = of(Won, vec![test("b", Won, 0.5, 1.0), empty]);
+        let (reason, counts, _) = reason_for(Won, vec![test("b", Won, 0.5, 1.0), empty]);
         assert_eq!(reason, "what is measured not measured, wanted at most 0.25 m");
         assert_eq!(counts, "2 tests: 1 open, 1 won");
         let won = || test("b", Won, 0.5, 1.0);
-        assert_eq!(of(Won, vec![won(), won()]).0, "All 2 tests that it rests on hold.");
-        let (reason, counts, _) = of(Won, vec![won()]);
+        assert_eq!(reason_for(Won, vec![won(), won()]).0, "All 2 tests that it rests on hold.");
+        let (reason, counts, _) = reason_for(Won, vec![won()]);
         assert_eq!(reason, "The test that it rests on holds.");
         assert_eq!(counts, "1 test: 1 won");
-        assert_eq!(of(Lost, vec![won()]).0, "None of its tests says why.");
-        assert_eq!(of(Open, vec![won()]).0, "Not enough was measured to tell.");
-        assert_eq!(of(Won, Vec::new()).0, "Not measured.");
+        assert_eq!(reason_for(Lost, vec![won()]).0, "None of its tests says why.");
+        assert_eq!(reason_for(Open, vec![won()]).0, "Not enough was measured to tell.");
+        assert_eq!(reason_for(Won, Vec::new()).0, "Not measured.");
     }
 
-    impl Shown<'_> {
+    impl VerdictView<'_> {
         /// Returns the reason, the counts and the names of the tests that are lost.
         fn reason_of(&self) -> (String, String, Vec<String>) {
             let lost = self.with(Lost).iter().map(|test| test.test.clone()).collect();

@@ -11,7 +11,7 @@ use crate::store::tables::{BeatRow, PhraseRow};
 use crate::store::{ItemTables, Row as _, StoreError, StoreSnapshot};
 use crate::units::s_to_frames;
 
-/// `beats_per_bar_source` of a bar that nobody counted.
+/// `beats_per_bar_source` of a bar whose beats were not counted.
 pub const DEFAULT: &str = "default";
 
 /// Where beats came from, the better the later.
@@ -115,7 +115,7 @@ impl PhraseBeats {
     pub fn in_bars(&self, row: &PhraseRow) -> Option<Beats> {
         let stated = row.beats_per_bar.and_then(|n| u32::try_from(n).ok());
         let is_default = row.beats_per_bar_source.as_deref() == Some(DEFAULT);
-        // Beats of a whole song tell more of its bars than nobody does; those of an excerpt may lack the highest number.
+        // The beat numbers of a whole song are better than the default; those of an excerpt may lack the highest.
         let is_guess = is_default && !row.is_constructed() && self.is_numbered();
         self.counted(stated.filter(|_| !is_guess), is_default, row.tempo_bpm)
     }
@@ -298,9 +298,9 @@ mod tests {
     fn rows_have_the_nearest_frame_and_none_behind_the_last() {
         let beats = [(0.05, Some(4)), (1.04, Some(1)), (2.0, None)];
         let found: Vec<_> = rows("a", beats, 41, BeatSource::Features).collect();
-        let of = |row: &BeatRow| (row.beat, row.frame, row.time_s, row.number);
+        let to_tuple = |row: &BeatRow| (row.beat, row.frame, row.time_s, row.number);
         let expected = [(0, 2, 0.05, Some(4)), (1, 31, 1.04, Some(1)), (2, 40, 2.0, None)];
-        assert_eq!(found.iter().map(of).collect::<Vec<_>>(), expected);
+        assert_eq!(found.iter().map(to_tuple).collect::<Vec<_>>(), expected);
         assert!(found.iter().all(|row| row.source.as_deref() == Some("features")));
     }
 }

@@ -75,7 +75,7 @@ kinds! {
     /// Features of other content than the phrase has now.
     StaleFeatures = "stale_features",
     Symlink = "symlink",
-    /// A tempo that nobody dances to.
+    /// A tempo outside of those that are danced to.
     Tempo = "tempo",
     Timeout = "timeout",
     TooLarge = "too_large",

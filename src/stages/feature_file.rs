@@ -12,7 +12,7 @@ use crate::stages::failure::{Failure, FailureKind};
 /// amount of zeros, so this and not the file's size bounds the memory that it takes.
 const MAX_ARRAY_BYTES: u64 = 256 << 20;
 
-/// What a feature file says beside its arrays.
+/// The content of a feature file beside its arrays.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FeatureFile {
     pub n_frames: usize,
@@ -89,7 +89,7 @@ pub fn read_features(
 /// Adds the blocks of features to a feature file; frames of shape `[T, 163]`.
 ///
 /// # Errors
-/// What the output says.
+/// The error of the output.
 pub fn write_blocks<W: Write + Seek>(
     npz: &mut NpzWriter<W>,
     frames: ArrayView2<'_, f32>,

@@ -9,15 +9,16 @@ use anyhow::ensure;
 use super::failure::quoted;
 use super::learned::{learned_path, remember};
 use super::train::session::{
-    Looker, MachineParams, check_run_name, claim, claim_path, lease_of, read_phrases,
+    MachineParams, ProgressWatch, check_run_name, claim, claim_path, lease_of, read_phrases,
 };
-use super::train::{Account, DryRun, StageAccount, restore};
-use super::trained::{Stand, Trained};
+use super::train::{StageSummary, TrainDryRun, TrainSummary, restore};
+use super::trained::{TrainedRun, WeightsChoice};
 use super::{ClientParams, Contract, Progress, Stage, Summary};
 use crate::store::Location;
 use crate::training::{
-    Augmentation, Checkpoints, Drive, End, FinetuneConfig, FinetuneLearner, Journal, Kind, Loader,
-    OptimizerConfig, Plan, State, TemporalConfig, Windows, Withhold,
+    Augmentation, CheckpointKind, Checkpoints, Drive, FinetuneConfig, FinetuneLearner, Journal,
+    Loader, OptimizerConfig, Plan, State, TemporalConfig, TrainingEnd, Windows,
+    WithholdProbabilities,
 };
 
 /// The stage.
@@ -285,15 +286,15 @@ impl Stage for Finetune {
         params.check()?;
         let config = params.config();
         let store = Location::open(&params.store, &params.client.options())?;
-        let watch = Looker(progress);
+        let watch = ProgressWatch(progress);
         let run = params.run.as_str();
         let checkpoints = Checkpoints::new(&store, run, Self::NAME);
         ensure!(
-            !params.resume || !checkpoints.steps(Kind::Step)?.is_empty(),
+            !params.resume || !checkpoints.steps(CheckpointKind::Step)?.is_empty(),
             "run {run} has no fine-tuning to resume in {store}; leave --resume out to start it"
         );
-        let Trained { state: trained, unet, decoder, .. } =
-            Trained::read(&store, run, Stand::Train)?;
+        let TrainedRun { state: trained, unet, decoder, .. } =
+            TrainedRun::read(&store, run, WeightsChoice::Train)?;
         let lease = match params.dry_run {
             true => None,
             false => Some(lease_of(&store, run, &watch)?),
@@ -317,7 +318,10 @@ impl Stage for Finetune {
         let windows = Arc::new(windows.heard_by(&network.unet));
         let mut learner = FinetuneLearner::new(
             network,
-            (&trained.config.diffusion.objective, Withhold::of(&trained.config.diffusion)),
+            (
+                &trained.config.diffusion.objective,
+                WithholdProbabilities::of(&trained.config.diffusion),
+            ),
             &config,
             &windows,
             [&unet.parameters, &decoder.parameters],
@@ -326,7 +330,7 @@ impl Stage for Finetune {
         // The learner has copies; of `base` they are half a gigabyte.
         drop((unet, decoder));
         if params.dry_run {
-            return Ok(Box::new(DryRun {
+            return Ok(Box::new(TrainDryRun {
                 run: params.run.clone(),
                 what: "fine-tune both networks".to_owned(),
                 n_train: windows.n_train(),
@@ -369,9 +373,9 @@ impl Stage for Finetune {
         let end = drive.run(&mut learner, |first| {
             Loader::start(&windows, batch_size, first, machine.loader_threads)
         })?;
-        let mut account = Account::new(run, &store, phrases.left_out);
-        account.add(StageAccount::of(Self::NAME, &drive.state.progress, started_at, end));
-        if end == End::Interrupted {
+        let mut account = TrainSummary::new(run, &store, phrases.left_out);
+        account.add(StageSummary::of(Self::NAME, &drive.state.progress, started_at, end));
+        if end == TrainingEnd::Interrupted {
             let mut words: Vec<String> = std::env::args().map(|word| quoted(&word)).collect();
             words.retain(|word| word != "--force");
             if !params.resume {

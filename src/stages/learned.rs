@@ -4,8 +4,8 @@ use bytes::Bytes;
 
 use super::generate::weights_digest;
 use super::model_files::{current_folder, folder_of, is_model_name};
-use super::train::session::{Looker, MachineParams, read_phrases};
-use super::trained::{Trained, Tuned};
+use super::train::session::{MachineParams, ProgressWatch, read_phrases};
+use super::trained::{FinetuneData, TrainedRun};
 use super::{Progress, Stage as _, finetune::Finetune, pretrained, train::Train};
 
 use crate::generation::{CardError, LearnedFrom, MAX_CARD_BYTES, ModelCard, Purpose, file_names};
@@ -44,7 +44,7 @@ pub fn remember(
     command: &str,
     dataset: &Dataset,
     patience: Patience,
-    watch: &Looker,
+    watch: &ProgressWatch,
 ) -> anyhow::Result<()> {
     let path = learned_path(run, command);
     let notice = |error: &StoreError, pause| watch.notice(error, pause);
@@ -75,20 +75,24 @@ pub fn remember(
 pub fn of_run(
     store: &Location,
     run: &str,
-    trained: &Trained,
+    trained: &TrainedRun,
     machine: &MachineParams,
     progress: &dyn Progress,
     is_dry_run: bool,
 ) -> anyhow::Result<Option<LearnedFrom>> {
-    let of = |command, data: &str, most| {
+    let learned_by = |command, data: &str, most| {
         of_command(store, run, command, (data, most), machine, progress, is_dry_run)
     };
-    let Some(by_train) = of(Train::NAME, &trained.state.data, None)? else { return Ok(None) };
-    let Some(Tuned { data, num_phrases }) = &trained.tuned else { return Ok(Some(by_train)) };
+    let Some(by_train) = learned_by(Train::NAME, &trained.state.data, None)? else {
+        return Ok(None);
+    };
+    let Some(FinetuneData { data, num_phrases }) = &trained.tuned else {
+        return Ok(Some(by_train));
+    };
     if *data == by_train.data {
         return Ok(Some(by_train));
     }
-    let by_finetune = of(Finetune::NAME, data, *num_phrases)?;
+    let by_finetune = learned_by(Finetune::NAME, data, *num_phrases)?;
     Ok(by_finetune.map(|by_finetune| by_train.and(by_finetune)))
 }
 
@@ -109,7 +113,7 @@ fn of_command(
     if listed.as_ref().is_some_and(|listed| listed.is_complete) {
         return Ok(listed);
     }
-    let watch = Looker(progress);
+    let watch = ProgressWatch(progress);
     let stage = super::export::Export::NAME;
     let phrases =
         read_phrases(store, stage, machine, max_train_phrases, progress, &watch, is_dry_run)?;
@@ -123,10 +127,10 @@ fn of_command(
     }))
 }
 
-/// Why nobody knows what the model of a motion learned from.
+/// Why it is not known what the model of a motion learned from.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
-pub enum NotKnown {
+pub enum LearnedFromError {
     #[error(
         "store {store} has no model \"{model}\", so what it learned from is not known; copy the folder of the \
          model to models/{model} there"
@@ -157,11 +161,11 @@ pub fn of_model(
     store: &Location,
     model: &str,
     weights: &str,
-) -> Result<Result<LearnedFrom, NotKnown>, StoreError> {
+) -> Result<Result<LearnedFrom, LearnedFromError>, StoreError> {
     let path = format!("{}/{}", folder_of(model), file_names::CARD);
     let Some(bytes) = card_of(store, model)? else {
         let (store, model) = (store.to_string(), model.to_owned());
-        return Ok(Err(NotKnown::NoModel { store, model }));
+        return Ok(Err(LearnedFromError::NoModel { store, model }));
     };
     let card = match ModelCard::read(&bytes, &store.url_of(&path)) {
         Ok(card) => card,
@@ -170,7 +174,7 @@ pub fn of_model(
     let found = weights_digest(&card);
     if found != weights {
         let short = |digest: &str| digest.chars().take(12).collect();
-        return Ok(Err(NotKnown::OtherWeights {
+        return Ok(Err(LearnedFromError::OtherWeights {
             store: store.to_string(),
             model: model.to_owned(),
             found: short(&found),
@@ -178,7 +182,7 @@ pub fn of_model(
         }));
     }
     let model = model.to_owned();
-    Ok(card.provenance.learned_from.ok_or(NotKnown::NotListed { model }))
+    Ok(card.provenance.learned_from.ok_or(LearnedFromError::NotListed { model }))
 }
 
 /// Returns whether the store has the model that made a motion, with the same weights.
@@ -199,9 +203,10 @@ fn card_of(store: &Location, model: &str) -> Result<Option<Bytes>, StoreError> {
         return Ok(None);
     }
     let path = format!("{}/{}", current_folder(store, &folder_of(model))?, file_names::CARD);
-    let of_program = || (model == pretrained::NAME).then(|| pretrained::file(file_names::CARD));
+    let pretrained_card =
+        || (model == pretrained::NAME).then(|| pretrained::file(file_names::CARD));
     match store.read_regular(&path, MAX_CARD_BYTES) {
-        Err(StoreError::NotFound { .. }) => Ok(of_program().flatten()),
+        Err(StoreError::NotFound { .. }) => Ok(pretrained_card().flatten()),
         read => read.map(Some),
     }
 }

@@ -63,7 +63,7 @@ pub struct Contract {
     pub writes: &'static str,
 }
 
-/// What a stage tells of its progress; the command line draws it.
+/// Receives the progress of a stage; the command line draws it.
 pub trait Progress: Sync {
     /// Starts counting `total` things called `unit` (in the plural).
     fn start(&self, what: &str, unit: &str, total: u64);
@@ -85,7 +85,7 @@ pub trait Progress: Sync {
     fn finish(&self);
 }
 
-/// Progress that nobody watches.
+/// Progress that is not shown.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Silent;
 
@@ -102,12 +102,12 @@ impl Progress for Silent {
     fn finish(&self) {}
 }
 
-/// What a stage did.
+/// The summary of a stage.
 pub trait Summary {
     /// Writes what the user asked for, or the account of what was done.
     ///
     /// # Errors
-    /// What the output says.
+    /// The error of the output.
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()>;
 
     /// Returns how many items failed; they are in the `failures` table.

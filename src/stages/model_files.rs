@@ -69,7 +69,7 @@ pub fn default_model_cache() -> PathBuf {
 pub struct OpenModel {
     pub card: ModelCard,
     source: Source,
-    /// What messages call it.
+    /// The name in messages.
     place: String,
     /// Whether the files' digests are known to be those of the card.
     is_verified: bool,
@@ -92,7 +92,7 @@ pub const POINTER: &str = "current.json";
 /// Digits of the name of such a folder.
 const VERSION_DIGITS: usize = 32;
 
-/// What [`POINTER`] says.
+/// The content of [`POINTER`].
 #[derive(serde::Serialize, serde::Deserialize)]
 struct Pointer {
     folder: String,
@@ -477,8 +477,8 @@ pub fn sha256(bytes: &[u8]) -> String {
 /// Returns what tells this processor from others: a model that is optimised for one may not run on another.
 fn processor() -> String {
     let known = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let of_first = known.lines().take_while(|line| !line.is_empty());
-    let mut told: Vec<&str> = of_first
+    let first_group = known.lines().take_while(|line| !line.is_empty());
+    let mut told: Vec<&str> = first_group
         .filter(|line| ["model name", "flags", "Features"].iter().any(|key| line.starts_with(key)))
         .collect();
     told.push(std::env::consts::ARCH);

@@ -45,22 +45,22 @@ pub struct MotionParams {
     pub samples: Vec<usize>,
 }
 
-/// How many motions have room.
+/// How many motions can be displayed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Room {
+pub enum MotionCapacity {
     /// A plot's.
     One,
     /// A page's.
     Many,
 }
 
-/// What is shown.
+/// Motions to display, with title and beats.
 #[derive(Clone, Debug)]
-pub struct Subject {
-    /// What stands over it.
+pub struct MotionDisplay {
+    /// The title above it.
     pub title: String,
     /// One or more.
-    pub shown: Vec<Shown>,
+    pub shown: Vec<DisplayedMotion>,
     pub beats_s: Vec<f64>,
     /// What the store says of the phrase.
     pub phrase: Option<PhraseRow>,
@@ -68,7 +68,7 @@ pub struct Subject {
 
 /// A motion and what is known of it.
 #[derive(Clone, Debug)]
-pub struct Shown {
+pub struct DisplayedMotion {
     pub name: String,
     /// Its values may be anything.
     pub motion: Trajectory,
@@ -80,7 +80,11 @@ impl MotionParams {
     ///
     /// # Errors
     /// One sentence for what is not there, cannot be read, or has no room.
-    pub fn read(&self, room: Room, options: &ClientOptions) -> anyhow::Result<Subject> {
+    pub fn read(
+        &self,
+        room: MotionCapacity,
+        options: &ClientOptions,
+    ) -> anyhow::Result<MotionDisplay> {
         let mut subject = match (self.motion.as_slice(), &self.phrase, &self.store) {
             ([_, ..], Some(phrase), _) => {
                 bail!("--motion and --phrase {phrase} name two things to show; give one of them")
@@ -104,7 +108,12 @@ impl MotionParams {
         Ok(subject)
     }
 
-    fn of_store(&self, store: &Location, phrase: &str, room: Room) -> anyhow::Result<Subject> {
+    fn of_store(
+        &self,
+        store: &Location,
+        phrase: &str,
+        room: MotionCapacity,
+    ) -> anyhow::Result<MotionDisplay> {
         let rows = ItemTables::take(store, phrase)?;
         let known: Option<PhraseRow> = rows.rows()?.pop();
         let (title, shown) = match &self.run {
@@ -118,20 +127,23 @@ impl MotionParams {
                 };
                 let facts = known.as_ref().map(facts_of_phrase).unwrap_or_default();
                 let motion = Trajectory::new(frames)?;
-                (phrase.to_owned(), vec![Shown { name: phrase.to_owned(), motion, facts }])
+                (
+                    phrase.to_owned(),
+                    vec![DisplayedMotion { name: phrase.to_owned(), motion, facts }],
+                )
             }
         };
         let beats_s = beats::of_item(&rows)?.times_s().to_vec();
-        Ok(Subject { title, shown, beats_s, phrase: known })
+        Ok(MotionDisplay { title, shown, beats_s, phrase: known })
     }
 }
 
-fn of_files(files: &[PathBuf], room: Room) -> anyhow::Result<Subject> {
+fn of_files(files: &[PathBuf], room: MotionCapacity) -> anyhow::Result<MotionDisplay> {
     check_room(files.len(), "--motion", room)?;
     let mut shown = Vec::new();
     for path in files {
         let motion = read_motion(path)?;
-        shown.push(Shown { name: name_of(path), motion, facts: Vec::new() });
+        shown.push(DisplayedMotion { name: name_of(path), motion, facts: Vec::new() });
     }
     let title = match files {
         [first, rest @ ..] if !rest.is_empty() => {
@@ -139,7 +151,7 @@ fn of_files(files: &[PathBuf], room: Room) -> anyhow::Result<Subject> {
         }
         _ => shown.first().map(|shown| shown.name.clone()).unwrap_or_default(),
     };
-    Ok(Subject { title, shown, beats_s: Vec::new(), phrase: None })
+    Ok(MotionDisplay { title, shown, beats_s: Vec::new(), phrase: None })
 }
 
 fn name_of(path: &Path) -> String {
@@ -147,10 +159,12 @@ fn name_of(path: &Path) -> String {
 }
 
 /// Refuses more motions than have room.
-fn check_room(n: usize, flag: &str, room: Room) -> anyhow::Result<()> {
+fn check_room(n: usize, flag: &str, room: MotionCapacity) -> anyhow::Result<()> {
     match room {
-        Room::One if n > 1 => bail!("a plot shows one motion, and {flag} names {n}; give one"),
-        Room::Many if n > MAX_SHOWN => {
+        MotionCapacity::One if n > 1 => {
+            bail!("a plot shows one motion, and {flag} names {n}; give one")
+        }
+        MotionCapacity::Many if n > MAX_SHOWN => {
             bail!("a page shows up to {MAX_SHOWN} motions, and {flag} names {n}; give fewer")
         }
         _ => Ok(()),
@@ -200,8 +214,8 @@ fn of_run(
     run: &str,
     (phrase, known): (&str, Option<&PhraseRow>),
     wanted: &[usize],
-    room: Room,
-) -> anyhow::Result<Vec<Shown>> {
+    room: MotionCapacity,
+) -> anyhow::Result<Vec<DisplayedMotion>> {
     let (mut runs, mut phrases) = (BTreeSet::new(), BTreeSet::new());
     let table = Snapshot::take(store, GenerationRow::schema())?;
     let rows: Vec<GenerationRow> = table.rows_where(|row: &GenerationRow| {
@@ -250,8 +264,8 @@ fn of_run(
     }
     let place = format!("store {store}: run \"{run}\"");
     let numbers: BTreeSet<usize> = match (wanted, room) {
-        ([], Room::One) => samples.keys().copied().take(1).collect(),
-        ([], Room::Many) => samples.keys().copied().collect(),
+        ([], MotionCapacity::One) => samples.keys().copied().take(1).collect(),
+        ([], MotionCapacity::Many) => samples.keys().copied().collect(),
         _ => wanted.iter().copied().collect(),
     };
     check_room(numbers.len(), "--sample", room)?;
@@ -266,7 +280,7 @@ fn of_run(
         };
         let motion = Trajectory::new(generated_frames(store, run, phrase, number)?)?;
         let facts = facts_of_generation(row, *n_candidates);
-        shown.push(Shown { name: format!("sample {number}"), motion, facts });
+        shown.push(DisplayedMotion { name: format!("sample {number}"), motion, facts });
     }
     Ok(shown)
 }

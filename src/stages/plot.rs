@@ -16,12 +16,12 @@ pub struct Plot;
 #[derive(Clone, Debug, clap::Args)]
 pub struct Params {
     #[command(subcommand)]
-    pub kind: Kind,
+    pub kind: PlotKind,
 }
 
 /// The kinds of plot.
 #[derive(Clone, Debug, clap::Subcommand)]
-pub enum Kind {
+pub enum PlotKind {
     /// draw the audio features of a file or a phrase over time
     Features(features::Params),
     /// draw the losses of a training run over its steps
@@ -41,9 +41,9 @@ impl Stage for Plot {
 
     fn run(params: Params, _progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
         match params.kind {
-            Kind::Features(params) => features::run(&params),
-            Kind::Training(params) => training::run(&params),
-            Kind::Motion(params) => motion::run(&params),
+            PlotKind::Features(params) => features::run(&params),
+            PlotKind::Training(params) => training::run(&params),
+            PlotKind::Motion(params) => motion::run(&params),
         }
     }
 }

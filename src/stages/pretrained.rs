@@ -5,7 +5,7 @@ use bytes::Bytes;
 /// Its name, under which tables know it.
 pub const NAME: &str = "pretrained";
 
-/// What messages call it.
+/// The name in messages.
 pub const PLACE: &str = "the model of the program";
 
 /// Returns a file of the model; none where the program was built without it.

@@ -74,7 +74,7 @@ impl Stage for Query {
                 .with_context(|| format!("while writing {}", output.display()))?;
         }
         let (n_rows, output) = (selected.n_rows(), output.clone());
-        Ok(Box::new(Written { n_rows, output, dry_run: params.dry_run }))
+        Ok(Box::new(QuerySummary { n_rows, output, dry_run: params.dry_run }))
     }
 }
 
@@ -153,13 +153,13 @@ impl Summary for Selected {
     }
 }
 
-struct Written {
+struct QuerySummary {
     n_rows: u64,
     output: PathBuf,
     dry_run: bool,
 }
 
-impl Summary for Written {
+impl Summary for QuerySummary {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
         let would = if self.dry_run { "would write " } else { "" };
         writeln!(out, "{would}{} rows → {}", self.n_rows, self.output.display())

@@ -8,7 +8,7 @@ use ndarray::{Array2, ArrayView2, s};
 use crate::generation::{Retrieval, Windows};
 use crate::motion::{MOTION_DIM, Placement};
 use crate::store::{Location, Patience, StoreError, StoreSnapshot};
-use crate::training::{Dataset, Phrase, Reading, Split};
+use crate::training::{Dataset, DatasetOptions, Phrase, Split};
 
 /// Most training phrases that are read, the same ones every time: a bound on memory.
 pub const MAX_TRAIN_PHRASES: usize = 4000;
@@ -32,7 +32,7 @@ pub fn dataset_of(
     snapshot: &StoreSnapshot,
     threads: NonZeroUsize,
 ) -> Result<Dataset, crate::training::DatasetError> {
-    let reading = Reading {
+    let reading = DatasetOptions {
         in_memory: false,
         n_threads: threads,
         patience: Patience::default(),

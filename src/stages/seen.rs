@@ -3,16 +3,16 @@
 //! What a commit settles it settles anew, with its rows. So a new fingerprint for old rows has a commit of its own,
 //! which has no parts and vouches for the rows of another.
 
-use crate::store::{Commit, Item, Ledger, Location, Settled, StoreError, digest_texts};
+use crate::store::{Commit, Item, Ledger, Location, SettledItem, StoreError, digest_texts};
 
-/// What a stage has seen again.
+/// Items whose content a stage has seen again under another fingerprint.
 #[derive(Debug)]
-pub struct Seen {
+pub struct SeenContent {
     stage: &'static str,
     ledger: Ledger,
 }
 
-impl Seen {
+impl SeenContent {
     /// Reads what was seen again, as commits of `stage` have it.
     ///
     /// # Errors
@@ -22,7 +22,7 @@ impl Seen {
     }
 
     /// Returns whether the content of a settled item was seen at `origin` under a fingerprint.
-    pub fn has(&self, known: &Settled, origin: &str, fingerprint: &str) -> bool {
+    pub fn has(&self, known: &SettledItem, origin: &str, fingerprint: &str) -> bool {
         let item = item(known, origin, fingerprint);
         self.ledger.get(&item.id).is_some_and(|seen| seen.item == item)
     }
@@ -35,7 +35,7 @@ impl Seen {
     /// Vouches that the content of a settled item lies at `origin` under a fingerprint.
     pub fn settle(
         &self,
-        known: &Settled,
+        known: &SettledItem,
         origin: &str,
         fingerprint: &str,
         commit: &mut Commit<'_>,
@@ -47,7 +47,7 @@ impl Seen {
 }
 
 /// Returns the item that vouches: its digest is of what was settled and of where it was seen.
-fn item(known: &Settled, origin: &str, fingerprint: &str) -> Item {
+fn item(known: &SettledItem, origin: &str, fingerprint: &str) -> Item {
     let settled = &known.item;
     let texts = [settled.input_hash.as_str(), &known.params_hash, origin, fingerprint];
     Item {

@@ -4,13 +4,13 @@ use crate::autodiff::Parameters;
 use crate::model::{MotionDecoder, ParameterList, UNet1D};
 use crate::store::Location;
 use crate::training::{
-    Checkpoints, DecoderLearner, DiffusionLearner, FinetuneLearner, Kind, Learner as _, State,
-    TrainConfig, TrainingError,
+    CheckpointKind, Checkpoints, DecoderLearner, DiffusionLearner, FinetuneLearner, Learner as _,
+    State, TrainConfig, TrainingError,
 };
 
 /// Which weights of a run.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
-pub enum Stand {
+pub enum WeightsChoice {
     /// Those of finetune where the run has them, else those of train.
     #[default]
     Latest,
@@ -21,22 +21,22 @@ pub enum Stand {
 }
 
 /// A run that was trained.
-pub struct Trained {
+pub struct TrainedRun {
     /// The state of the UNet's training: configuration, scales, data.
     pub state: State<TrainConfig>,
-    pub unet: Best,
-    pub decoder: Best,
+    pub unet: BestWeights,
+    pub decoder: BestWeights,
     /// `diffusion` or `finetune`.
     pub stage: &'static str,
     /// The validation loss of what the stage minimises.
     pub loss: Option<f64>,
-    /// What fine-tuned weights learned from; none for those of train.
-    pub tuned: Option<Tuned>,
+    /// The data that fine-tuned weights learned from; none for those of train.
+    pub tuned: Option<FinetuneData>,
 }
 
-/// What finetune learned from.
+/// The data that finetune learned from.
 #[derive(Clone, Debug)]
-pub struct Tuned {
+pub struct FinetuneData {
     /// Fingerprint of its dataset.
     pub data: String,
     /// Most training phrases.
@@ -44,20 +44,20 @@ pub struct Tuned {
 }
 
 /// Weights, and the step at which they validated best.
-pub struct Best {
+pub struct BestWeights {
     pub parameters: Parameters<f32>,
     pub step: u64,
 }
 
-impl Trained {
+impl TrainedRun {
     /// Reads a run.
     ///
     /// # Errors
     /// [`TrainingError::Missing`] with the command that makes what is missing.
-    pub fn read(store: &Location, run: &str, stand: Stand) -> Result<Self, TrainingError> {
-        let of = |stage: &'static str| Checkpoints::new(store, run, stage);
-        let diffusion = of(DiffusionLearner::STAGE);
-        let Some(&step) = diffusion.steps(Kind::Best)?.last() else {
+    pub fn read(store: &Location, run: &str, stand: WeightsChoice) -> Result<Self, TrainingError> {
+        let checkpoints_of = |stage: &'static str| Checkpoints::new(store, run, stage);
+        let diffusion = checkpoints_of(DiffusionLearner::STAGE);
+        let Some(&step) = diffusion.steps(CheckpointKind::Best)?.last() else {
             let way_out = format!("run motiongen train --run {run} first");
             return Err(TrainingError::Missing {
                 run: run.to_owned(),
@@ -65,36 +65,37 @@ impl Trained {
                 way_out,
             });
         };
-        let state: State<TrainConfig> = diffusion.read(Kind::Best, step, State::of)?;
+        let state: State<TrainConfig> = diffusion.read(CheckpointKind::Best, step, State::of)?;
         let network = &state.config.network;
         let (_, unet) = UNet1D::new(&network.unet);
         let (_, decoder) = MotionDecoder::new(&network.decoder);
-        let tuned = of(FinetuneLearner::STAGE);
+        let tuned = checkpoints_of(FinetuneLearner::STAGE);
         let tuned_steps = match stand {
-            Stand::Train => Vec::new(),
-            Stand::Latest | Stand::Finetune => tuned.steps(Kind::Best)?,
+            WeightsChoice::Train => Vec::new(),
+            WeightsChoice::Latest | WeightsChoice::Finetune => tuned.steps(CheckpointKind::Best)?,
         };
         if let Some(&step) = tuned_steps.last() {
-            let best = |prefix, list: ParameterList| -> Result<Best, TrainingError> {
-                Ok(Best { parameters: section(&tuned, step, prefix, list)?, step })
+            let best = |prefix, list: ParameterList| -> Result<BestWeights, TrainingError> {
+                Ok(BestWeights { parameters: section(&tuned, step, prefix, list)?, step })
             };
             // Only what is looked at has to be as this version has it.
-            let of_tuned: State<serde_json::Value> = tuned.read(Kind::Best, step, State::of)?;
-            let loss = of_tuned.progress.best.map(|best| best.loss);
-            let num_phrases = of_tuned.config["num_phrases"].as_u64();
+            let tuned_state: State<serde_json::Value> =
+                tuned.read(CheckpointKind::Best, step, State::of)?;
+            let loss = tuned_state.progress.best.map(|best| best.loss);
+            let num_phrases = tuned_state.config["num_phrases"].as_u64();
             let num_phrases = num_phrases.and_then(|n| usize::try_from(n).ok());
-            let tuned_on = Tuned { data: of_tuned.data, num_phrases };
+            let tuned_on = FinetuneData { data: tuned_state.data, num_phrases };
             let (unet, decoder) = (best("unet.", unet)?, best("decoder.", decoder)?);
             let stage = FinetuneLearner::STAGE;
             return Ok(Self { state, unet, decoder, stage, loss, tuned: Some(tuned_on) });
         }
-        if stand == Stand::Finetune {
+        if stand == WeightsChoice::Finetune {
             let way_out = format!("run motiongen finetune --run {run} first");
             let (run, what) = (run.to_owned(), "fine-tuned networks");
             return Err(TrainingError::Missing { run, what, way_out });
         }
         let unet = best(&diffusion, run, "unet.", "trained UNet", unet)?;
-        let (stage, what) = (of(DecoderLearner::STAGE), "trained decoder");
+        let (stage, what) = (checkpoints_of(DecoderLearner::STAGE), "trained decoder");
         let decoder = best(&stage, run, "decoder.", what, decoder)?;
         let loss = state.progress.best.map(|best| best.loss);
         Ok(Self { state, unet, decoder, stage: DiffusionLearner::STAGE, loss, tuned: None })
@@ -111,12 +112,12 @@ pub fn best(
     prefix: &str,
     what: &'static str,
     list: ParameterList,
-) -> Result<Best, TrainingError> {
-    let Some(&step) = checkpoints.steps(Kind::Best)?.last() else {
+) -> Result<BestWeights, TrainingError> {
+    let Some(&step) = checkpoints.steps(CheckpointKind::Best)?.last() else {
         let way_out = format!("run motiongen train --run {run} to the end first");
         return Err(TrainingError::Missing { run: run.to_owned(), what, way_out });
     };
-    Ok(Best { parameters: section(checkpoints, step, prefix, list)?, step })
+    Ok(BestWeights { parameters: section(checkpoints, step, prefix, list)?, step })
 }
 
 fn section(
@@ -125,7 +126,7 @@ fn section(
     prefix: &str,
     list: ParameterList,
 ) -> Result<Parameters<f32>, TrainingError> {
-    checkpoints.read(Kind::Best, step, |archive, place| {
+    checkpoints.read(CheckpointKind::Best, step, |archive, place| {
         let place = place.to_owned();
         archive.section(prefix, list).map_err(|source| TrainingError::Weights { place, source })
     })

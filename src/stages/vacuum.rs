@@ -6,7 +6,7 @@ use std::str::FromStr;
 use std::time::Duration;
 
 use super::{ClientParams, Contract, Progress, Stage, Summary};
-use crate::store::{self, Location, Vacuumed};
+use crate::store::{self, Location, VacuumRemovals};
 
 /// The stage.
 pub struct Vacuum;
@@ -52,7 +52,7 @@ impl fmt::Display for Age {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let seconds = self.0.as_secs();
         let is_whole = |(_, unit): &&(char, u64)| seconds >= *unit && seconds.is_multiple_of(*unit);
-        // Seven days are a week, but nobody says so of what can be other numbers of days.
+        // Seven days are a week, but ages are usually given in days, so that weeks are not printed.
         let (name, unit) = UNITS.iter().skip(1).find(is_whole).unwrap_or(&('s', 1));
         write!(f, "{}{name}", seconds / unit)
     }
@@ -77,12 +77,12 @@ struct VacuumSummary {
     store: String,
     older_than: Age,
     dry_run: bool,
-    done: Vacuumed,
+    done: VacuumRemovals,
 }
 
 impl Summary for VacuumSummary {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        let Vacuumed { paths, n_bytes, n_kept } = &self.done;
+        let VacuumRemovals { paths, n_bytes, n_kept } = &self.done;
         writeln!(out, "vacuum {}", self.store)?;
         if self.dry_run {
             for path in paths {
@@ -107,7 +107,7 @@ impl Summary for VacuumSummary {
     }
 
     fn figures(&mut self) -> serde_json::Value {
-        let Vacuumed { paths, n_bytes, n_kept } = &self.done;
+        let VacuumRemovals { paths, n_bytes, n_kept } = &self.done;
         serde_json::json!({
             "store": self.store,
             "dry_run": self.dry_run,

@@ -7,7 +7,7 @@ use anyhow::{Context as _, anyhow, bail, ensure};
 
 use super::generate::listen;
 use super::ingest::Ingest;
-use super::motion_source::{MotionParams, Room, Subject};
+use super::motion_source::{MotionCapacity, MotionDisplay, MotionParams};
 use super::{ClientParams, Contract, Progress, Stage, Summary};
 use crate::audio::header::read_header;
 use crate::store::tables::PhraseRow;
@@ -57,7 +57,7 @@ impl Stage for View {
     fn run(params: Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
         let output = output_of(&params)?;
         let options = params.client.options();
-        let subject = params.source.read(Room::Many, &options)?;
+        let subject = params.source.read(MotionCapacity::Many, &options)?;
         let audio = match (&params.audio, &subject.phrase) {
             (Some(path), _) => Some(read_audio(path)?),
             (None, Some(row)) if !params.no_audio => {
@@ -77,7 +77,7 @@ impl Stage for View {
             store::write_file(&output, |out| out.write_all(text.as_bytes()))
                 .with_context(|| format!("while writing {}", output.display()))?;
         }
-        Ok(Box::new(Made {
+        Ok(Box::new(ViewSummary {
             n_motions: page.samples.len(),
             n_frames: page.samples.first().map_or(0, |sample| sample.frames.nrows()),
             n_beats: page.beats_s.len(),
@@ -199,7 +199,7 @@ fn tracked(path: &Path, progress: &dyn Progress) -> Vec<f64> {
     }
 }
 
-fn page_of(subject: Subject, audio: Option<Audio>) -> Page {
+fn page_of(subject: MotionDisplay, audio: Option<Audio>) -> Page {
     let samples = subject.shown.into_iter().map(|shown| ViewSample {
         name: shown.name,
         frames: shown.motion.into_array(),
@@ -208,8 +208,8 @@ fn page_of(subject: Subject, audio: Option<Audio>) -> Page {
     Page { title: subject.title, samples: samples.collect(), beats_s: subject.beats_s, audio }
 }
 
-/// What was made.
-struct Made {
+/// The summary of a page: its sizes and its file.
+struct ViewSummary {
     n_motions: usize,
     n_frames: usize,
     n_beats: usize,
@@ -219,7 +219,7 @@ struct Made {
     output: PathBuf,
 }
 
-impl Summary for Made {
+impl Summary for ViewSummary {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
         let Self { n_motions, n_frames, n_beats, has_audio, n_bytes, dry_run, output } = self;
         let counted = |n: usize, one: &str| format!("{n} {one}{}", if n == 1 { "" } else { "s" });

@@ -122,13 +122,13 @@ fn copy_into(content: Content, to: &mut std::fs::File) -> std::io::Result<(u64, 
 /// Hexadecimal digits of the name of an entry.
 const N_DIGITS: usize = 32;
 
-struct Entry {
+struct CacheEntry {
     path: PathBuf,
     size_bytes: u64,
     used: SystemTime,
 }
 
-fn entries(folder: &FsPath) -> std::io::Result<Vec<Entry>> {
+fn entries(folder: &FsPath) -> std::io::Result<Vec<CacheEntry>> {
     let mut found = Vec::new();
     for entry in std::fs::read_dir(folder)? {
         let entry = entry?;
@@ -141,7 +141,7 @@ fn entries(folder: &FsPath) -> std::io::Result<Vec<Entry>> {
             continue;
         }
         let used = meta.modified().unwrap_or(SystemTime::UNIX_EPOCH);
-        found.push(Entry { path: entry.path(), size_bytes: meta.len(), used });
+        found.push(CacheEntry { path: entry.path(), size_bytes: meta.len(), used });
     }
     Ok(found)
 }

@@ -14,9 +14,9 @@ use parquet::errors::ParquetError;
 use serde::{Deserialize, Serialize};
 
 use super::digest::digest;
-use super::location::{Listed, Location};
+use super::location::{ListedObject, Location};
 use super::manifest::{Header, Item, Part, Rank};
-use super::parquet_object::{ParquetObject, Wanted, names};
+use super::parquet_object::{ParquetObject, WantedItems, names};
 
 pub(super) use writer::{CatalogueError, write};
 
@@ -43,9 +43,9 @@ const INPUT_HASH: &str = "input_hash";
 const FAILURE: &str = "failure";
 
 /// Why a catalogue is of no use.
-pub(super) type Unusable = String;
+pub(super) type UnusableReason = String;
 
-/// What the footer of a catalogue says.
+/// The content of a catalogue's footer.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub(super) struct Meta {
     format: u32,
@@ -76,9 +76,9 @@ pub(super) struct Catalogue {
     file: ParquetObject,
 }
 
-/// The latest word on an item, as a catalogue has it.
+/// The latest settlement of an item, as a catalogue has it.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Row<'a> {
+pub(super) struct CatalogueRow<'a> {
     pub item: &'a str,
     pub commit: usize,
     pub header: usize,
@@ -91,7 +91,7 @@ impl Catalogue {
     pub fn newest(
         store: &Location,
         stage: &str,
-        listed: &[Listed],
+        listed: &[ListedObject],
         keys: &HashSet<&str>,
     ) -> Option<Self> {
         let mut listed: Vec<_> = listed.iter().filter(|l| is_catalogue(&l.path)).collect();
@@ -108,7 +108,7 @@ impl Catalogue {
         None
     }
 
-    fn open(store: &Location, stage: &str, listed: &Listed) -> Result<Self, Unusable> {
+    fn open(store: &Location, stage: &str, listed: &ListedObject) -> Result<Self, UnusableReason> {
         let file = ParquetObject::open(store, &listed.path, listed.size_bytes, TAIL_BYTES)
             .map_err(|e| e.to_string())?;
         let text = file.text(META).ok_or("it has no list of commits")?;
@@ -124,7 +124,7 @@ impl Catalogue {
     }
 
     /// Refuses a catalogue that counts rows of a commit whose manifest is gone.
-    fn checked(self, keys: &HashSet<&str>) -> Result<Self, Unusable> {
+    fn checked(self, keys: &HashSet<&str>) -> Result<Self, UnusableReason> {
         let is_gone = |entry: &&Entry| !entry.is_dead && !keys.contains(entry.key.as_str());
         match self.meta.commits.iter().find(is_gone) {
             Some(entry) => Err(format!("commit {} is gone", entry.key)),
@@ -143,14 +143,14 @@ impl Catalogue {
     }
 
     /// Returns the rank of a row.
-    pub fn rank(&self, row: Row) -> Rank<'_> {
+    pub fn rank(&self, row: CatalogueRow) -> Rank<'_> {
         let entry = &self.meta.commits[row.commit];
         Rank::new(&self.meta.headers[row.header], entry.generation, &entry.key)
     }
 
     /// Visits the names of all items, in order, and which commits they are of.
-    pub fn visit(&self, mut visit: impl FnMut(Row)) -> Result<(), Unusable> {
-        self.batches(Wanted::All, Some(&[ITEM, COMMIT, HEADER]), |batch| {
+    pub fn visit(&self, mut visit: impl FnMut(CatalogueRow)) -> Result<(), UnusableReason> {
+        self.batches(WantedItems::All, Some(&[ITEM, COMMIT, HEADER]), |batch| {
             (0..batch.n_rows()).try_for_each(|i| {
                 visit(batch.row(i)?);
                 Ok(())
@@ -159,8 +159,11 @@ impl Catalogue {
     }
 
     /// Visits all items, in order, with all that is known of them.
-    pub fn visit_items(&self, mut visit: impl FnMut(Row, Item)) -> Result<(), Unusable> {
-        self.batches(Wanted::All, None, |batch| {
+    pub fn visit_items(
+        &self,
+        mut visit: impl FnMut(CatalogueRow, Item),
+    ) -> Result<(), UnusableReason> {
+        self.batches(WantedItems::All, None, |batch| {
             (0..batch.n_rows()).try_for_each(|i| {
                 let (row, item) = (batch.row(i)?, batch.item(i)?);
                 visit(row, item);
@@ -170,10 +173,10 @@ impl Catalogue {
     }
 
     /// Returns the commit that holds what is known of an item, and by which it was settled.
-    pub fn find(&self, item: &str) -> Result<Option<(usize, usize)>, Unusable> {
+    pub fn find(&self, item: &str) -> Result<Option<(usize, usize)>, UnusableReason> {
         let (mut found, wanted) = (None, BTreeSet::from([item.to_owned()]));
         // The columns of the row group at once, rather than the names first.
-        self.batches(Wanted::Near(&wanted), Some(&[ITEM, COMMIT, HEADER]), |batch| {
+        self.batches(WantedItems::Near(&wanted), Some(&[ITEM, COMMIT, HEADER]), |batch| {
             if let Some(i) = batch.items.iter().position(|known| known == Some(item)) {
                 let row = batch.row(i)?;
                 found = Some((row.commit, row.header));
@@ -185,18 +188,18 @@ impl Catalogue {
 
     fn batches(
         &self,
-        wanted: Wanted,
+        wanted: WantedItems,
         columns: Option<&[&str]>,
-        mut visit: impl FnMut(&Columns) -> Result<(), Unusable>,
-    ) -> Result<(), Unusable> {
+        mut visit: impl FnMut(&CatalogueColumns) -> Result<(), UnusableReason>,
+    ) -> Result<(), UnusableReason> {
         let text = |e: ParquetError| e.to_string();
         let mut n_rows = 0;
         for batch in self.file.batches(ITEM, wanted, columns).map_err(text)? {
             let batch = batch.map_err(text)?;
             n_rows += batch.num_rows() as u64;
-            visit(&Columns::of(&batch, &self.meta).ok_or("its columns are others")?)?;
+            visit(&CatalogueColumns::of(&batch, &self.meta).ok_or("its columns are others")?)?;
         }
-        if matches!(wanted, Wanted::All) && n_rows != self.meta.n_items {
+        if matches!(wanted, WantedItems::All) && n_rows != self.meta.n_items {
             return Err(format!("it has {n_rows} of {} items", self.meta.n_items));
         }
         Ok(())
@@ -204,7 +207,7 @@ impl Catalogue {
 }
 
 /// The columns of a batch of a catalogue.
-struct Columns<'a> {
+struct CatalogueColumns<'a> {
     batch: &'a RecordBatch,
     meta: &'a Meta,
     items: &'a StringArray,
@@ -212,7 +215,7 @@ struct Columns<'a> {
     headers: &'a Int32Array,
 }
 
-impl<'a> Columns<'a> {
+impl<'a> CatalogueColumns<'a> {
     fn of(batch: &'a RecordBatch, meta: &'a Meta) -> Option<Self> {
         let numbers =
             |name: &str| batch.column_by_name(name)?.as_any().downcast_ref::<Int32Array>();
@@ -224,20 +227,22 @@ impl<'a> Columns<'a> {
         self.batch.num_rows()
     }
 
-    fn row(&self, i: usize) -> Result<Row<'a>, Unusable> {
+    fn row(&self, i: usize) -> Result<CatalogueRow<'a>, UnusableReason> {
         let place = |n: i32, len: usize| usize::try_from(n).ok().filter(|n| *n < len);
         let commit = place(self.commits.value(i), self.meta.commits.len());
         let header = place(self.headers.value(i), self.meta.headers.len());
         match (commit, header) {
-            (Some(commit), Some(header)) => Ok(Row { item: self.items.value(i), commit, header }),
+            (Some(commit), Some(header)) => {
+                Ok(CatalogueRow { item: self.items.value(i), commit, header })
+            }
             _ => Err(format!("item {} is of no commit", self.items.value(i))),
         }
     }
 
-    fn item(&self, i: usize) -> Result<Item, Unusable> {
+    fn item(&self, i: usize) -> Result<Item, UnusableReason> {
         let text = |name: &str| {
             let column = names(self.batch, name).map_err(|e| e.to_string())?;
-            Ok::<_, Unusable>((!column.is_null(i)).then(|| column.value(i).to_owned()))
+            Ok::<_, UnusableReason>((!column.is_null(i)).then(|| column.value(i).to_owned()))
         };
         Ok(Item {
             id: self.items.value(i).to_owned(),

@@ -13,7 +13,7 @@ use bytes::Bytes;
 use super::StoreError;
 use super::digest::{digest, digest_texts};
 use super::ledger::Ledger;
-use super::location::{Location, Put};
+use super::location::{Location, PutOutcome};
 use super::manifest::{Item, MANIFEST_FORMAT, Manifest, Part};
 use super::part::{FinishedPart, PartWriter};
 use super::schema::TableSchema;
@@ -37,9 +37,9 @@ struct OpenPart {
     writer: PartWriter,
 }
 
-/// What a commit added.
+/// The rows and bytes that a commit added.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Committed {
+pub struct CommitResult {
     pub n_rows: u64,
     pub n_bytes: u64,
     /// Whether another process had made the same commit already.
@@ -99,7 +99,7 @@ impl<'a> Commit<'a> {
     ///
     /// # Errors
     /// [`StoreError`]; nothing of the commit is visible then.
-    pub fn publish(self) -> Result<Committed, StoreError> {
+    pub fn publish(self) -> Result<CommitResult, StoreError> {
         self.publish_manifest().map(|(committed, _)| committed)
     }
 
@@ -107,17 +107,17 @@ impl<'a> Commit<'a> {
     ///
     /// # Errors
     /// [`StoreError`]; nothing of the commit is visible then.
-    pub fn publish_into(self, ledger: &mut Ledger) -> Result<Committed, StoreError> {
+    pub fn publish_into(self, ledger: &mut Ledger) -> Result<CommitResult, StoreError> {
         let (committed, manifest) = self.publish_manifest()?;
         ledger.add(&manifest);
         Ok(committed)
     }
 
-    fn publish_manifest(self) -> Result<(Committed, Manifest), StoreError> {
+    fn publish_manifest(self) -> Result<(CommitResult, Manifest), StoreError> {
         let sequence = self.replaces.iter().map(|(sequence, _)| sequence + 1).max().unwrap_or(0);
         let key = self.key();
         let program = program();
-        let mut committed = Committed::default();
+        let mut committed = CommitResult::default();
         let mut parts = Vec::new();
         for (table, open) in self.parts {
             let finished = open.writer.finish(&[
@@ -144,7 +144,8 @@ impl<'a> Commit<'a> {
             items: self.items,
             compacted: None,
         };
-        committed.already_there = publish_manifest(self.store, &manifest)? == Put::AlreadyThere;
+        committed.already_there =
+            publish_manifest(self.store, &manifest)? == PutOutcome::AlreadyThere;
         Ok((committed, manifest))
     }
 
@@ -181,7 +182,7 @@ pub(super) fn publish_part(
         .metadata()
         .map_err(|e| StoreError::io("measure", &store.url_of(&path), e))?
         .len();
-    if store.put_file_new(&path, file)? == Put::AlreadyThere {
+    if store.put_file_new(&path, file)? == PutOutcome::AlreadyThere {
         store.touch(&path);
         // Failures carry the time at which they happened, so the one that is there may be some bytes longer or
         // shorter.
@@ -191,7 +192,10 @@ pub(super) fn publish_part(
 }
 
 /// Publishes a manifest, whose parts are there.
-pub(super) fn publish_manifest(store: &Location, manifest: &Manifest) -> Result<Put, StoreError> {
+pub(super) fn publish_manifest(
+    store: &Location,
+    manifest: &Manifest,
+) -> Result<PutOutcome, StoreError> {
     let text =
         serde_json::to_vec(manifest).expect("invariant: a manifest holds only strings and numbers");
     store.put_new(&manifest.path(), Bytes::from(text))

@@ -1,8 +1,8 @@
 //! Compaction: parts that hold dead rows or are small are written anew, whole.
 //!
-//! What counts does not change, so nobody has to wait: a compaction repeats the latest word on each item under the
-//! rank of the commit that settled it. Who settles an item meanwhile outranks it, and of two compactions of the
-//! same items one counts. The old parts stay where they are until vacuum takes them.
+//! The live rows do not change, so other processes need not wait: a compaction repeats the latest settlement of each
+//! item under the rank of the commit that settled it. A commit that settles an item meanwhile outranks it, and of
+//! two compactions of the same items one counts. The old parts stay where they are until vacuum takes them.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
@@ -14,7 +14,7 @@ use xxhash_rust::xxh3::xxh3_64;
 use super::StoreError;
 use super::commit::{KEY_DIGITS, input_hash, program, publish_manifest, publish_part};
 use super::digest::digest_texts;
-use super::location::{Location, Put};
+use super::location::{Location, PutOutcome};
 use super::manifest::{COMPACTED_FORMAT, Compacted, Header, Item, Manifest};
 use super::parquet_object::names;
 use super::part::{PartWriter, ROW_GROUP_ROWS};
@@ -32,7 +32,7 @@ const MAX_BYTES: u64 = 64 << 20;
 /// A commit is small that has less than this share of both.
 const SMALL: u64 = 4;
 
-/// What a compaction did, or would do.
+/// The result of a compaction, or of its dry run.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Compaction {
     /// Parts that counted before, in all stages.
@@ -57,7 +57,7 @@ struct Plan {
 }
 
 /// An item that is written anew.
-struct Live {
+struct LiveItem {
     item: Item,
     header: usize,
     commit: Arc<str>,
@@ -143,7 +143,7 @@ fn plan(log: StageLog, done: &mut Compaction) -> Result<Option<Plan>, StoreError
 
 /// The items of a chunk, and what the commits say that settled them.
 struct Chunk {
-    items: BTreeMap<String, Live>,
+    items: BTreeMap<String, LiveItem>,
     headers: Arc<Vec<Header>>,
     /// Hashes of the names of all items of the stage.
     known: Arc<HashSet<u64>>,
@@ -152,7 +152,7 @@ struct Chunk {
 /// Returns the live items of the commits that are written anew, by ranges of the stable hash of their names, as
 /// stages batch them.
 fn chunks(plan: &Plan) -> Result<Vec<Chunk>, StoreError> {
-    let mut chunks: BTreeMap<u64, BTreeMap<String, Live>> = BTreeMap::new();
+    let mut chunks: BTreeMap<u64, BTreeMap<String, LiveItem>> = BTreeMap::new();
     let mut headers: Vec<Header> = Vec::new();
     let mut places: HashMap<Header, usize> = HashMap::new();
     let mut known = HashSet::new();
@@ -165,7 +165,7 @@ fn chunks(plan: &Plan) -> Result<Vec<Chunk>, StoreError> {
         });
         let chunk = chunks.entry(batch_of(&word.item.id, plan.n_chunks)).or_default();
         let commit = Arc::clone(&commit.key);
-        chunk.insert(word.item.id.clone(), Live { item: word.item, header, commit });
+        chunk.insert(word.item.id.clone(), LiveItem { item: word.item, header, commit });
     })?;
     let (headers, known) = (Arc::new(headers), Arc::new(known));
     let chunk = |items| Chunk { items, headers: Arc::clone(&headers), known: Arc::clone(&known) };
@@ -193,7 +193,7 @@ fn write(
     let mut parts = Vec::new();
     for schema in schemas {
         let (name, version) = (schema.name, schema.version);
-        let mut rows = Rows::new(schema.clone());
+        let mut rows = PartRows::new(schema.clone());
         for commit in &commits {
             for part in commit.parts.iter().filter(|part| part.table == name) {
                 let live = LivePart {
@@ -230,7 +230,7 @@ fn write(
     }
     let manifest = manifest(stage, key, &commits, chunk, parts, items);
     match publish_manifest(store, &manifest)? {
-        Put::Written | Put::AlreadyThere => Ok(()),
+        PutOutcome::Written | PutOutcome::AlreadyThere => Ok(()),
     }
 }
 
@@ -244,13 +244,13 @@ fn manifest(
 ) -> Manifest {
     // The headers that this chunk names, in the order in which it names them.
     let (mut headers, mut places) = (Vec::new(), HashMap::new());
-    let of = chunk.items.values().map(|live| {
+    let header_indices = chunk.items.values().map(|live| {
         *places.entry(live.header).or_insert_with(|| {
             headers.push(chunk.headers[live.header].clone());
             headers.len() as u32 - 1
         })
     });
-    let of = of.collect();
+    let header_indices = header_indices.collect();
     let generation = 1 + commits.iter().map(|commit| commit.generation).max().unwrap_or(0);
     Manifest {
         format: COMPACTED_FORMAT,
@@ -262,7 +262,7 @@ fn manifest(
         origin: String::new(),
         parts,
         items,
-        compacted: Some(Compacted { generation, commits: headers, of }),
+        compacted: Some(Compacted { generation, commits: headers, of: header_indices }),
     }
 }
 
@@ -285,14 +285,14 @@ fn key_of(stage: &str, schemas: &[TableSchema], commits: &BTreeSet<&str>, chunk:
 }
 
 /// Rows of a table on their way into a part, item by item.
-struct Rows {
+struct PartRows {
     schema: TableSchema,
     batches: Vec<RecordBatch>,
     /// Items, their batches, and their rows in those.
     runs: Vec<(String, usize, std::ops::Range<usize>)>,
 }
 
-impl Rows {
+impl PartRows {
     fn new(schema: TableSchema) -> Self {
         Self { schema, batches: Vec::new(), runs: Vec::new() }
     }

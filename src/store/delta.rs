@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 
 use super::StoreError;
 use super::digest::digest_texts;
-use super::location::{Location, Put};
+use super::location::{Location, PutOutcome};
 use super::schema::{ColumnType, TableSchema, TimestampUs};
 use super::store_snapshot::{LivePart, StoreSnapshot};
 use super::tables;
@@ -22,7 +22,7 @@ const FOLDER: &str = "_delta_log";
 /// Times that a version is written again that another process wrote first.
 const RETRIES: usize = 8;
 
-/// What a table's log says.
+/// The state of a table by its log.
 #[derive(Default)]
 struct Log {
     next_version: u64,
@@ -94,8 +94,9 @@ fn read(store: &Location, table: &str) -> Result<Log, StoreError> {
             let action: Value = serde_json::from_slice(line)
                 .map_err(|e| refuse(format!("is damaged in {} ({e})", listed.path)))?;
             if let Some(protocol) = action.get("protocol") {
-                let of = |name: &str| protocol.get(name).and_then(Value::as_u64).unwrap_or(0);
-                let found = [of("minReaderVersion"), of("minWriterVersion")];
+                let version_of =
+                    |name: &str| protocol.get(name).and_then(Value::as_u64).unwrap_or(0);
+                let found = [version_of("minReaderVersion"), version_of("minWriterVersion")];
                 if found != PROTOCOL {
                     return Err(refuse(format!(
                         "is of protocol {}/{}, this program writes {}/{}; move it away",
@@ -126,7 +127,7 @@ fn write(store: &Location, schema: &TableSchema, parts: &[LivePart]) -> Result<b
             return Ok(false);
         };
         let path = format!("{}/{FOLDER}/{:020}.json", schema.name, log.next_version);
-        if store.put_new(&path, Bytes::from(text))? == Put::Written {
+        if store.put_new(&path, Bytes::from(text))? == PutOutcome::Written {
             return Ok(true);
         }
     }

@@ -12,7 +12,7 @@ pub fn digest(bytes: &[u8]) -> String {
 /// Returns the digest of everything left in a reader.
 ///
 /// # Errors
-/// What the reader says.
+/// The error of the reader.
 pub fn digest_of(reader: &mut impl std::io::Read) -> std::io::Result<String> {
     let mut hasher = blake3::Hasher::new();
     let mut buffer = vec![0; 1 << 20];

@@ -50,7 +50,7 @@ impl Snapshot {
         };
         for batch in self.batches_of(wanted)? {
             let batch = batch?;
-            let columns = Columns::of(&batch, self)?;
+            let columns = FrameColumns::of(&batch, self)?;
             let mut row = 0;
             while row < batch.num_rows() {
                 let name = columns.items.value(row);
@@ -82,13 +82,13 @@ impl Snapshot {
 }
 
 /// The columns of a batch of a frame table.
-struct Columns<'a> {
+struct FrameColumns<'a> {
     items: &'a StringArray,
     numbers: &'a Int32Array,
     channels: Vec<&'a Float32Array>,
 }
 
-impl<'a> Columns<'a> {
+impl<'a> FrameColumns<'a> {
     fn of(batch: &'a RecordBatch, table: &Snapshot) -> Result<Self, StoreError> {
         let column = |i: usize| batch.column_by_name(&table.schema.columns[i].name);
         let missing = || table.broken("a batch", "has no columns of frames".to_owned());
@@ -123,15 +123,15 @@ impl<'a> Columns<'a> {
 }
 
 /// Rows of numbers of one width, appended in any order and read at random: in memory, or in a file of
-/// this machine that nobody else sees and that goes with the program.
+/// this machine that other processes do not see and that is removed with the program.
 #[derive(Debug)]
 pub struct FrameSpool {
     width: usize,
-    kept: Kept,
+    kept: SpoolStorage,
 }
 
 #[derive(Debug)]
-enum Kept {
+enum SpoolStorage {
     Memory(Mutex<Vec<f32>>),
     File { file: File, n_rows: Mutex<u64> },
 }
@@ -139,7 +139,7 @@ enum Kept {
 impl FrameSpool {
     /// Makes an empty spool in memory.
     pub fn in_memory(width: usize) -> Self {
-        Self { width, kept: Kept::Memory(Mutex::default()) }
+        Self { width, kept: SpoolStorage::Memory(Mutex::default()) }
     }
 
     /// Makes an empty spool in a nameless file of the folder for temporary files (`TMPDIR`).
@@ -148,7 +148,7 @@ impl FrameSpool {
     /// [`StoreError::Io`] when no file can be made.
     pub fn in_file(width: usize) -> Result<Self, StoreError> {
         let file = tempfile::tempfile().map_err(|e| failed("make", e))?;
-        Ok(Self { width, kept: Kept::File { file, n_rows: Mutex::new(0) } })
+        Ok(Self { width, kept: SpoolStorage::File { file, n_rows: Mutex::new(0) } })
     }
 
     /// Appends rows, and returns the place of the first.
@@ -162,13 +162,13 @@ impl FrameSpool {
         assert_eq!(rows.ncols(), self.width, "width of the spool");
         let values = rows.iter().copied();
         match &self.kept {
-            Kept::Memory(kept) => {
+            SpoolStorage::Memory(kept) => {
                 let mut kept = kept.lock().unwrap_or_else(PoisonError::into_inner);
                 let first = kept.len() / self.width.max(1);
                 kept.extend(values);
                 Ok(first as u64)
             }
-            Kept::File { file, n_rows } => {
+            SpoolStorage::File { file, n_rows } => {
                 let bytes: Vec<u8> = values.flat_map(f32::to_le_bytes).collect();
                 let first = {
                     let mut n_rows = n_rows.lock().unwrap_or_else(PoisonError::into_inner);
@@ -188,7 +188,7 @@ impl FrameSpool {
     /// [`StoreError::Io`] when the file cannot be read, or ends before.
     pub fn read(&self, first: u64, target: &mut [f32]) -> Result<(), StoreError> {
         match &self.kept {
-            Kept::Memory(kept) => {
+            SpoolStorage::Memory(kept) => {
                 let kept = kept.lock().unwrap_or_else(PoisonError::into_inner);
                 let start = first as usize * self.width;
                 let source = kept.get(start..start + target.len()).ok_or_else(|| {
@@ -196,7 +196,7 @@ impl FrameSpool {
                 })?;
                 target.copy_from_slice(source);
             }
-            Kept::File { file, .. } => {
+            SpoolStorage::File { file, .. } => {
                 let mut bytes = vec![0; size_of_val(target)];
                 read_at(file, &mut bytes, first * self.row_bytes())
                     .map_err(|e| failed("read", e))?;

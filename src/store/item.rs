@@ -24,7 +24,7 @@ pub struct ItemTables {
 }
 
 impl ItemTables {
-    /// Looks an item up; one that nobody has settled has no rows.
+    /// Looks an item up; one that was not settled has no rows.
     ///
     /// # Errors
     /// [`StoreError`] when the commits cannot be read.

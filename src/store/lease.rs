@@ -2,7 +2,7 @@
 //!
 //! `leases/<name>/<number>.json`, each put unless it is there: the highest number tells who holds the lease and until
 //! when. The holder renews it under the next number for as long as it lives; when it is killed the lease runs out,
-//! and whoever waits takes the next number. Nobody ever has to change an object.
+//! and a process that waits takes the next number. No object is ever changed.
 
 use std::path::Path as FsPath;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 
 use super::StoreError;
-use super::location::{Location, Put};
+use super::location::{Location, PutOutcome};
 use super::schema::TimestampUs;
 
 /// Folder of the leases.
@@ -26,7 +26,7 @@ const PAUSE: Duration = Duration::from_millis(500);
 
 /// Who holds a lease, and until when.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-struct Terms {
+struct LeaseTerms {
     holder: Holder,
     expires_us: i64,
     is_released: bool,
@@ -37,7 +37,7 @@ struct Terms {
 struct Holder {
     host: String,
     pid: u32,
-    /// What tells this machine since it was started, and its process numbers, from all others.
+    /// The identity of this machine since it was started, as process numbers are only unique there.
     machine: String,
     /// When the process started, in ticks since the machine did.
     started: String,
@@ -115,7 +115,8 @@ impl Lease {
                 Some((number, _)) => number + 1,
                 None => 1,
             };
-            if put(store, name, number, &Terms::new(&holder, lifetime))? == Put::Written {
+            if put(store, name, number, &LeaseTerms::new(&holder, lifetime))? == PutOutcome::Written
+            {
                 // A listing that was taken while numbers came and went may have missed the highest.
                 if latest(store, name)?.is_none_or(|(highest, _)| highest <= number) {
                     return Ok(Self::hold(store, name, holder, lifetime, number));
@@ -123,7 +124,7 @@ impl Lease {
                 store.remove(&format!("{}/{number:010}.json", folder(name)))?;
                 continue;
             }
-            // Somebody else was faster; it is looked at again, as one that was renewed.
+            // Another process was faster; the lease is looked at again, as one that was renewed.
             seen = Some(number - 1);
         }
     }
@@ -168,7 +169,7 @@ impl Drop for Lease {
         if state.is_lost {
             return;
         }
-        let terms = Terms {
+        let terms = LeaseTerms {
             holder: self.held.holder.clone(),
             expires_us: TimestampUs::now().0,
             is_released: true,
@@ -201,14 +202,19 @@ impl HeldLease {
             }
             let number = state.number + 1;
             let begun = Instant::now();
-            match put(&self.store, &self.name, number, &Terms::new(&self.holder, self.lifetime)) {
-                Ok(Put::Written) => {
+            match put(
+                &self.store,
+                &self.name,
+                number,
+                &LeaseTerms::new(&self.holder, self.lifetime),
+            ) {
+                Ok(PutOutcome::Written) => {
                     state.number = number;
                     valid_until = begun + self.lifetime;
                     drop(state);
                     self.forget_old(number);
                 }
-                Ok(Put::AlreadyThere) => {
+                Ok(PutOutcome::AlreadyThere) => {
                     state.is_lost = true;
                     return;
                 }
@@ -229,7 +235,7 @@ impl HeldLease {
     }
 }
 
-impl Terms {
+impl LeaseTerms {
     fn new(holder: &Holder, lifetime: Duration) -> Self {
         let lifetime_us = i64::try_from(lifetime.as_micros()).unwrap_or(i64::MAX);
         let expires_us = TimestampUs::now().0.saturating_add(lifetime_us);
@@ -295,7 +301,7 @@ fn started(pid: u32) -> Option<String> {
     // The name of the program may hold anything; what follows it is the third field.
     let (_, rest) = stat.rsplit_once(')')?;
     let mut fields = rest.split_whitespace();
-    // A process that ended and that nobody has waited for is dead.
+    // A process that ended and was not yet waited for is dead.
     let state = fields.next()?;
     (state != "Z" && state != "X").then_some(())?;
     fields.nth(18).map(str::to_owned)
@@ -310,15 +316,15 @@ fn number_of(path: &str) -> Option<u64> {
 }
 
 /// Returns the terms of the highest number, if the lease was ever taken.
-fn latest(store: &Location, name: &str) -> Result<Option<(u64, Terms)>, StoreError> {
+fn latest(store: &Location, name: &str) -> Result<Option<(u64, LeaseTerms)>, StoreError> {
     for _ in 0..8 {
         let listed = store.list(&folder(name))?;
         let numbers = listed.iter().filter_map(|l| Some((number_of(&l.path)?, &l.path)));
         let Some((number, path)) = numbers.max() else { return Ok(None) };
         // One that was renewed meanwhile is gone.
         let Some(bytes) = store.read_if_there(path)? else { continue };
-        // What cannot be read is over as soon as somebody takes the next number.
-        let terms = serde_json::from_slice(&bytes).unwrap_or(Terms {
+        // A lease that cannot be read is over as soon as a process takes the next number.
+        let terms = serde_json::from_slice(&bytes).unwrap_or(LeaseTerms {
             holder: Holder::default(),
             expires_us: 0,
             is_released: true,
@@ -329,7 +335,12 @@ fn latest(store: &Location, name: &str) -> Result<Option<(u64, Terms)>, StoreErr
     Err(StoreError::Held { what: name.to_owned(), holder })
 }
 
-fn put(store: &Location, name: &str, number: u64, terms: &Terms) -> Result<Put, StoreError> {
+fn put(
+    store: &Location,
+    name: &str,
+    number: u64,
+    terms: &LeaseTerms,
+) -> Result<PutOutcome, StoreError> {
     let text = serde_json::to_vec(terms).expect("invariant: terms are strings and numbers");
     store.put_new(&format!("{}/{number:010}.json", folder(name)), text.into())
 }

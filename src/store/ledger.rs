@@ -9,23 +9,23 @@ use super::location::Location;
 use super::manifest::{Header, Item, Manifest};
 use super::stage_log::StageLog;
 
-/// What a store knows of one stage's items.
+/// The settled items of one stage in a store.
 #[derive(Debug, Default)]
 pub struct Ledger {
     /// Sorted by id: of a million items a list takes half the memory of a map that repeats their ids.
-    settled: Vec<Settled>,
-    /// What was settled since, which counts before it.
-    added: HashMap<String, Settled>,
+    settled: Vec<SettledItem>,
+    /// Items that were settled since, which take precedence.
+    added: HashMap<String, SettledItem>,
 }
 
-/// The latest word on an item, and what the commit that settled it says of all its items.
+/// The latest settlement of an item, with the header of the commit that settled it.
 #[derive(Clone, Debug)]
-pub struct Settled {
+pub struct SettledItem {
     pub item: Item,
     header: Arc<Header>,
 }
 
-impl Deref for Settled {
+impl Deref for SettledItem {
     type Target = Header;
 
     fn deref(&self) -> &Header {
@@ -54,7 +54,7 @@ impl Ledger {
                     header
                 }
             };
-            ledger.settled.push(Settled { item: word.item, header });
+            ledger.settled.push(SettledItem { item: word.item, header });
         })?;
         // A log that was read again says everything twice; the later word replaces the same word.
         ledger.settled.reverse();
@@ -68,13 +68,13 @@ impl Ledger {
         let headers: Vec<_> = manifest.headers().into_iter().map(Arc::new).collect();
         for (i, item) in manifest.items.iter().enumerate() {
             let header = Arc::clone(&headers[manifest.header_of(i)]);
-            self.added.insert(item.id.clone(), Settled { item: item.clone(), header });
+            self.added.insert(item.id.clone(), SettledItem { item: item.clone(), header });
         }
     }
 
     /// Returns the items from `origin` that failed last time, in order of id.
     pub fn failed(&self, origin: &str) -> Vec<&str> {
-        let failed = |s: &&Settled| s.item.failure.is_some() && s.origin == origin;
+        let failed = |s: &&SettledItem| s.item.failure.is_some() && s.origin == origin;
         let mut ids: Vec<_> = self.all().filter(failed).map(|s| s.item.id.as_str()).collect();
         ids.sort_unstable();
         ids
@@ -86,7 +86,7 @@ impl Ledger {
     }
 
     /// Returns the latest word on an item.
-    pub fn get(&self, id: &str) -> Option<&Settled> {
+    pub fn get(&self, id: &str) -> Option<&SettledItem> {
         let before = || {
             let place =
                 self.settled.binary_search_by(|known| known.item.id.as_str().cmp(id)).ok()?;
@@ -95,8 +95,8 @@ impl Ledger {
         self.added.get(id).or_else(before)
     }
 
-    fn all(&self) -> impl Iterator<Item = &Settled> {
-        let is_latest = |known: &&Settled| !self.added.contains_key(&known.item.id);
+    fn all(&self) -> impl Iterator<Item = &SettledItem> {
+        let is_latest = |known: &&SettledItem| !self.added.contains_key(&known.item.id);
         self.settled.iter().filter(is_latest).chain(self.added.values())
     }
 }

@@ -3,7 +3,7 @@
 use std::path::Path as FsPath;
 
 use super::StoreError;
-use super::location::{Listed, Put};
+use super::location::{ListedObject, PutOutcome};
 
 /// Start of the names of files being written. The dot keeps an abandoned one out of `*.parquet` globs
 /// and of listings.
@@ -58,22 +58,22 @@ fn sync_folder(folder: &FsPath) -> std::io::Result<()> {
 }
 
 /// Links a temporary file to its final name after fsync of the data, then fsyncs the folder.
-pub fn persist_new(file: tempfile::NamedTempFile, path: &FsPath) -> std::io::Result<Put> {
+pub fn persist_new(file: tempfile::NamedTempFile, path: &FsPath) -> std::io::Result<PutOutcome> {
     file.as_file().sync_all()?;
     match file.persist_noclobber(path) {
         Ok(_) => {}
         Err(e) if e.error.kind() == std::io::ErrorKind::AlreadyExists => {
-            return Ok(Put::AlreadyThere);
+            return Ok(PutOutcome::AlreadyThere);
         }
         Err(e) => return Err(e.error),
     }
     if let Some(folder) = path.parent() {
         sync_folder(folder)?;
     }
-    Ok(Put::Written)
+    Ok(PutOutcome::Written)
 }
 
-pub fn list(root: &FsPath, folder: &str) -> Result<Vec<Listed>, StoreError> {
+pub fn list(root: &FsPath, folder: &str) -> Result<Vec<ListedObject>, StoreError> {
     let start = root.join(folder);
     if !start.exists() {
         return Ok(Vec::new());
@@ -91,7 +91,7 @@ pub fn list(root: &FsPath, folder: &str) -> Result<Vec<Listed>, StoreError> {
             continue;
         };
         let size_bytes = entry.metadata().map(|m| m.len()).unwrap_or_default();
-        found.push(Listed { path: path.to_owned(), size_bytes });
+        found.push(ListedObject { path: path.to_owned(), size_bytes });
     }
     Ok(found)
 }
@@ -154,7 +154,7 @@ mod tests {
             "models/m/.partial-ABCDEF",
             "baselines/.partial-123abc",
         ];
-        let of_others = [
+        let foreign_paths = [
             ".tmp_important_notes",
             ".partial-a1B2c3",
             "projects/a/.tmpl.html",
@@ -167,7 +167,7 @@ mod tests {
             "runs/a/diffusion/.tmp_notes",
             "runs/a/diffusion/deeper/.partial-a1B2c3",
         ];
-        ours.iter().chain(&of_others).for_each(|path| write(path, 2));
+        ours.iter().chain(&foreign_paths).for_each(|path| write(path, 2));
         write("motion/.partial-y0unG5", 0);
         sweep(root.path());
         let left: BTreeSet<String> = walkdir::WalkDir::new(root.path())
@@ -176,7 +176,7 @@ mod tests {
             .filter(|entry| entry.file_type().is_file())
             .map(|entry| entry.path().strip_prefix(root.path()).unwrap().display().to_string())
             .collect();
-        let expected = of_others.iter().chain(&["motion/.partial-y0unG5"]);
+        let expected = foreign_paths.iter().chain(&["motion/.partial-y0unG5"]);
         assert_eq!(left, expected.map(|path| (*path).to_owned()).collect());
     }
 }

@@ -30,18 +30,18 @@ const READS_IN_FLIGHT: usize = 32;
 pub struct Location {
     /// The location as a URL without a trailing slash; a local path is made absolute.
     url: String,
-    kind: Kind,
+    kind: LocationKind,
 }
 
 #[derive(Clone, Debug)]
-pub(crate) enum Kind {
+pub(crate) enum LocationKind {
     Local(PathBuf),
     Remote { store: Arc<dyn ObjectStore>, prefix: ObjectPath },
 }
 
-/// What a listing tells of one object, or of one file below a local folder.
+/// An object of a listing, or a file below a local folder.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Listed {
+pub struct ListedObject {
     /// Path below the location, `/`-separated.
     pub path: String,
     pub size_bytes: u64,
@@ -49,7 +49,7 @@ pub struct Listed {
 
 /// Whether a put wrote the object or found it there.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Put {
+pub enum PutOutcome {
     Written,
     AlreadyThere,
 }
@@ -86,7 +86,7 @@ impl Location {
             full.push('/');
             full.push_str(prefix.as_ref());
         }
-        Ok(Self { url: full, kind: Kind::Remote { store, prefix } })
+        Ok(Self { url: full, kind: LocationKind::Remote { store, prefix } })
     }
 
     /// Returns a location behind a client that the caller holds already, for embedders; `url` is
@@ -94,7 +94,7 @@ impl Location {
     pub fn with_client(url: &str, store: Arc<dyn ObjectStore>, prefix: &str) -> Self {
         let prefix = remote::join(&ObjectPath::default(), prefix);
         let url = url.trim_end_matches('/').to_owned();
-        Self { url, kind: Kind::Remote { store, prefix } }
+        Self { url, kind: LocationKind::Remote { store, prefix } }
     }
 
     /// Opens a local folder, which need not exist.
@@ -109,7 +109,7 @@ impl Location {
             .map_err(|e| StoreError::io("find", &path.display().to_string(), e))?;
         let url = Url::from_file_path(&absolute).map(String::from).unwrap_or_default();
         let url = url.trim_end_matches('/').to_owned();
-        Ok(Self { url, kind: Kind::Local(absolute) })
+        Ok(Self { url, kind: LocationKind::Local(absolute) })
     }
 
     /// Returns the location as a URL, without a trailing slash.
@@ -123,28 +123,28 @@ impl Location {
     /// as `gsutil` and `aws s3` print it.
     pub fn url_of(&self, path: &str) -> String {
         match &self.kind {
-            Kind::Local(root) => {
+            LocationKind::Local(root) => {
                 Url::from_file_path(root.join(path)).map(String::from).unwrap_or_default()
             }
-            Kind::Remote { .. } => format!("{}/{path}", self.url),
+            LocationKind::Remote { .. } => format!("{}/{path}", self.url),
         }
     }
 
     /// Returns the folder on this machine, or `None` for a remote location.
     pub fn local_path(&self) -> Option<&FsPath> {
         match &self.kind {
-            Kind::Local(path) => Some(path),
-            Kind::Remote { .. } => None,
+            LocationKind::Local(path) => Some(path),
+            LocationKind::Remote { .. } => None,
         }
     }
 
-    pub(crate) fn kind(&self) -> &Kind {
+    pub(crate) fn kind(&self) -> &LocationKind {
         &self.kind
     }
 
     /// Removes temporary files that killed writers left in a local store's own folders more than a day ago.
     pub fn sweep(&self) {
-        if let Kind::Local(root) = &self.kind {
+        if let LocationKind::Local(root) = &self.kind {
             local::sweep(root);
         }
     }
@@ -153,10 +153,10 @@ impl Location {
     ///
     /// # Errors
     /// [`StoreError`] when the storage cannot be listed.
-    pub fn list(&self, folder: &str) -> Result<Vec<Listed>, StoreError> {
+    pub fn list(&self, folder: &str) -> Result<Vec<ListedObject>, StoreError> {
         let mut found = match &self.kind {
-            Kind::Local(root) => local::list(root, folder)?,
-            Kind::Remote { store, prefix } => {
+            LocationKind::Local(root) => local::list(root, folder)?,
+            LocationKind::Remote { store, prefix } => {
                 let below = remote::join(prefix, folder);
                 let metas: Vec<_> = block_on(store.list(Some(&below)).try_collect())
                     .map_err(|e| StoreError::remote("list", &self.url_of(folder), e))?;
@@ -164,7 +164,7 @@ impl Location {
                     .into_iter()
                     .filter_map(|meta| {
                         let path = remote::relative(prefix, &meta.location)?;
-                        Some(Listed { path, size_bytes: meta.size })
+                        Some(ListedObject { path, size_bytes: meta.size })
                     })
                     .collect()
             }
@@ -180,10 +180,10 @@ impl Location {
     pub(crate) fn list_with_times(
         &self,
         folder: &str,
-    ) -> Result<Vec<(Listed, SystemTime)>, StoreError> {
-        let mut found: Vec<(Listed, SystemTime)> = match &self.kind {
-            Kind::Local(root) => {
-                let time_of = |listed: &Listed| {
+    ) -> Result<Vec<(ListedObject, SystemTime)>, StoreError> {
+        let mut found: Vec<(ListedObject, SystemTime)> = match &self.kind {
+            LocationKind::Local(root) => {
+                let time_of = |listed: &ListedObject| {
                     let modified = std::fs::metadata(root.join(&listed.path))?.modified()?;
                     Ok::<_, std::io::Error>(modified)
                 };
@@ -193,7 +193,7 @@ impl Location {
                     .filter_map(|listed| time_of(&listed).ok().map(|time| (listed, time)))
                     .collect()
             }
-            Kind::Remote { store, prefix } => {
+            LocationKind::Remote { store, prefix } => {
                 let below = remote::join(prefix, folder);
                 let metas: Vec<_> = block_on(store.list(Some(&below)).try_collect())
                     .map_err(|e| StoreError::remote("list", &self.url_of(folder), e))?;
@@ -201,7 +201,7 @@ impl Location {
                     .into_iter()
                     .filter_map(|meta| {
                         let path = remote::relative(prefix, &meta.location)?;
-                        let listed = Listed { path, size_bytes: meta.size };
+                        let listed = ListedObject { path, size_bytes: meta.size };
                         Some((listed, meta.last_modified.into()))
                     })
                     .collect()
@@ -218,7 +218,7 @@ impl Location {
     pub(crate) fn size_bytes(&self, path: &str) -> Result<u64, StoreError> {
         let place = || self.url_of(path);
         match &self.kind {
-            Kind::Local(root) => {
+            LocationKind::Local(root) => {
                 let found = std::fs::metadata(root.join(path))
                     .map_err(|e| StoreError::io("measure", &place(), e))?;
                 if found.is_file() {
@@ -227,9 +227,11 @@ impl Location {
                     Err(StoreError::NotAFile { place: place() })
                 }
             }
-            Kind::Remote { store, prefix } => block_on(store.head(&remote::join(prefix, path)))
-                .map(|meta| meta.size)
-                .map_err(|e| StoreError::remote("measure", &place(), e)),
+            LocationKind::Remote { store, prefix } => {
+                block_on(store.head(&remote::join(prefix, path)))
+                    .map(|meta| meta.size)
+                    .map_err(|e| StoreError::remote("measure", &place(), e))
+            }
         }
     }
 
@@ -240,17 +242,17 @@ impl Location {
     pub fn read(&self, path: &str) -> Result<Bytes, StoreError> {
         let place = || self.url_of(path);
         match &self.kind {
-            Kind::Local(root) => std::fs::read(root.join(path))
+            LocationKind::Local(root) => std::fs::read(root.join(path))
                 .map(Bytes::from)
                 .map_err(|e| StoreError::io("read", &place(), e)),
-            Kind::Remote { store, prefix } => {
+            LocationKind::Remote { store, prefix } => {
                 block_on(remote::read_object(store, &remote::join(prefix, path)))
                     .map_err(|e| StoreError::remote("read", &place(), e))
             }
         }
     }
 
-    /// Reads a whole object that somebody else wrote, if it is a regular file of at most so many bytes.
+    /// Reads a whole object that another program wrote, if it is a regular file of at most `max_bytes`.
     ///
     /// # Errors
     /// [`StoreError::NotAFile`], [`StoreError::TooLarge`], and as [`Location::read`].
@@ -266,11 +268,11 @@ impl Location {
     /// Returns whether anything was ever committed here.
     ///
     /// # Errors
-    /// What the storage says.
+    /// The error of the storage.
     pub fn is_store(&self) -> Result<bool, StoreError> {
         match &self.kind {
-            Kind::Local(root) => Ok(root.join(COMMITS).is_dir()),
-            Kind::Remote { store, prefix } => {
+            LocationKind::Local(root) => Ok(root.join(COMMITS).is_dir()),
+            LocationKind::Remote { store, prefix } => {
                 let below = remote::join(prefix, COMMITS);
                 let first = block_on(store.list(Some(&below)).try_next());
                 let first = first.map_err(|e| StoreError::remote("list", &self.url, e))?;
@@ -282,7 +284,7 @@ impl Location {
     /// Reads a whole object; none where there is no such object.
     ///
     /// # Errors
-    /// What the storage says.
+    /// The error of the storage.
     pub fn read_if_there(&self, path: &str) -> Result<Option<Bytes>, StoreError> {
         match self.read(path) {
             Err(StoreError::NotFound { .. }) => Ok(None),
@@ -294,11 +296,11 @@ impl Location {
     ///
     /// # Errors
     /// The first failure.
-    pub fn read_many(&self, listed: &[Listed]) -> Result<Vec<Bytes>, StoreError> {
+    pub fn read_many(&self, listed: &[ListedObject]) -> Result<Vec<Bytes>, StoreError> {
         match &self.kind {
-            Kind::Local(_) => listed.iter().map(|l| self.read(&l.path)).collect(),
-            Kind::Remote { store, prefix } => {
-                let reads = listed.iter().map(|Listed { path, size_bytes }| async move {
+            LocationKind::Local(_) => listed.iter().map(|l| self.read(&l.path)).collect(),
+            LocationKind::Remote { store, prefix } => {
+                let reads = listed.iter().map(|ListedObject { path, size_bytes }| async move {
                     remote::read_sized(store, &remote::join(prefix, path), *size_bytes)
                         .await
                         .map_err(|e| StoreError::remote("read", &self.url_of(path), e))
@@ -311,17 +313,17 @@ impl Location {
     /// Writes `bytes` at `path` unless something is there: whole or absent, and durable on return.
     ///
     /// # Errors
-    /// What the storage says; an existing object is not an error but [`Put::AlreadyThere`].
-    pub fn put_new(&self, path: &str, bytes: Bytes) -> Result<Put, StoreError> {
+    /// What the storage says; an existing object is not an error but [`PutOutcome::AlreadyThere`].
+    pub fn put_new(&self, path: &str, bytes: Bytes) -> Result<PutOutcome, StoreError> {
         let place = || self.url_of(path);
         match &self.kind {
-            Kind::Local(root) => {
+            LocationKind::Local(root) => {
                 let io = |e| StoreError::io("write", &place(), e);
                 let mut file = local::temporary_in(&folder_of(root, path)).map_err(io)?;
                 file.write_all(&bytes).map_err(io)?;
                 local::persist_new(file, &root.join(path)).map_err(io)
             }
-            Kind::Remote { store, prefix } => {
+            LocationKind::Remote { store, prefix } => {
                 let object = remote::join(prefix, path);
                 block_on(remote::create(store, &object, &bytes))
                     .map_err(|e| StoreError::remote("write", &place(), e))
@@ -332,17 +334,17 @@ impl Location {
     /// Writes `bytes` at `path` in place of what is there: the old or the new is there at any moment, whole.
     ///
     /// # Errors
-    /// What the storage says.
+    /// The error of the storage.
     pub fn replace(&self, path: &str, bytes: Bytes) -> Result<(), StoreError> {
         let place = || self.url_of(path);
         match &self.kind {
-            Kind::Local(root) => {
+            LocationKind::Local(root) => {
                 let io = |e| StoreError::io("write", &place(), e);
                 let mut file = output::temporary_beside(&root.join(path)).map_err(io)?;
                 file.write_all(&bytes).map_err(io)?;
                 output::replace_file(&root.join(path), file).map_err(io)
             }
-            Kind::Remote { store, prefix } => {
+            LocationKind::Remote { store, prefix } => {
                 block_on(store.put(&remote::join(prefix, path), bytes.into()))
                     .map(|_| ())
                     .map_err(|e| StoreError::remote("write", &place(), e))
@@ -357,15 +359,15 @@ impl Location {
     /// [`StoreError::Io`] when no file can be made.
     pub fn temporary(&self, path: &str) -> Result<tempfile::NamedTempFile, StoreError> {
         match &self.kind {
-            Kind::Local(root) => local::temporary_in(&folder_of(root, path)),
-            Kind::Remote { .. } => tempfile::NamedTempFile::new(),
+            LocationKind::Local(root) => local::temporary_in(&folder_of(root, path)),
+            LocationKind::Remote { .. } => tempfile::NamedTempFile::new(),
         }
         .map_err(|e| StoreError::io("make a temporary file beside it", &self.url_of(path), e))
     }
 
-    /// Says of a local file that it was written now, so that nobody takes it for abandoned; best effort.
+    /// Sets the time of a local file to now, so that it is not taken for abandoned; best effort.
     pub(crate) fn touch(&self, path: &str) {
-        if let Kind::Local(root) = &self.kind
+        if let LocationKind::Local(root) = &self.kind
             && let Ok(file) = std::fs::File::options().write(true).open(root.join(path))
         {
             file.set_modified(SystemTime::now()).ok();
@@ -375,14 +377,16 @@ impl Location {
     /// Removes an object; one that is gone already is no error.
     ///
     /// # Errors
-    /// What the storage says.
+    /// The error of the storage.
     pub fn remove(&self, path: &str) -> Result<(), StoreError> {
         let place = || self.url_of(path);
         let removed = match &self.kind {
-            Kind::Local(root) => std::fs::remove_file(root.join(path))
+            LocationKind::Local(root) => std::fs::remove_file(root.join(path))
                 .map_err(|e| StoreError::io("remove", &place(), e)),
-            Kind::Remote { store, prefix } => block_on(store.delete(&remote::join(prefix, path)))
-                .map_err(|e| StoreError::remote("remove", &place(), e)),
+            LocationKind::Remote { store, prefix } => {
+                block_on(store.delete(&remote::join(prefix, path)))
+                    .map_err(|e| StoreError::remote("remove", &place(), e))
+            }
         };
         match removed {
             Err(StoreError::NotFound { .. }) => Ok(()),
@@ -396,17 +400,17 @@ impl Location {
     /// writer of the same path writes the same bytes, because paths are content keys.
     ///
     /// # Errors
-    /// What the storage says; an existing object is not an error but [`Put::AlreadyThere`].
+    /// What the storage says; an existing object is not an error but [`PutOutcome::AlreadyThere`].
     pub fn put_file_new(
         &self,
         path: &str,
         file: tempfile::NamedTempFile,
-    ) -> Result<Put, StoreError> {
+    ) -> Result<PutOutcome, StoreError> {
         let place = || self.url_of(path);
         let io = |e| StoreError::io("write", &place(), e);
         match &self.kind {
-            Kind::Local(root) => local::persist_new(file, &root.join(path)).map_err(io),
-            Kind::Remote { store, prefix } => {
+            LocationKind::Local(root) => local::persist_new(file, &root.join(path)).map_err(io),
+            LocationKind::Remote { store, prefix } => {
                 let size = file.as_file().metadata().map_err(io)?.len();
                 if size <= remote::SINGLE_PUT_BYTES as u64 {
                     let bytes = std::fs::read(file.path()).map_err(io)?;
@@ -415,15 +419,15 @@ impl Location {
                 let path = remote::join(prefix, path);
                 let put = async {
                     match store.head(&path).await {
-                        Ok(_) => return Ok(Put::AlreadyThere),
+                        Ok(_) => return Ok(PutOutcome::AlreadyThere),
                         Err(object_store::Error::NotFound { .. }) => {}
                         Err(e) => return Err(e),
                     }
                     match remote::upload(store, &path, file.path()).await {
-                        Ok(()) => Ok(Put::Written),
+                        Ok(()) => Ok(PutOutcome::Written),
                         // As in `create`: the last answer may have been lost.
                         Err(e) => match store.head(&path).await {
-                            Ok(there) if there.size == size => Ok(Put::Written),
+                            Ok(there) if there.size == size => Ok(PutOutcome::Written),
                             _ => Err(e),
                         },
                     }
@@ -443,8 +447,8 @@ fn folder_of(root: &FsPath, path: &str) -> PathBuf {
 impl fmt::Display for Location {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match &self.kind {
-            Kind::Local(path) => write!(f, "{}", path.display()),
-            Kind::Remote { .. } => f.write_str(&self.url),
+            LocationKind::Local(path) => write!(f, "{}", path.display()),
+            LocationKind::Remote { .. } => f.write_str(&self.url),
         }
     }
 }

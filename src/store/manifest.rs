@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::StoreError;
-use super::location::{Listed, Location};
+use super::location::{ListedObject, Location};
 
 /// Layout of the manifests of stages; raised when a field changes its meaning.
 pub(super) const MANIFEST_FORMAT: u32 = 1;
@@ -43,7 +43,7 @@ pub struct Compacted {
     pub of: Vec<u32>,
 }
 
-/// What a commit says of all its items.
+/// The properties that all items of a commit share.
 #[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Header {
     pub key: String,
@@ -189,7 +189,7 @@ pub(super) fn stage_and_key(path: &str) -> Option<(&str, &str)> {
 }
 
 /// Reads manifests that a listing told of, in that order.
-pub(super) fn read(store: &Location, listed: &[Listed]) -> Result<Vec<Manifest>, StoreError> {
+pub(super) fn read(store: &Location, listed: &[ListedObject]) -> Result<Vec<Manifest>, StoreError> {
     let read = store.read_many(listed)?;
     listed
         .iter()
@@ -226,11 +226,12 @@ mod tests {
     fn compactions_name_a_commit_for_every_item() {
         let commits =
             r#"[{"key": "x", "sequence": 0, "program": "", "params_hash": "", "origin": ""}]"#;
-        let compacted = |of: &str| {
-            format!(r#", "compacted": {{"generation": 1, "commits": {commits}, "of": {of}}}"#)
+        let compacted = |indices: &str| {
+            format!(r#", "compacted": {{"generation": 1, "commits": {commits}, "of": {indices}}}"#)
         };
         let items = [("a", "1"), ("b", "1")];
-        let parse = |of: &str| Manifest::parse(manifest(&items, &compacted(of)).as_bytes(), "m");
+        let parse =
+            |indices: &str| Manifest::parse(manifest(&items, &compacted(indices)).as_bytes(), "m");
         assert_eq!(parse("[0, 0]").expect("a manifest").header_of(1), 0);
         let advice = "; move it away and run the stage again";
         for (of, reason) in

@@ -43,7 +43,7 @@ mod vacuum;
 
 pub use cache::Cache;
 pub use client::{ClientOptions, memory_traffic};
-pub use commit::{Commit, Committed};
+pub use commit::{Commit, CommitResult};
 pub use compact::{Compaction, compact};
 pub use counted::Traffic;
 pub use currency::{outdated_features, outdated_generations};
@@ -53,8 +53,8 @@ pub use error::{RemoteError, StoreError};
 pub use frames::FrameSpool;
 pub use item::ItemTables;
 pub use lease::Lease;
-pub use ledger::{Ledger, Settled};
-pub use location::{Listed, Location, Put};
+pub use ledger::{Ledger, SettledItem};
+pub use location::{ListedObject, Location, PutOutcome};
 pub use manifest::{Item, Manifest, Part};
 #[cfg(test)]
 pub use number_columns::tests::parquet_of;
@@ -69,6 +69,8 @@ pub use reader::Snapshot;
 pub use redaction::{lines, one_line, redacted};
 pub use schema::{Cell, Column, ColumnType, Row, TableSchema, TimestampUs};
 pub use shard::{Shard, batch_of, split_of};
-pub use source::{Content, InOrder, Listing, Source, SourceFile, SourceProblem, SourceProblemKind};
+pub use source::{
+    Content, Listing, OrderedContents, Source, SourceFile, SourceProblem, SourceProblemKind,
+};
 pub use store_snapshot::{LivePart, StoreSnapshot, checkpoint, live_parts, origin_of};
-pub use vacuum::{Vacuumed, vacuum};
+pub use vacuum::{VacuumRemovals, vacuum};

@@ -1,4 +1,4 @@
-//! Parquet files that are no parts of a store: whoever wrote them, with whatever columns.
+//! Parquet files that are not parts of a store, written by any program and with any columns.
 
 use std::collections::BTreeMap;
 

@@ -20,7 +20,7 @@ pub fn is_standard_output(path: &FsPath) -> bool {
 
 /// Where bytes for a name end up.
 #[derive(Debug, PartialEq, Eq)]
-enum Target {
+enum OutputTarget {
     StandardOutput,
     /// A regular file, or none yet; links are resolved.
     File(PathBuf),
@@ -28,7 +28,7 @@ enum Target {
     Stream(PathBuf),
 }
 
-impl Target {
+impl OutputTarget {
     /// Follows a name to what it stands for.
     fn of(path: &FsPath) -> std::io::Result<Self> {
         if is_standard_output(path) {
@@ -73,13 +73,13 @@ fn is_descriptor_folder(folder: &FsPath) -> bool {
 /// Symbolic links are followed; pipes and devices are written to, and `-` is standard output.
 ///
 /// # Errors
-/// What the file system or `write` says; the old file is untouched then.
+/// The error of the file system or of `write`; the old file is untouched then.
 pub fn write_file(
     path: &FsPath,
     write: impl FnOnce(&mut dyn Write) -> std::io::Result<()>,
 ) -> std::io::Result<()> {
-    match Target::of(path)? {
-        Target::File(path) => {
+    match OutputTarget::of(path)? {
+        OutputTarget::File(path) => {
             let folder = path.parent().unwrap_or(FsPath::new("."));
             let mut out = std::io::BufWriter::new(temporary_in(folder)?);
             write(&mut out)?;
@@ -96,21 +96,21 @@ pub fn write_file(
 /// Creates the temporary file for what [`replace_file`] will publish at `path`.
 ///
 /// # Errors
-/// What the file system says.
+/// The error of the file system.
 pub fn temporary_beside(path: &FsPath) -> std::io::Result<tempfile::NamedTempFile> {
-    match Target::of(path)? {
-        Target::File(path) => temporary_in(path.parent().unwrap_or(FsPath::new("."))),
-        Target::StandardOutput | Target::Stream(_) => tempfile::NamedTempFile::new(),
+    match OutputTarget::of(path)? {
+        OutputTarget::File(path) => temporary_in(path.parent().unwrap_or(FsPath::new("."))),
+        OutputTarget::StandardOutput | OutputTarget::Stream(_) => tempfile::NamedTempFile::new(),
     }
 }
 
 /// Publishes a finished temporary file at `path`, as [`write_file`] does.
 ///
 /// # Errors
-/// What the file system says; the old file is untouched then.
+/// The error of the file system; the old file is untouched then.
 pub fn replace_file(path: &FsPath, file: tempfile::NamedTempFile) -> std::io::Result<()> {
-    match Target::of(path)? {
-        Target::File(path) => publish(&path, file),
+    match OutputTarget::of(path)? {
+        OutputTarget::File(path) => publish(&path, file),
         target => {
             let mut from = file.reopen()?;
             let mut out = target.open()?;
@@ -119,7 +119,7 @@ pub fn replace_file(path: &FsPath, file: tempfile::NamedTempFile) -> std::io::Re
     }
 }
 
-impl Target {
+impl OutputTarget {
     /// Opens what is no regular file; nothing is cut or made.
     fn open(self) -> std::io::Result<Box<dyn Write>> {
         match self {
@@ -203,7 +203,10 @@ mod tests {
         let file = std::fs::File::create(folder.path().join("x")).unwrap();
         let path = format!("/dev/fd/{}", std::os::fd::AsRawFd::as_raw_fd(&file));
         if FsPath::new(&path).exists() {
-            assert!(matches!(Target::of(FsPath::new(&path)).unwrap(), Target::Stream(_)));
+            assert!(matches!(
+                OutputTarget::of(FsPath::new(&path)).unwrap(),
+                OutputTarget::Stream(_)
+            ));
             text(FsPath::new(&path), "into it").unwrap();
             assert_eq!(std::fs::read_to_string(folder.path().join("x")).unwrap(), "into it");
         }

@@ -24,7 +24,7 @@ use parquet::file::metadata::{ParquetMetaData, ParquetMetaDataReader, RowGroupMe
 use parquet::file::statistics::Statistics;
 
 use super::client::block_on;
-use super::location::{Kind, Location};
+use super::location::{Location, LocationKind};
 use super::remote::join;
 
 /// Bytes that are read of the end of a remote part in one request: its footer.
@@ -37,7 +37,7 @@ pub(super) type Batches = Box<dyn Iterator<Item = Result<RecordBatch, ParquetErr
 
 /// Which rows are wanted.
 #[derive(Clone, Copy)]
-pub(super) enum Wanted<'a> {
+pub(super) enum WantedItems<'a> {
     All,
     /// Those of one item.
     One(&'a str),
@@ -45,15 +45,15 @@ pub(super) enum Wanted<'a> {
     Near(&'a BTreeSet<String>),
 }
 
-impl Wanted<'_> {
+impl WantedItems<'_> {
     /// Returns whether a row group that holds names from `min` to `max` may hold what is wanted.
     fn may_lie_within(self, min: Option<&[u8]>, max: Option<&[u8]>) -> bool {
         let within =
             |item: &[u8]| min.is_none_or(|min| min <= item) && max.is_none_or(|max| max >= item);
         match self {
-            Wanted::All => true,
-            Wanted::One(item) => within(item.as_bytes()),
-            Wanted::Near(items) => items.iter().any(|item| within(item.as_bytes())),
+            WantedItems::All => true,
+            WantedItems::One(item) => within(item.as_bytes()),
+            WantedItems::Near(items) => items.iter().any(|item| within(item.as_bytes())),
         }
     }
 }
@@ -79,13 +79,13 @@ impl ParquetObject {
         tail_bytes: u64,
     ) -> ParquetResult<Self> {
         match store.kind() {
-            Kind::Local(root) => {
+            LocationKind::Local(root) => {
                 let path = root.join(path);
                 let file = File::open(&path)?;
                 let metadata = ArrowReaderMetadata::load(&file, ArrowReaderOptions::default())?;
                 Ok(Self { file: Handle::Local(path), metadata })
             }
-            Kind::Remote { store, prefix } => {
+            LocationKind::Remote { store, prefix } => {
                 let path = join(prefix, path);
                 let opened = block_on(RemoteFile::open(store, &path, n_bytes, tail_bytes));
                 let (file, metadata) = match opened {
@@ -114,7 +114,7 @@ impl ParquetObject {
     pub fn batches(
         &self,
         column: &'static str,
-        wanted: Wanted,
+        wanted: WantedItems,
         columns: Option<&[&str]>,
     ) -> ParquetResult<Batches> {
         match &self.file {
@@ -148,7 +148,7 @@ pub(super) fn names<'a>(batch: &'a RecordBatch, column: &str) -> ParquetResult<&
 fn narrow<T>(
     builder: ArrowReaderBuilder<T>,
     column: &'static str,
-    wanted: Wanted,
+    wanted: WantedItems,
     columns: Option<&[&str]>,
 ) -> ArrowReaderBuilder<T> {
     let groups = builder.metadata().row_groups().iter().enumerate();
@@ -159,7 +159,7 @@ fn narrow<T>(
         let mask = ProjectionMask::columns(builder.parquet_schema(), columns.iter().copied());
         builder = builder.with_projection(mask);
     }
-    let Wanted::One(item) = wanted else { return builder };
+    let WantedItems::One(item) = wanted else { return builder };
     let mask = ProjectionMask::columns(builder.parquet_schema(), [column]);
     let item = item.to_owned();
     let is_wanted = ArrowPredicateFn::new(mask, move |batch| {
@@ -170,7 +170,7 @@ fn narrow<T>(
 }
 
 /// Returns whether the statistics of a row group leave room for what is wanted.
-fn may_hold(group: &RowGroupMetaData, column: &str, wanted: Wanted) -> bool {
+fn may_hold(group: &RowGroupMetaData, column: &str, wanted: WantedItems) -> bool {
     let column = group.columns().iter().find(|c| c.column_path().string() == column);
     let Some(Statistics::ByteArray(names)) = column.and_then(|c| c.statistics()) else {
         return true;

@@ -39,7 +39,7 @@ struct FrameBuffer {
     channels: Vec<Vec<f32>>,
 }
 
-/// What names an item beside its own column; the same for all its frames.
+/// The value of a label column of an item; the same for all its frames.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Label {
     Text(String),
@@ -180,9 +180,9 @@ impl PartWriter {
         let mut columns: Vec<ArrayRef> =
             vec![repeated(items.iter().map(|(name, _, n)| (name.as_str(), *n)), n_rows)];
         for label in 0..self.table.frame_column() - 1 {
-            let of =
+            let label_and_count =
                 move |(_, labels, n): &(String, Vec<Label>, usize)| (labels[label].clone(), *n);
-            columns.push(labels_of(items.iter().map(of), n_rows));
+            columns.push(labels_of(items.iter().map(label_and_count), n_rows));
         }
         columns.push(Arc::new(Int32Array::from(std::mem::take(&mut buffer.frame))));
         for channel in &mut buffer.channels {

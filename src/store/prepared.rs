@@ -113,9 +113,9 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let hour = std::time::Duration::from_secs(3600);
         let key = |i: usize| format!("model-{i:032x}");
-        let of_others =
+        let foreign_names =
             ["documents", "model-of-mine", "optimized-00000000000000000000000000000000.bak"];
-        for name in of_others {
+        for name in foreign_names {
             std::fs::create_dir(root.path().join(name)).unwrap();
             let then = SystemTime::now() - hour * 1000;
             std::fs::File::open(root.path().join(name)).unwrap().set_modified(then).unwrap();
@@ -130,8 +130,8 @@ mod tests {
         make(root.path(), &key(99), "x").unwrap();
         assert!(root.path().join(key(0)).is_dir());
         assert!(!root.path().join(key(1)).exists());
-        assert!(of_others.iter().all(|name| root.path().join(name).is_dir()));
+        assert!(foreign_names.iter().all(|name| root.path().join(name).is_dir()));
         let n_folders = std::fs::read_dir(root.path()).unwrap().count();
-        assert_eq!(n_folders, N_KEPT + of_others.len());
+        assert_eq!(n_folders, N_KEPT + foreign_names.len());
     }
 }

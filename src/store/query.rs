@@ -12,18 +12,18 @@ use polars::sql::{SQLContext, extract_table_identifiers};
 pub use answer::{Answer, DataFormat, Format, TextTable};
 use explain::{Explainer, first_line, unknown_table};
 
-use super::location::{Kind, Location};
+use super::location::{Location, LocationKind};
 use super::reader::check_version;
 use super::schema::{Column as TableColumn, ColumnType, TableSchema};
-use super::sql::{self, Asked};
+use super::sql::{self, StatementKind};
 use super::store_snapshot::{LivePart, StoreSnapshot};
 use super::tables;
 use super::{ClientOptions, StoreError};
 
-/// What polars calls a count that has no name.
+/// The name that polars gives to a count without one.
 const COUNT_COLUMN: &str = "len";
 
-/// What a store holds of one table.
+/// The size and schema of a table in a store.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TableInfo {
     pub name: &'static str,
@@ -36,7 +36,7 @@ pub struct TableInfo {
 
 /// Reads one SQL statement over the tables of a store.
 ///
-/// Selections and filters are pushed down to the Parquet parts; a table that nobody has written yet is empty.
+/// Selections and filters are pushed down to the Parquet parts; a table that was never written is empty.
 /// Rows are read when the answer is written.
 ///
 /// # Errors
@@ -48,14 +48,14 @@ pub fn query(store: &Location, sql: &str, options: &ClientOptions) -> Result<Ans
     check_is_store(store)?;
     let schemas = tables::all();
     let named_sql = match asked {
-        Asked::Tables => return Ok(Answer::of_frame(frame_of_tables(store, options)?)),
-        Asked::Columns { table } => {
+        StatementKind::Tables => return Ok(Answer::of_frame(frame_of_tables(store, options)?)),
+        StatementKind::Columns { table } => {
             let schema = schemas.iter().find(|schema| schema.name.eq_ignore_ascii_case(&table));
             let schema =
                 schema.ok_or_else(|| StoreError::Query(unknown_table(&table, &schemas)))?;
             return Ok(Answer::of_frame(frame_of_columns(schema)));
         }
-        Asked::Rows { named } => named,
+        StatementKind::Rows { named } => named,
     };
     let snapshot = StoreSnapshot::take(store)?;
     if let Some((table, column)) = counted_table(sql)
@@ -275,15 +275,15 @@ fn scan_parts(
 ) -> Result<LazyFrame, StoreError> {
     let paths = || parts.iter().map(|l| l.part.path.as_str());
     let sources = match store.kind() {
-        Kind::Local(root) => {
+        LocationKind::Local(root) => {
             let path = |p| PlRefPath::new(root.join(p).to_string_lossy());
             ScanSources::Paths(paths().map(path).collect())
         }
-        Kind::Remote { .. } if store.url().starts_with("memory://") => {
+        LocationKind::Remote { .. } if store.url().starts_with("memory://") => {
             let read: Result<Vec<_>, _> = paths().map(|p| store.read(p)).collect();
             ScanSources::Buffers(read?.into_iter().map(|b| b.to_vec().into()).collect())
         }
-        Kind::Remote { .. } => {
+        LocationKind::Remote { .. } => {
             ScanSources::Paths(paths().map(|p| PlRefPath::new(store.url_of(p))).collect())
         }
     };

@@ -7,7 +7,7 @@ use parquet::errors::ParquetError;
 
 use super::StoreError;
 use super::location::Location;
-use super::parquet_object::{Batches, ParquetObject, TAIL_BYTES, Wanted, names};
+use super::parquet_object::{Batches, ParquetObject, TAIL_BYTES, WantedItems, names};
 use super::schema::{Row, TableSchema};
 use super::store_snapshot::{LivePart, StoreSnapshot};
 
@@ -24,7 +24,7 @@ pub struct Snapshot {
 }
 
 impl Snapshot {
-    /// Takes a snapshot of a table; a table that nobody has written is empty.
+    /// Takes a snapshot of a table; a table that was never written is empty.
     ///
     /// # Errors
     /// [`StoreError::SchemaVersion`] when a part is of a version that is not read; [`StoreError`] when
@@ -63,8 +63,8 @@ impl Snapshot {
     /// Returns the live rows, part by part; within a part they are sorted as the schema says.
     pub fn batches(&self) -> impl Iterator<Item = Result<RecordBatch, StoreError>> + '_ {
         let wanted = match &self.item {
-            Some(item) => Wanted::One(item),
-            None => Wanted::All,
+            Some(item) => WantedItems::One(item),
+            None => WantedItems::All,
         };
         self.wanted(wanted)
     }
@@ -79,12 +79,12 @@ impl Snapshot {
             Some(store) => store.parts_near(self.schema.name, &self.parts, items)?,
             None => self.parts.iter().collect(),
         };
-        Ok(self.batches_in(parts.into_iter(), Wanted::Near(items)))
+        Ok(self.batches_in(parts.into_iter(), WantedItems::Near(items)))
     }
 
     fn wanted<'a>(
         &'a self,
-        wanted: Wanted<'a>,
+        wanted: WantedItems<'a>,
     ) -> impl Iterator<Item = Result<RecordBatch, StoreError>> + 'a {
         self.batches_in(self.parts.iter(), wanted)
     }
@@ -92,7 +92,7 @@ impl Snapshot {
     fn batches_in<'a>(
         &'a self,
         parts: impl Iterator<Item = &'a LivePart> + 'a,
-        wanted: Wanted<'a>,
+        wanted: WantedItems<'a>,
     ) -> impl Iterator<Item = Result<RecordBatch, StoreError>> + 'a {
         parts.flat_map(move |live| {
             let failed = move |source| StoreError::Parquet {

@@ -1,6 +1,6 @@
 //! Texts that people read: without the secrets of URLs, and without what steers a terminal.
 
-/// What stands where a secret was.
+/// The text in place of a secret.
 const CUT: char = '…';
 
 /// Returns a text whose URLs have neither user and password nor a query, where signatures and tokens are.
@@ -46,7 +46,7 @@ fn push_without_secrets(url: &str, out: &mut String) {
     let is_port = |text: &str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
     let user = match (authority.rfind('@'), authority.split_once(':')) {
         (Some(at), _) => Some(at),
-        // A password may have a slash that nobody encoded.
+        // A password may have a slash that is not encoded.
         (None, Some((_, port))) if !is_port(port) => url.rfind('@'),
         _ => None,
     };

@@ -8,7 +8,7 @@ use bytes::Bytes;
 use object_store::path::Path as ObjectPath;
 use object_store::{ObjectStore, ObjectStoreExt as _, PutMode, PutOptions, PutPayload};
 
-use super::location::Put;
+use super::location::PutOutcome;
 
 /// Largest object that is sent with one PUT; larger ones go up in parts of this size.
 pub const SINGLE_PUT_BYTES: usize = 8 << 20;
@@ -66,20 +66,20 @@ pub async fn create(
     store: &Arc<dyn ObjectStore>,
     path: &ObjectPath,
     bytes: &Bytes,
-) -> object_store::Result<Put> {
+) -> object_store::Result<PutOutcome> {
     let mut n_broken = 0;
     loop {
         let options = PutOptions { mode: PutMode::Create, ..PutOptions::default() };
         let payload = PutPayload::from_bytes(bytes.clone());
         let error = match store.put_opts(path, payload, options).await {
-            Ok(_) => return Ok(Put::Written),
-            Err(object_store::Error::AlreadyExists { .. }) => return Ok(Put::AlreadyThere),
+            Ok(_) => return Ok(PutOutcome::Written),
+            Err(object_store::Error::AlreadyExists { .. }) => return Ok(PutOutcome::AlreadyThere),
             Err(error) => error,
         };
         // The store may have acted and its answer been lost; then our bytes are there. The client
         // repeats no request that creates, because only its caller can tell.
         match read_object(store, path).await {
-            Ok(there) if there == *bytes => return Ok(Put::Written),
+            Ok(there) if there == *bytes => return Ok(PutOutcome::Written),
             Err(object_store::Error::NotFound { .. })
                 if is_broken_connection(&error) && n_broken < BROKEN_PUT_RETRIES =>
             {

@@ -18,7 +18,7 @@ pub struct TableSchema {
     /// The oldest version that is read: since then only nullable columns were added, which are null in older
     /// parts.
     pub oldest_version: u32,
-    /// What one row is.
+    /// The meaning of one row.
     pub description: &'static str,
     pub columns: Vec<Column>,
     /// Columns by which the rows of a part are sorted.
@@ -354,10 +354,10 @@ mod tests {
             OldRow { id: "b".into(), length_m: -2.0 },
         ]);
         assert_eq!(NewRow::from_batch(&batch), None);
-        let of =
+        let row =
             |id: &str, length_m| NewRow { id: id.into(), colour: None, length_m, weight_kg: None };
         let rows = NewRow::from_batch(&new.completed(batch.clone(), 2));
-        assert_eq!(rows, Some(vec![of("a", 1.5), of("b", -2.0)]));
+        assert_eq!(rows, Some(vec![row("a", 1.5), row("b", -2.0)]));
         // A part of this version has all its columns, or is broken.
         assert_eq!(NewRow::from_batch(&new.completed(batch.clone(), 4)), None);
         // What may not be null is not made up.

@@ -61,9 +61,10 @@ impl Shard {
                 };
                 let (mut i, n) = (number(index, &i)?, number(count, &n)?);
                 if index == SLURM_INDEX {
-                    let of =
+                    let variable =
                         |name: &str| environment(name).map(|text| number(name, &text)).transpose();
-                    let (first, last, step) = (of(SLURM_MIN)?, of(SLURM_MAX)?, of(SLURM_STEP)?);
+                    let (first, last, step) =
+                        (variable(SLURM_MIN)?, variable(SLURM_MAX)?, variable(SLURM_STEP)?);
                     i = place_in_array(i, n, first.unwrap_or(0), last, step.unwrap_or(1))
                         .map_err(bad)?;
                 }
@@ -94,8 +95,8 @@ impl Shard {
 
 /// Returns the place of a Slurm task among the `count` of its array.
 ///
-/// A list of tasks does not say how many there were when the job was cut into shards, so whoever did only its own
-/// would leave phrases to nobody.
+/// A list of tasks does not say how many there were when the job was cut into shards; if each task did only its
+/// own shard, phrases would be left out.
 fn place_in_array(
     id: u32,
     count: u32,

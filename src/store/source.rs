@@ -14,7 +14,7 @@ use xxhash_rust::xxh3::xxh3_128;
 
 use super::cache::Cache;
 use super::client::{block_on, runtime};
-use super::location::{Kind, Location};
+use super::location::{Location, LocationKind};
 use super::remote::{join, read_sized, relative};
 use super::{ClientOptions, StoreError};
 
@@ -40,7 +40,7 @@ pub struct SourceProblem {
     /// Path below the source; bytes that are not UTF-8 are shown as U+FFFD.
     pub path: String,
     pub kind: SourceProblemKind,
-    /// What is wrong, as the predicate of a sentence about the path.
+    /// The problem, as the predicate of a sentence about the path.
     pub message: String,
 }
 
@@ -128,8 +128,8 @@ impl Source {
     /// in [`Listing::problems`].
     pub fn list(&self) -> Result<Listing, StoreError> {
         match self.location.kind() {
-            Kind::Local(root) => list_tree(root, self.follows_links),
-            Kind::Remote { store, prefix } => {
+            LocationKind::Local(root) => list_tree(root, self.follows_links),
+            LocationKind::Remote { store, prefix } => {
                 let metas: Vec<_> = block_on(store.list(Some(prefix)).try_collect())
                     .map_err(|e| StoreError::remote("list", self.location.url(), e))?;
                 let mut listing = Listing::default();
@@ -148,11 +148,11 @@ impl Source {
     /// Returns the file that a table recorded by its URL, or `None` when it lies elsewhere.
     pub fn recorded(&self, url: &str, size_bytes: u64, fingerprint: &str) -> Option<SourceFile> {
         let path = match self.location.kind() {
-            Kind::Local(root) => {
+            LocationKind::Local(root) => {
                 let path = url::Url::parse(url).ok()?.to_file_path().ok()?;
                 path.strip_prefix(root).ok()?.to_str()?.to_owned()
             }
-            Kind::Remote { .. } => {
+            LocationKind::Remote { .. } => {
                 url.strip_prefix(self.location.url())?.strip_prefix('/')?.to_owned()
             }
         };
@@ -160,13 +160,13 @@ impl Source {
     }
 
     /// Reads files in the order given, remote ones ahead of the caller within the budget.
-    pub fn read_in_order(&self, files: Vec<SourceFile>) -> InOrder {
+    pub fn read_in_order(&self, files: Vec<SourceFile>) -> OrderedContents {
         match self.location.kind() {
-            Kind::Local(root) => {
+            LocationKind::Local(root) => {
                 let (root, follows_links) = (root.clone(), self.follows_links);
-                InOrder::Local { root, follows_links, files: files.into() }
+                OrderedContents::Local { root, follows_links, files: files.into() }
             }
-            Kind::Remote { store, prefix } => {
+            LocationKind::Remote { store, prefix } => {
                 let (sender, receiver) = mpsc::channel(1);
                 let fetcher = Fetcher {
                     store: Arc::clone(store),
@@ -183,33 +183,33 @@ impl Source {
                         .buffered(window);
                     let mut fetched = std::pin::pin!(fetched);
                     while let Some(content) = fetched.next().await {
-                        // The reader is gone: nobody wants the rest.
+                        // The receiver is dropped: the rest is not wanted.
                         if sender.send(content).await.is_err() {
                             break;
                         }
                     }
                 });
-                InOrder::Remote { receiver }
+                OrderedContents::Remote { receiver }
             }
         }
     }
 }
 
 /// The contents of files, one after the other in the order asked for.
-pub enum InOrder {
+pub enum OrderedContents {
     Local { root: std::path::PathBuf, follows_links: bool, files: VecDeque<SourceFile> },
-    Remote { receiver: mpsc::Receiver<Fetched> },
+    Remote { receiver: mpsc::Receiver<FetchedFile> },
 }
 
 /// A fetched file with its share of the read-ahead budget, which goes back when it is dropped.
-type Fetched = (Result<Content, StoreError>, Option<OwnedSemaphorePermit>);
+type FetchedFile = (Result<Content, StoreError>, Option<OwnedSemaphorePermit>);
 
-impl Iterator for InOrder {
-    type Item = Fetched;
+impl Iterator for OrderedContents {
+    type Item = FetchedFile;
 
     fn next(&mut self) -> Option<Self::Item> {
         match self {
-            InOrder::Local { root, follows_links, files } => {
+            OrderedContents::Local { root, follows_links, files } => {
                 let file = files.pop_front()?;
                 let path = root.join(&file.path);
                 // A file may have become a link since it was listed.
@@ -220,7 +220,7 @@ impl Iterator for InOrder {
                 };
                 Some((read, None))
             }
-            InOrder::Remote { receiver } => receiver.blocking_recv(),
+            OrderedContents::Remote { receiver } => receiver.blocking_recv(),
         }
     }
 }
@@ -236,7 +236,7 @@ struct Fetcher {
 }
 
 impl Fetcher {
-    fn fetch(&self, file: SourceFile) -> impl Future<Output = Fetched> + Send + 'static {
+    fn fetch(&self, file: SourceFile) -> impl Future<Output = FetchedFile> + Send + 'static {
         let this = self.clone();
         async move {
             // A file larger than the whole budget takes all of it and goes through alone. The

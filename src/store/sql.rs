@@ -6,7 +6,7 @@ use sqlparser::parser::{Parser, ParserOptions};
 
 /// A statement, as far as it can be told without tables.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Asked {
+pub enum StatementKind {
     /// A query; `named` is the same with a name for each computed column of the answer.
     Rows { named: Option<String> },
     /// `show tables`.
@@ -19,7 +19,7 @@ pub enum Asked {
 ///
 /// # Errors
 /// One sentence for what is no question.
-pub fn read(sql: &str) -> Result<Asked, String> {
+pub fn read(sql: &str) -> Result<StatementKind, String> {
     let statements = Parser::new(&GenericDialect)
         // As the engine reads it.
         .with_options(ParserOptions { trailing_commas: true, ..ParserOptions::default() })
@@ -56,17 +56,17 @@ fn refusal(verb: &str) -> String {
     )
 }
 
-fn asked(statement: &Statement, sql: &str) -> Result<Asked, String> {
+fn asked(statement: &Statement, sql: &str) -> Result<StatementKind, String> {
     match statement {
-        Statement::Query(query) => Ok(Asked::Rows { named: named(query) }),
-        Statement::Explain { .. } => Ok(Asked::Rows { named: None }),
-        Statement::ShowTables { .. } => Ok(Asked::Tables),
+        Statement::Query(query) => Ok(StatementKind::Rows { named: named(query) }),
+        Statement::Explain { .. } => Ok(StatementKind::Rows { named: None }),
+        Statement::ShowTables { .. } => Ok(StatementKind::Tables),
         Statement::ExplainTable { table_name, .. } => {
-            Ok(Asked::Columns { table: unquoted(&table_name.to_string()) })
+            Ok(StatementKind::Columns { table: unquoted(&table_name.to_string()) })
         }
         Statement::ShowColumns { .. } => {
             let table = sql.trim_end().trim_end_matches(';').split_whitespace().last();
-            Ok(Asked::Columns { table: unquoted(table.unwrap_or_default()) })
+            Ok(StatementKind::Columns { table: unquoted(table.unwrap_or_default()) })
         }
         other => Err(refusal(&first_word(&other.to_string()))),
     }
@@ -100,7 +100,7 @@ fn named(query: &Query) -> Option<String> {
         }
         let text = expr.to_string().replace('"', "");
         let n_before = names.iter().filter(|(before, _)| before == expr).count();
-        // Who asks for the same twice is given it twice.
+        // An expression that is selected twice gets two columns.
         let name = if n_before == 0 { text } else { format!("{text} {}", n_before + 1) };
         names.push((expr.clone(), name.clone()));
         *item =
@@ -143,7 +143,7 @@ mod tests {
 
     fn named_sql(sql: &str) -> Option<String> {
         match read(sql) {
-            Ok(Asked::Rows { named }) => named,
+            Ok(StatementKind::Rows { named }) => named,
             other => panic!("{sql}: {other:?}"),
         }
     }
@@ -184,9 +184,9 @@ mod tests {
 
     #[test]
     fn other_statements_are_told_apart() {
-        let columns = |table: &str| Ok(Asked::Columns { table: table.to_owned() });
-        assert_eq!(read("show tables"), Ok(Asked::Tables));
-        assert_eq!(read("-- all\nSHOW TABLES;"), Ok(Asked::Tables));
+        let columns = |table: &str| Ok(StatementKind::Columns { table: table.to_owned() });
+        assert_eq!(read("show tables"), Ok(StatementKind::Tables));
+        assert_eq!(read("-- all\nSHOW TABLES;"), Ok(StatementKind::Tables));
         assert_eq!(read("describe phrases"), columns("phrases"));
         assert_eq!(read("desc \"beats\""), columns("beats"));
         assert_eq!(read("show columns from motion;"), columns("motion"));

@@ -7,15 +7,15 @@ use std::sync::{Arc, Mutex, PoisonError};
 use xxhash_rust::xxh3::xxh3_64;
 
 use super::StoreError;
-use super::catalogue::{self, Catalogue, CatalogueError, Row, Unusable};
-use super::location::{Listed, Location};
+use super::catalogue::{self, Catalogue, CatalogueError, CatalogueRow, UnusableReason};
+use super::location::{ListedObject, Location};
 use super::manifest::{self, FOLDER, Header, Item, Manifest, Part, Rank, stage_and_key};
 
 /// Times that a listing is taken again, where what it told of was gone before it was read.
 const RETRIES: usize = 4;
 /// Least manifests that a catalogue is written for, and how many of those that it covers come to one that it
-/// does not before another is written: all catalogues of a growing store together cost as much as so many of the
-/// last one.
+/// does not before another is written: all catalogues of a growing store together cost as much as
+/// `COVERED_PER_NEWER` of the last one.
 const MIN_NEWER: usize = 16;
 const COVERED_PER_NEWER: usize = 16;
 
@@ -23,14 +23,14 @@ const COVERED_PER_NEWER: usize = 16;
 pub(super) struct StageLog {
     store: Location,
     pub stage: String,
-    manifests: Vec<Listed>,
-    catalogues: Vec<Listed>,
+    manifests: Vec<ListedObject>,
+    catalogues: Vec<ListedObject>,
     catalogue: Option<Catalogue>,
     newer: Vec<Manifest>,
     /// All manifests, read when the catalogue turned out to be of no use.
     all: Mutex<Option<Arc<Vec<Manifest>>>>,
     state: Mutex<Option<Arc<Vec<CommitState>>>>,
-    places: Mutex<Option<Arc<Places>>>,
+    places: Mutex<Option<Arc<CommitsByItem>>>,
 }
 
 impl fmt::Debug for StageLog {
@@ -63,8 +63,8 @@ impl CommitState {
     }
 }
 
-/// The latest word on an item.
-pub(super) struct Word<'a> {
+/// The latest settlement of an item.
+pub(super) struct ItemRecord<'a> {
     pub item: Item,
     pub header: &'a Header,
     /// The commit that holds its rows.
@@ -73,12 +73,12 @@ pub(super) struct Word<'a> {
 
 /// Which commits items are of, by the hash of their names: a commit too many is read in vain, no more.
 #[derive(Debug)]
-pub(super) struct Places {
+pub(super) struct CommitsByItem {
     keys: Vec<Arc<str>>,
     of: Vec<(u64, u32)>,
 }
 
-impl Places {
+impl CommitsByItem {
     /// Returns the commits that may hold rows of the items.
     pub fn commits_of<'a>(&self, items: impl IntoIterator<Item = &'a String>) -> HashSet<&str> {
         let mut found = HashSet::new();
@@ -133,7 +133,7 @@ impl StageLog {
             manifests.iter().filter_map(|l| Some(stage_and_key(&l.path)?.0)).collect();
         stages.dedup();
         let read = |stage: &str| {
-            let of = |listed: &[Listed], folder: &str| -> Vec<Listed> {
+            let listed_below = |listed: &[ListedObject], folder: &str| -> Vec<ListedObject> {
                 let folder = format!("{folder}/{stage}/");
                 listed.iter().filter(|l| l.path.starts_with(&folder)).cloned().collect()
             };
@@ -143,7 +143,8 @@ impl StageLog {
                     store.list(&format!("{}/{stage}", catalogue::FOLDER))?,
                 ))
             };
-            let found = (of(&manifests, FOLDER), of(&catalogues, catalogue::FOLDER));
+            let found =
+                (listed_below(&manifests, FOLDER), listed_below(&catalogues, catalogue::FOLDER));
             Self::of(store, stage, found.0, found.1, again)
         };
         stages.into_iter().map(read).collect()
@@ -152,9 +153,9 @@ impl StageLog {
     fn of(
         store: &Location,
         stage: &str,
-        mut manifests: Vec<Listed>,
-        mut catalogues: Vec<Listed>,
-        again: impl Fn() -> Result<(Vec<Listed>, Vec<Listed>), StoreError>,
+        mut manifests: Vec<ListedObject>,
+        mut catalogues: Vec<ListedObject>,
+        again: impl Fn() -> Result<(Vec<ListedObject>, Vec<ListedObject>), StoreError>,
     ) -> Result<Self, StoreError> {
         for n_tried in 0.. {
             manifests.retain(|l| stage_and_key(&l.path).is_some());
@@ -166,9 +167,10 @@ impl StageLog {
                 .flat_map(|catalogue| &catalogue.meta.commits)
                 .map(|entry| entry.key.as_str())
                 .collect();
-            let is_newer =
-                |l: &&Listed| stage_and_key(&l.path).is_some_and(|(_, key)| !covered.contains(key));
-            let newer: Vec<Listed> = manifests.iter().filter(is_newer).cloned().collect();
+            let is_newer = |l: &&ListedObject| {
+                stage_and_key(&l.path).is_some_and(|(_, key)| !covered.contains(key))
+            };
+            let newer: Vec<ListedObject> = manifests.iter().filter(is_newer).cloned().collect();
             match manifest::read(store, &newer) {
                 Ok(newer) => {
                     return Ok(Self {
@@ -197,7 +199,7 @@ impl StageLog {
     /// manifests.
     fn with_contents<T>(
         &self,
-        read: impl Fn(Contents) -> Result<T, Unusable>,
+        read: impl Fn(Contents) -> Result<T, UnusableReason>,
     ) -> Result<T, StoreError> {
         let mut all = self.all.lock().unwrap_or_else(PoisonError::into_inner).clone();
         if all.is_none() {
@@ -261,7 +263,7 @@ impl StageLog {
     ///
     /// # Errors
     /// [`StoreError`] when manifests cannot be read.
-    pub fn places(&self) -> Result<Arc<Places>, StoreError> {
+    pub fn places(&self) -> Result<Arc<CommitsByItem>, StoreError> {
         let mut places = self.places.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(places) = &*places {
             return Ok(Arc::clone(places));
@@ -275,7 +277,7 @@ impl StageLog {
     ///
     /// # Errors
     /// [`StoreError`] when manifests cannot be read.
-    pub fn visit(&self, mut visit: impl FnMut(Word)) -> Result<(), StoreError> {
+    pub fn visit(&self, mut visit: impl FnMut(ItemRecord)) -> Result<(), StoreError> {
         // A catalogue that breaks off is read again as manifests: the later word replaces the same word.
         let visit = std::cell::RefCell::new(&mut visit);
         self.with_contents(|contents| words(contents, &mut **visit.borrow_mut()))
@@ -315,7 +317,7 @@ impl StageLog {
             if let Some(catalogue) = contents.catalogue
                 && let Some((commit, header)) = catalogue.find(item)?
             {
-                let rank = catalogue.rank(Row { item, commit, header });
+                let rank = catalogue.rank(CatalogueRow { item, commit, header });
                 if best.as_ref().is_none_or(|(known, ..)| rank > *known) {
                     let meta = &catalogue.meta;
                     best = Some((rank, &meta.headers[header], &meta.commits[commit].parts));
@@ -354,15 +356,15 @@ impl StageLog {
     }
 }
 
-/// The latest word that newer manifests have on each item.
-struct Newest<'a> {
+/// The latest settlement of each item in newer manifests.
+struct NewestItems<'a> {
     headers: Vec<Vec<Header>>,
     manifests: &'a [Manifest],
     of: HashMap<&'a str, (usize, usize)>,
     dead: Vec<Vec<String>>,
 }
 
-impl<'a> Newest<'a> {
+impl<'a> NewestItems<'a> {
     fn of(manifests: &'a [Manifest]) -> Self {
         let headers = manifests.iter().map(Manifest::headers).collect();
         let dead = vec![Vec::new(); manifests.len()];
@@ -394,8 +396,8 @@ impl<'a> Newest<'a> {
 }
 
 /// Returns every commit, and what of it counts.
-fn states(contents: Contents) -> Result<Vec<CommitState>, Unusable> {
-    let mut newest = Newest::of(contents.newer);
+fn states(contents: Contents) -> Result<Vec<CommitState>, UnusableReason> {
+    let mut newest = NewestItems::of(contents.newer);
     let mut dead_of_old: HashMap<usize, Vec<String>> = HashMap::new();
     let mut states = Vec::new();
     if let Some(catalogue) = contents.catalogue {
@@ -443,7 +445,7 @@ fn states(contents: Contents) -> Result<Vec<CommitState>, Unusable> {
     Ok(states)
 }
 
-fn places_of(contents: Contents) -> Result<Places, Unusable> {
+fn places_of(contents: Contents) -> Result<CommitsByItem, UnusableReason> {
     let (mut keys, mut of): (Vec<Arc<str>>, _) = (Vec::new(), Vec::new());
     if let Some(catalogue) = contents.catalogue {
         keys.extend(catalogue.meta.commits.iter().map(|entry| Arc::from(entry.key.as_str())));
@@ -458,11 +460,11 @@ fn places_of(contents: Contents) -> Result<Places, Unusable> {
         of.extend(manifest.items.iter().map(|item| (xxh3_64(item.id.as_bytes()), commit)));
     }
     of.sort_unstable();
-    Ok(Places { keys, of })
+    Ok(CommitsByItem { keys, of })
 }
 
-fn words(contents: Contents, visit: &mut dyn FnMut(Word)) -> Result<(), Unusable> {
-    let newest = Newest::of(contents.newer);
+fn words(contents: Contents, visit: &mut dyn FnMut(ItemRecord)) -> Result<(), UnusableReason> {
+    let newest = NewestItems::of(contents.newer);
     let mut outranked: HashSet<&str> = HashSet::new();
     if let Some(catalogue) = contents.catalogue {
         let visited = catalogue.visit_items(|row, item| {
@@ -474,7 +476,7 @@ fn words(contents: Contents, visit: &mut dyn FnMut(Word)) -> Result<(), Unusable
             }
             let header = &catalogue.meta.headers[row.header];
             let commit = &catalogue.meta.commits[row.commit].key;
-            visit(Word { item, header, commit });
+            visit(ItemRecord { item, header, commit });
         });
         visited?;
     }
@@ -483,7 +485,7 @@ fn words(contents: Contents, visit: &mut dyn FnMut(Word)) -> Result<(), Unusable
         if !outranked.contains(id) {
             let manifest = &contents.newer[place.0];
             let item = manifest.items[place.1].clone();
-            visit(Word { item, header: newest.header(place), commit: &manifest.key });
+            visit(ItemRecord { item, header: newest.header(place), commit: &manifest.key });
         }
     }
     Ok(())

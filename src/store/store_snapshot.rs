@@ -41,7 +41,7 @@ pub fn live_parts(store: &Location) -> Result<BTreeMap<String, Vec<LivePart>>, S
 }
 
 impl StoreSnapshot {
-    /// Takes a snapshot of a store; one that nobody has written is empty.
+    /// Takes a snapshot of a store; that of a store without commits is empty.
     ///
     /// # Errors
     /// [`StoreError`] when the commits cannot be read.
@@ -55,7 +55,7 @@ impl StoreSnapshot {
         &self.store
     }
 
-    /// Returns the live rows of a table; a table that nobody has written is empty.
+    /// Returns the live rows of a table; a table that was never written is empty.
     ///
     /// # Errors
     /// [`StoreError::SchemaVersion`] when a part is of a version that is not read; [`StoreError`] when
@@ -87,7 +87,7 @@ impl StoreSnapshot {
         Ok((table, unknown))
     }
 
-    /// Looks an item up; one that nobody has settled has no rows.
+    /// Looks an item up; one that was not settled has no rows.
     ///
     /// # Errors
     /// [`StoreError`] when the commits cannot be read.

@@ -1,4 +1,5 @@
-//! Vacuum: commits whose rows all were superseded go, with their parts, once nobody reads them any more.
+//! Vacuum: commits whose rows all were superseded are removed, with their parts, once no reader needs them any
+//! more.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::time::{Duration, SystemTime};
@@ -6,7 +7,7 @@ use std::time::{Duration, SystemTime};
 use super::StoreError;
 use super::commit::KEY_DIGITS;
 use super::delta;
-use super::location::{Listed, Location};
+use super::location::{ListedObject, Location};
 use super::manifest::{self, FOLDER, Manifest, Rank, stage_and_key};
 use super::stage_log::StageLog;
 use super::tables;
@@ -15,9 +16,9 @@ use super::tables;
 /// writes its parts first.
 const ABANDONED: Duration = Duration::from_secs(24 * 3600);
 
-/// What vacuum removes.
+/// The files that vacuum removes.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Vacuumed {
+pub struct VacuumRemovals {
     /// Manifests and parts, below the store, in order.
     pub paths: Vec<String>,
     pub n_bytes: u64,
@@ -26,7 +27,7 @@ pub struct Vacuumed {
 }
 
 /// Removes what has been dead for longer than `older_than`, and parts that writers who were killed left behind; with
-/// `dry_run` it tells what it would remove. Whoever took a snapshot longer ago loses its parts.
+/// `dry_run` it tells what it would remove. A snapshot that is older loses its parts.
 ///
 /// # Errors
 /// [`StoreError`] when the store cannot be read, or refuses to remove.
@@ -34,15 +35,15 @@ pub fn vacuum(
     store: &Location,
     older_than: Duration,
     dry_run: bool,
-) -> Result<Vacuumed, StoreError> {
+) -> Result<VacuumRemovals, StoreError> {
     let now = SystemTime::now();
     let is_old = |time: SystemTime, age: Duration| {
         // A clock that is behind that of the storage has seen no time pass.
         now.duration_since(time).unwrap_or_default() >= age
     };
     let parts = parts_of(store)?;
-    let mut done = Vacuumed::default();
-    let mut by_stage: BTreeMap<String, Vec<(Listed, SystemTime)>> = BTreeMap::new();
+    let mut done = VacuumRemovals::default();
+    let mut by_stage: BTreeMap<String, Vec<(ListedObject, SystemTime)>> = BTreeMap::new();
     for (listed, time) in store.list_with_times(FOLDER)? {
         if let Some((stage, _)) = stage_and_key(&listed.path) {
             by_stage.entry(stage.to_owned()).or_default().push((listed, time));
@@ -50,9 +51,9 @@ pub fn vacuum(
     }
     let named_by_delta = delta::active_paths(store)?;
     let mut keys: HashSet<String> = HashSet::new();
-    let mut dead: Vec<Dead> = Vec::new();
+    let mut dead: Vec<DeadCommit> = Vec::new();
     for (stage, listed) in by_stage {
-        let (listed, times): (Vec<Listed>, Vec<SystemTime>) = listed.into_iter().unzip();
+        let (listed, times): (Vec<ListedObject>, Vec<SystemTime>) = listed.into_iter().unzip();
         let manifests = manifest::read(store, &listed)?;
         keys.extend(manifests.iter().map(|manifest| manifest.key.clone()));
         let mut of_stage = Vec::new();
@@ -65,7 +66,7 @@ pub fn vacuum(
             }
             let parts = manifest.parts.iter().map(|part| (part.path.clone(), part.n_bytes));
             let manifest = (listed.path.clone(), listed.size_bytes);
-            of_stage.push(Dead { manifest, parts: parts.collect() });
+            of_stage.push(DeadCommit { manifest, parts: parts.collect() });
         }
         if !of_stage.is_empty() && !dry_run {
             // Readers whose catalogue counts what goes now would read all manifests.
@@ -75,7 +76,7 @@ pub fn vacuum(
         }
         dead.extend(of_stage);
     }
-    for Dead { manifest, parts: of_manifest } in dead {
+    for DeadCommit { manifest, parts: of_manifest } in dead {
         // The manifest first: a part without one is abandoned, and goes another time.
         for (path, n_bytes) in std::iter::once(manifest).chain(of_manifest) {
             remove(store, path, n_bytes, dry_run, &mut done)?;
@@ -96,7 +97,7 @@ pub fn vacuum(
 }
 
 /// A commit that goes: paths and sizes.
-struct Dead {
+struct DeadCommit {
     manifest: (String, u64),
     parts: Vec<(String, u64)>,
 }
@@ -106,7 +107,7 @@ fn remove(
     path: String,
     n_bytes: u64,
     dry_run: bool,
-    done: &mut Vacuumed,
+    done: &mut VacuumRemovals,
 ) -> Result<(), StoreError> {
     if !dry_run {
         store.remove(&path)?;
@@ -118,7 +119,7 @@ fn remove(
 
 /// Lists the parts of all tables. They are listed before the manifests, so that a part whose manifest comes
 /// meanwhile is not taken for abandoned.
-fn parts_of(store: &Location) -> Result<Vec<(Listed, SystemTime)>, StoreError> {
+fn parts_of(store: &Location) -> Result<Vec<(ListedObject, SystemTime)>, StoreError> {
     let mut parts = Vec::new();
     for schema in tables::all() {
         let listed = store.list_with_times(schema.name)?;

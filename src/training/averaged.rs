@@ -12,8 +12,8 @@ use super::error::TrainingError;
 pub(super) const AVERAGE: &str = "ema.";
 pub(super) const MOMENTS: [&str; 2] = ["adam.m.", "adam.v."];
 
-/// What changes while one network is trained, and how it is saved.
-pub struct Averaged {
+/// The state of one network in training: parameters, optimizer and moving average, and how they are saved.
+pub struct NetworkState {
     /// Section of the weights.
     prefix: &'static str,
     parameters: Parameters<f32>,
@@ -22,7 +22,7 @@ pub struct Averaged {
     ema_config: EmaConfig,
 }
 
-impl Averaged {
+impl NetworkState {
     /// Begins with some weights.
     pub fn new(
         prefix: &'static str,
@@ -92,7 +92,7 @@ impl Averaged {
         (self.optimizer.state().1, self.ema.n_updates())
     }
 
-    /// Takes up the numbers of [`Averaged::sections`].
+    /// Takes up the numbers of [`NetworkState::sections`].
     ///
     /// # Errors
     /// When they are not those of this network.

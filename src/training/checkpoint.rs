@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use crate::store::{Location, Put, StoreError};
+use crate::store::{Location, PutOutcome, StoreError};
 use crate::weights::{Archive, Precision, Section, save_to_file};
 
 use super::error::TrainingError;
@@ -33,7 +33,7 @@ pub struct State<C> {
     pub progress: Progress,
 }
 
-/// What changes from step to step.
+/// The progress of a training, which changes from step to step.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Progress {
     /// Steps done.
@@ -109,16 +109,16 @@ pub struct Checkpoints<'a> {
     folder: String,
 }
 
-/// What a checkpoint is for.
+/// The purpose of a checkpoint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Kind {
+pub enum CheckpointKind {
     /// Everything, to go on from.
     Step,
     /// The weights that validated best.
     Best,
 }
 
-impl Kind {
+impl CheckpointKind {
     fn name(self) -> &'static str {
         match self {
             Self::Step => "step",
@@ -133,12 +133,12 @@ impl<'a> Checkpoints<'a> {
     }
 
     /// Returns the path of a checkpoint below the store.
-    pub fn path(&self, kind: Kind, step: u64) -> String {
+    pub fn path(&self, kind: CheckpointKind, step: u64) -> String {
         format!("{}/{}-{step:08}.safetensors", self.folder, kind.name())
     }
 
     /// Returns what messages call a checkpoint.
-    pub fn place(&self, kind: Kind, step: u64) -> String {
+    pub fn place(&self, kind: CheckpointKind, step: u64) -> String {
         self.store.url_of(&self.path(kind, step))
     }
 
@@ -154,7 +154,7 @@ impl<'a> Checkpoints<'a> {
     ///
     /// # Errors
     /// When the store cannot be listed.
-    pub fn steps(&self, kind: Kind) -> Result<Vec<u64>, TrainingError> {
+    pub fn steps(&self, kind: CheckpointKind) -> Result<Vec<u64>, TrainingError> {
         let prefix = format!("{}/{}-", self.folder, kind.name());
         let listed = self.store.list(&self.folder)?;
         let step = |path: &str| {
@@ -173,10 +173,10 @@ impl<'a> Checkpoints<'a> {
     /// What the store says, a full disk among others; older checkpoints are untouched then.
     pub fn write<C: Serialize>(
         &self,
-        kind: Kind,
+        kind: CheckpointKind,
         state: &State<C>,
         sections: &[Section<f32>],
-    ) -> Result<Put, TrainingError> {
+    ) -> Result<PutOutcome, TrainingError> {
         let step = state.progress.step;
         let path = self.path(kind, step);
         let text = serde_json::to_string(state).map_err(|e| TrainingError::Checkpoint {
@@ -189,8 +189,8 @@ impl<'a> Checkpoints<'a> {
             .map_err(|source| TrainingError::Weights { place: self.store.url_of(&path), source })?;
         let put = self.store.put_file_new(&path, file)?;
         let kept = match kind {
-            Kind::Step => N_KEPT,
-            Kind::Best => 1,
+            CheckpointKind::Step => N_KEPT,
+            CheckpointKind::Best => 1,
         };
         let mut steps = self.steps(kind)?;
         steps.retain(|&other| other <= step);
@@ -205,7 +205,7 @@ impl<'a> Checkpoints<'a> {
     ///
     /// # Errors
     /// What the store says.
-    pub fn remove(&self, kind: Kind, step: u64) -> Result<(), TrainingError> {
+    pub fn remove(&self, kind: CheckpointKind, step: u64) -> Result<(), TrainingError> {
         Ok(self.store.remove(&self.path(kind, step))?)
     }
 
@@ -214,7 +214,7 @@ impl<'a> Checkpoints<'a> {
     /// # Errors
     /// What the store says.
     pub fn clear(&self) -> Result<(), TrainingError> {
-        for kind in [Kind::Step, Kind::Best] {
+        for kind in [CheckpointKind::Step, CheckpointKind::Best] {
             for step in self.steps(kind)? {
                 self.remove(kind, step)?;
             }
@@ -228,7 +228,7 @@ impl<'a> Checkpoints<'a> {
     /// When it cannot be read, or what `load` says.
     pub fn read<T>(
         &self,
-        kind: Kind,
+        kind: CheckpointKind,
         step: u64,
         load: impl FnOnce(&Archive, &str) -> Result<T, TrainingError>,
     ) -> Result<T, TrainingError> {

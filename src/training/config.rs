@@ -102,7 +102,7 @@ pub struct DecoderTraining {
     pub ema: EmaConfig,
     /// Latents are made noisy up to this share of the diffusion's steps.
     pub noised_to: f64,
-    /// Of so many batches one has latents that the UNet sampled; 0 for none.
+    /// One of every `sampled_every` batches has latents that the UNet sampled; 0 for none.
     pub sampled_every: u64,
     /// The UNet samples from up to this share of the steps, so that the latent is still of its motion.
     pub sampled_from: f64,

@@ -21,7 +21,7 @@ use crate::store::{
 /// features is centred on the end of the audio, and both lengths are rounded.
 const LENGTH_TOLERANCE_FRAMES: usize = 3;
 
-/// What a phrase is used for.
+/// The use of a phrase in training.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Split {
     Train,
@@ -76,7 +76,7 @@ fn beats_per_bar(row: &PhraseRow) -> u32 {
 
 /// A phrase that cannot be learned from, and why.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct LeftOut {
+pub struct ExcludedPhrase {
     pub phrase_id: String,
     pub kind: &'static str,
     pub message: String,
@@ -84,7 +84,7 @@ pub struct LeftOut {
 
 /// How phrases are read.
 #[derive(Clone, Debug)]
-pub struct Reading {
+pub struct DatasetOptions {
     /// Whether frames are kept in memory rather than in a temporary file.
     pub in_memory: bool,
     pub n_threads: NonZeroUsize,
@@ -126,15 +126,15 @@ pub enum DatasetError {
     },
 }
 
-/// What one table gave of a phrase.
-struct Found {
+/// The frames of a phrase as read from one table.
+struct PhraseFrames {
     row: u64,
     n_frames: usize,
     digest: String,
 }
 
 /// Frames of one table by phrase, or why they are of no use.
-type Gathered = BTreeMap<String, Result<Found, LeftOut>>;
+type Gathered = BTreeMap<String, Result<PhraseFrames, ExcludedPhrase>>;
 
 impl Dataset {
     /// Reads all phrases with motion and features.
@@ -147,10 +147,10 @@ impl Dataset {
     /// [`DatasetError`] when the store cannot be read or has no such phrases.
     pub fn read(
         store: &Location,
-        reading: &Reading,
+        reading: &DatasetOptions,
         notice: &(dyn Fn(&StoreError, Duration) + Sync),
         progress: &(dyn Fn(usize, usize) + Sync),
-    ) -> Result<(Self, Vec<LeftOut>), DatasetError> {
+    ) -> Result<(Self, Vec<ExcludedPhrase>), DatasetError> {
         let wait = |error: &StoreError, pause| notice(error, pause);
         let snapshot = reading.patience.wait_out(wait, || StoreSnapshot::take(store))?;
         Self::of(&snapshot, reading, notice, progress)
@@ -162,10 +162,10 @@ impl Dataset {
     /// As [`Dataset::read`].
     pub fn of(
         snapshot: &StoreSnapshot,
-        reading: &Reading,
+        reading: &DatasetOptions,
         notice: &(dyn Fn(&StoreError, Duration) + Sync),
         progress: &(dyn Fn(usize, usize) + Sync),
-    ) -> Result<(Self, Vec<LeftOut>), DatasetError> {
+    ) -> Result<(Self, Vec<ExcludedPhrase>), DatasetError> {
         let wait = |error: &StoreError, pause| notice(error, pause);
         let take = |schema: fn() -> TableSchema| {
             reading.patience.wait_out(wait, || snapshot.table(schema()))
@@ -211,7 +211,7 @@ impl Dataset {
                         Some(_) => ("no_features", "has motion but no features; run extract"),
                     };
                     let message = format!("phrase {id} {message}");
-                    left_out.push(LeftOut { phrase_id: id, kind, message });
+                    left_out.push(ExcludedPhrase { phrase_id: id, kind, message });
                     continue;
                 }
             };
@@ -220,7 +220,7 @@ impl Dataset {
                 let message = format!(
                     "phrase {id} has features of files that were replaced since; run extract again"
                 );
-                left_out.push(LeftOut { phrase_id: id, kind: "stale_features", message });
+                left_out.push(ExcludedPhrase { phrase_id: id, kind: "stale_features", message });
                 continue;
             }
             if motion.n_frames.abs_diff(features.n_frames) > LENGTH_TOLERANCE_FRAMES {
@@ -229,7 +229,7 @@ impl Dataset {
                      {LENGTH_TOLERANCE_FRAMES}",
                     motion.n_frames, features.n_frames
                 );
-                left_out.push(LeftOut { phrase_id: id, kind: "length_mismatch", message });
+                left_out.push(ExcludedPhrase { phrase_id: id, kind: "length_mismatch", message });
                 continue;
             }
             let Some(split) = Split::of_name(&row.split) else {
@@ -237,7 +237,7 @@ impl Dataset {
                     "phrase {id} is in split {:?}; known are train, validation and test",
                     row.split
                 );
-                left_out.push(LeftOut { phrase_id: id, kind: "split", message });
+                left_out.push(ExcludedPhrase { phrase_id: id, kind: "split", message });
                 continue;
             };
             digests.push(format!("{id}\n{}\n{}\n{}", row.split, motion.digest, features.digest));
@@ -394,7 +394,7 @@ fn gather(
     table: &Snapshot,
     spool: &FrameSpool,
     wanted: &BTreeSet<String>,
-    reading: &Reading,
+    reading: &DatasetOptions,
     notice: &(dyn Fn(&StoreError, Duration) + Sync),
     count: &(dyn Fn() + Sync),
 ) -> Result<Gathered, StoreError> {
@@ -449,15 +449,15 @@ fn keep(
     id: &str,
     frames: &Array2<f32>,
     spool: &FrameSpool,
-) -> Result<Result<Found, LeftOut>, StoreError> {
+) -> Result<Result<PhraseFrames, ExcludedPhrase>, StoreError> {
     if let Err((kind, what)) = check(frames) {
         let message = format!("phrase {id}: {what}");
-        return Ok(Err(LeftOut { phrase_id: id.to_owned(), kind, message }));
+        return Ok(Err(ExcludedPhrase { phrase_id: id.to_owned(), kind, message }));
     }
     let values = frames.as_slice().expect("frames are gathered in order");
     let bytes: Vec<u8> = values.iter().flat_map(|x| x.to_le_bytes()).collect();
     let row = spool.append(frames.view())?;
-    Ok(Ok(Found { row, n_frames: frames.nrows(), digest: digest(&bytes) }))
+    Ok(Ok(PhraseFrames { row, n_frames: frames.nrows(), digest: digest(&bytes) }))
 }
 
 /// Refuses frames that are not finite; those of motion are checked as ingest does, because a table may

@@ -11,11 +11,11 @@ use crate::model::{DecoderConfig, MotionDecoder, ParameterList};
 use crate::motion::{Channel, ChannelLimits, MOTION_DIM, Normalizer};
 use crate::weights::{Archive, Section};
 
-use super::averaged::Averaged;
+use super::averaged::NetworkState;
 use super::checkpoint::Progress;
 use super::config::DecoderTraining;
 use super::diffusion::tape_seed;
-use super::drive::{Alone, Learner, Losses, Reducer, Step, Validation};
+use super::drive::{Learner, Losses, NoReduction, Reducer, StepResult, Validation};
 use super::error::TrainingError;
 use super::objective::{Reconstruction, reconstruction};
 use super::sampling::{Condition, Denoiser, motion_view};
@@ -33,7 +33,7 @@ const STARTS: u64 = 7 << 60;
 /// Trains a decoder on the latents of a UNet that stays as it is.
 pub struct DecoderLearner<'u> {
     decoder: MotionDecoder,
-    network: Averaged,
+    network: NetworkState,
     gradients: Gradients<f32>,
     arena: Arena<f32>,
     threads: Arc<Threads>,
@@ -60,7 +60,7 @@ impl<'u> DecoderLearner<'u> {
         Self {
             decoder,
             gradients: Gradients::new(&parameters),
-            network: Averaged::new(DECODER, parameters, &config.optimizer, config.ema),
+            network: NetworkState::new(DECODER, parameters, &config.optimizer, config.ema),
             arena: Arena::default(),
             threads: Arc::new(Threads::of_process()),
             denoiser,
@@ -68,7 +68,7 @@ impl<'u> DecoderLearner<'u> {
             config: config.clone(),
             seed,
             windows: Arc::clone(windows),
-            reducer: Box::new(Alone),
+            reducer: Box::new(NoReduction),
         }
     }
 
@@ -238,14 +238,19 @@ fn combine(a: f64, x: &Array3<f32>, b: f64, y: &Array3<f32>) -> Array3<f32> {
 impl Learner for DecoderLearner<'_> {
     const STAGE: &'static str = "decoder";
 
-    fn step(&mut self, batch: &Batch, step: u64, n_steps: u64) -> Result<Step, TrainingError> {
+    fn step(
+        &mut self,
+        batch: &Batch,
+        step: u64,
+        n_steps: u64,
+    ) -> Result<StepResult, TrainingError> {
         let threads = Arc::clone(&self.threads);
         let learning_rate = self.config.learning_rate.at(step, n_steps);
         threads.run(|| {
             let losses = self.differentiate(batch, step)?;
             let gradient_norm =
                 self.network.step(&mut self.gradients, losses.total, learning_rate, step);
-            Ok(Step { losses, gradient_norm, learning_rate, lr_decoder: None })
+            Ok(StepResult { losses, gradient_norm, learning_rate, lr_decoder: None })
         })
     }
 

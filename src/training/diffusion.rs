@@ -11,10 +11,10 @@ use crate::motion::style::STYLE_DIM;
 use crate::motion::{MOTION_DIM, Normalizer};
 use crate::weights::{Archive, Section};
 
-use super::averaged::Averaged;
+use super::averaged::NetworkState;
 use super::checkpoint::Progress;
 use super::config::{DiffusionTraining, NetworkConfig};
-use super::drive::{Alone, Learner, Losses, Reducer, Step, Validation};
+use super::drive::{Learner, Losses, NoReduction, Reducer, StepResult, Validation};
 use super::error::TrainingError;
 use super::objective::Objective;
 use super::sampling::{Denoiser, is_partial, motion_view};
@@ -40,7 +40,7 @@ pub struct Baselines {
 /// Trains a UNet.
 pub struct DiffusionLearner {
     unet: Arc<UNet1D>,
-    network: Averaged,
+    network: NetworkState,
     /// Of the parts that are done side by side; the first gathers all.
     gradients: Vec<Gradients<f32>>,
     /// Of the parts that are done side by side.
@@ -73,7 +73,7 @@ impl DiffusionLearner {
             gradients: (0..config.side_by_side.max(1))
                 .map(|_| Gradients::new(&parameters))
                 .collect(),
-            network: Averaged::new(UNET, parameters, &config.optimizer, config.ema),
+            network: NetworkState::new(UNET, parameters, &config.optimizer, config.ema),
             arenas: (0..config.side_by_side.max(1)).map(|_| Arena::default()).collect(),
             threads: Arc::new(Threads::of_process()),
             schedule: Schedule::new(&network.diffusion)?,
@@ -81,7 +81,7 @@ impl DiffusionLearner {
             takes_style: network.unet.style_dim > 0,
             seed,
             windows: Arc::clone(windows),
-            reducer: Box::new(Alone),
+            reducer: Box::new(NoReduction),
         })
     }
 
@@ -116,7 +116,8 @@ impl DiffusionLearner {
             windows,
             ..
         } = &mut *self;
-        let (withhold, takes_style, seed) = (Withhold::of(config), *takes_style, *seed);
+        let (withhold, takes_style, seed) =
+            (WithholdProbabilities::of(config), *takes_style, *seed);
         let normalizer = windows.normalizer();
         let parameters = network.live();
         gradients.iter_mut().for_each(Gradients::clear);
@@ -130,7 +131,7 @@ impl DiffusionLearner {
                 let share = batch.mask.iter().map(|&w| f64::from(w)).sum::<f64>() / all.max(1.0);
                 let seed = tape_seed(seed, step * n_parts as u64 + part as u64);
                 let mut tape = Tape::new(parameters, arena, Some(seed));
-                let given = Given::of(&batch, schedule, withhold, takes_style);
+                let given = DiffusionInputs::of(&batch, schedule, withhold, takes_style);
                 let loss = given.loss(&mut tape, unet, normalizer, schedule, &config.objective)?;
                 let value = share * f64::from(loss.scalar());
                 let weight = tape.constant(&[], &[share as f32]);
@@ -158,10 +159,10 @@ impl DiffusionLearner {
         Ok(loss)
     }
 
-    /// Returns what is lost on the validation windows by those who do not look.
+    /// Returns the losses on the validation windows of predictors that ignore their input.
     ///
     /// # Errors
-    /// What reading the windows says.
+    /// The error of reading the windows.
     pub fn baselines(&self) -> Result<Baselines, TrainingError> {
         let mean = self.mean_over_validation(|given| Ok(given.mean_target()))?;
         let [constant, untrained] = self.mean_over_validation(|given| {
@@ -182,7 +183,7 @@ impl DiffusionLearner {
     /// Returns the means of some numbers over the frames of the validation windows, nothing dropped.
     fn mean_over_validation<const N: usize>(
         &self,
-        of: impl Fn(&Given) -> Result<[f64; N], TrainingError> + Sync,
+        mean_losses: impl Fn(&DiffusionInputs) -> Result<[f64; N], TrainingError> + Sync,
     ) -> Result<[f64; N], TrainingError> {
         let n = self.windows.n_validation();
         let n_wanted = n.clamp(MIN_VALIDATION_WINDOWS, MAX_VALIDATION_WINDOWS);
@@ -191,9 +192,13 @@ impl DiffusionLearner {
         for first in (0..n_wanted).step_by(size) {
             let batch = self.windows.validation(first..(first + size).min(n_wanted))?;
             let weight: f64 = batch.mask.iter().map(|&w| f64::from(w)).sum();
-            let given =
-                Given::of(&batch, &self.schedule, Withhold::of(&self.config), self.takes_style);
-            let found = self.threads.run(|| of(&given))?;
+            let given = DiffusionInputs::of(
+                &batch,
+                &self.schedule,
+                WithholdProbabilities::of(&self.config),
+                self.takes_style,
+            );
+            let found = self.threads.run(|| mean_losses(&given))?;
             for (sum, value) in sums.iter_mut().zip(found) {
                 *sum += weight * value;
             }
@@ -224,13 +229,13 @@ pub(super) fn tape_seed(seed: u64, number: u64) -> u64 {
 
 /// Probabilities with which conditions are withheld.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Withhold {
+pub struct WithholdProbabilities {
     pub audio: f64,
     pub style: f64,
     pub clock: f64,
 }
 
-impl Withhold {
+impl WithholdProbabilities {
     /// Returns those of a configuration.
     pub fn of(config: &DiffusionTraining) -> Self {
         Self {
@@ -241,8 +246,8 @@ impl Withhold {
     }
 }
 
-/// What the network is given of a batch, and what it should say.
-pub struct Given<'a> {
+/// Inputs of the denoiser for a batch, with its target.
+pub struct DiffusionInputs<'a> {
     batch: &'a Batch,
     pub t: Vec<usize>,
     x_t: Vec<f32>,
@@ -252,12 +257,12 @@ pub struct Given<'a> {
     style: Option<Vec<f32>>,
 }
 
-impl<'a> Given<'a> {
+impl<'a> DiffusionInputs<'a> {
     /// Adds noise to a batch, and withholds what chance withholds.
     pub fn of(
         batch: &'a Batch,
         schedule: &Schedule,
-        withhold: Withhold,
+        withhold: WithholdProbabilities,
         takes_style: bool,
     ) -> Self {
         let (n, frames) = (batch.n_windows, batch.n_frames);
@@ -318,15 +323,15 @@ impl<'a> Given<'a> {
         let mask = &self.batch.mask;
         let loss = objective.loss(g, schedule, &self.t, [prediction, &target], mask)?;
         let x_t = g.constant(prediction.shape(), &self.x_t);
-        let of_estimate = objective.estimate.loss(
+        let estimate_loss = objective.estimate.loss(
             g,
             normalizer,
             (schedule, &self.t),
             [prediction, &x_t],
             (&self.batch.motion, mask),
         )?;
-        Ok(match of_estimate {
-            Some(of_estimate) => g.add(&loss, &of_estimate)?,
+        Ok(match estimate_loss {
+            Some(estimate_loss) => g.add(&loss, &estimate_loss)?,
             None => loss,
         })
     }
@@ -394,14 +399,19 @@ fn without_clock(batch: &Batch, probability: f64) -> Cow<'_, [f32]> {
 impl Learner for DiffusionLearner {
     const STAGE: &'static str = "diffusion";
 
-    fn step(&mut self, batch: &Batch, step: u64, n_steps: u64) -> Result<Step, TrainingError> {
+    fn step(
+        &mut self,
+        batch: &Batch,
+        step: u64,
+        n_steps: u64,
+    ) -> Result<StepResult, TrainingError> {
         let loss = self.differentiate(batch, step)?;
         let learning_rate = self.config.learning_rate.at(step, n_steps);
         let Self { network, gradients, threads, .. } = self;
         let gradient_norm =
             threads.run(|| network.step(&mut gradients[0], loss, learning_rate, step));
         let losses = Losses { total: loss, parts: vec![("diffusion", loss)] };
-        Ok(Step { losses, gradient_norm, learning_rate, lr_decoder: None })
+        Ok(StepResult { losses, gradient_norm, learning_rate, lr_decoder: None })
     }
 
     fn rehearse(&mut self, batch: &Batch) -> Result<(), TrainingError> {

@@ -9,7 +9,7 @@ use crate::autodiff::Gradients;
 use crate::store::{Patience, StoreError};
 use crate::weights::{Archive, Section};
 
-use super::checkpoint::{Best, Checkpoints, Kind, Progress, State};
+use super::checkpoint::{Best, CheckpointKind, Checkpoints, Progress, State};
 use super::error::TrainingError;
 use super::journal::{Entry, Journal, RowKind};
 use super::loader::Loader;
@@ -17,8 +17,8 @@ use super::window::Batch;
 
 /// Steps in a row that may be skipped because something is not finite.
 const MAX_SKIPPED_IN_A_ROW: u32 = 10;
-/// How long steps are tried, without effect, to see how many fit into a time: at least so many, and for so
-/// long, but not more than a share of the time.
+/// How long steps are rehearsed, without effect, to estimate how many fit into a time: at least `MIN_TRIED` steps
+/// and `TRIED_S` seconds, but at most the share `SHARE_TRIED` of the time.
 const MIN_TRIED: u64 = 3;
 const TRIED_S: f64 = 8.0;
 const SHARE_TRIED: f64 = 0.02;
@@ -26,7 +26,7 @@ const SHARE_TRIED: f64 = 0.02;
 /// validations take the rest.
 const SHARE_OF_TIME: f64 = 0.92;
 
-/// Losses by name, and what is minimised.
+/// The loss that is minimised, and its parts by name.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Losses {
     pub total: f64,
@@ -47,9 +47,9 @@ impl Losses {
     }
 }
 
-/// What a step came to.
+/// The result of a training step.
 #[derive(Clone, Debug)]
-pub struct Step {
+pub struct StepResult {
     pub losses: Losses,
     /// Norm of the gradient before it was clipped.
     pub gradient_norm: f64,
@@ -57,13 +57,13 @@ pub struct Step {
     pub lr_decoder: Option<f64>,
 }
 
-impl Step {
+impl StepResult {
     fn is_finite(&self) -> bool {
         self.losses.total.is_finite() && self.gradient_norm.is_finite()
     }
 }
 
-/// What a validation came to.
+/// The losses of a validation.
 #[derive(Clone, Debug)]
 pub struct Validation {
     /// Of the weights that would be used: the average, where there is one.
@@ -80,15 +80,15 @@ pub trait Reducer: Send + Sync {
     fn reduce(&mut self, gradients: &mut Gradients<f32>);
 }
 
-/// A trainer alone.
+/// The reducer of a single process: leaves the gradients as they are.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Alone;
+pub struct NoReduction;
 
-impl Reducer for Alone {
+impl Reducer for NoReduction {
     fn reduce(&mut self, _gradients: &mut Gradients<f32>) {}
 }
 
-/// What learns.
+/// A network, or both, with its optimizer: takes training steps and validates.
 pub trait Learner: Send {
     /// Name of the stage, as tables and folders spell it.
     const STAGE: &'static str;
@@ -99,7 +99,8 @@ pub trait Learner: Send {
     ///
     /// # Errors
     /// Shapes that do not fit.
-    fn step(&mut self, batch: &Batch, step: u64, n_steps: u64) -> Result<Step, TrainingError>;
+    fn step(&mut self, batch: &Batch, step: u64, n_steps: u64)
+    -> Result<StepResult, TrainingError>;
 
     /// Does the work of a step but for the optimizer's, and forgets it, to see how long it takes.
     ///
@@ -185,7 +186,7 @@ impl Plan {
     }
 }
 
-/// Whoever looks on.
+/// Receives progress events of a training.
 pub trait Watch {
     /// Training begins at `step` of `n_steps`.
     fn begin(&self, stage: &'static str, step: u64, n_steps: u64);
@@ -193,7 +194,7 @@ pub trait Watch {
     fn step(&self, said: &str);
     /// Something worth a line.
     fn note(&self, line: &str);
-    /// Whether someone asked for an end.
+    /// Whether the user asked for an end.
     fn is_interrupted(&self) -> bool;
     /// Memory of the process, in bytes, if it can be told.
     fn resident_bytes(&self) -> Option<u64>;
@@ -203,14 +204,14 @@ pub trait Watch {
 
 /// How training ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum End {
+pub enum TrainingEnd {
     /// All steps were done.
     Done,
     /// The time was over.
     OutOfTime,
     /// Nothing improved any more.
     Stale,
-    /// Someone asked for it.
+    /// The user asked for an end.
     Interrupted,
 }
 
@@ -235,7 +236,7 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
         &mut self,
         learner: &mut L,
         start_loader: impl FnOnce(u64) -> Loader,
-    ) -> Result<End, TrainingError> {
+    ) -> Result<TrainingEnd, TrainingError> {
         let mut loader = start_loader(self.state.progress.step);
         let mut first = Some(loader.next_batch()?);
         if self.state.progress.n_steps == 0 {
@@ -257,14 +258,14 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
         let end = loop {
             let step = self.state.progress.step;
             if step >= n_steps {
-                break End::Done;
+                break TrainingEnd::Done;
             }
             if self.watch.is_interrupted() {
-                break End::Interrupted;
+                break TrainingEnd::Interrupted;
             }
             let elapsed_s = before_s + started.elapsed().as_secs_f64();
             if self.plan.time.is_some_and(|time| elapsed_s >= time.as_secs_f64()) {
-                break End::OutOfTime;
+                break TrainingEnd::OutOfTime;
             }
             let batch = match first.take() {
                 Some(batch) => batch,
@@ -286,7 +287,7 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
             if every(self.plan.validate_every_epochs) || is_last {
                 self.validate(learner)?;
                 if self.is_stale() {
-                    break End::Stale;
+                    break TrainingEnd::Stale;
                 }
             }
             let by_steps = self.plan.save_every_steps.is_some_and(|n| done.is_multiple_of(n));
@@ -298,7 +299,7 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
             }
         };
         self.state.progress.elapsed_s = before_s + started.elapsed().as_secs_f64();
-        if end == End::OutOfTime {
+        if end == TrainingEnd::OutOfTime {
             self.validate(learner)?;
         }
         self.save(learner)?;
@@ -335,7 +336,7 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
         &mut self,
         learner: &L,
         batch: &Batch,
-        taken: &Step,
+        taken: &StepResult,
         took: Duration,
         waited: Duration,
     ) -> Result<(), TrainingError> {
@@ -407,7 +408,7 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
         ));
         if is_better {
             let best = learner.best();
-            self.write(Kind::Best, &best)?;
+            self.write(CheckpointKind::Best, &best)?;
         }
         Ok(())
     }
@@ -431,7 +432,7 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
                 .map_err(TrainingError::from)
                 .and_then(|()| self.journal.commit(step, patience, &notice))
         };
-        let done = done.and_then(|()| self.write(Kind::Step, &learner.sections()));
+        let done = done.and_then(|()| self.write(CheckpointKind::Step, &learner.sections()));
         done.map_err(|source| TrainingError::NotSaved {
             stage: L::STAGE,
             step,
@@ -440,7 +441,7 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
         })
     }
 
-    fn write(&self, kind: Kind, sections: &[Section<f32>]) -> Result<(), TrainingError> {
+    fn write(&self, kind: CheckpointKind, sections: &[Section<f32>]) -> Result<(), TrainingError> {
         let mut outcome = Ok(());
         let written = self.plan.store_patience.wait_out(
             |error, pause| notice(self.watch, error, pause),
@@ -464,8 +465,8 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
 
     /// Returns what messages call the newest checkpoint.
     fn last_checkpoint(&self) -> String {
-        match self.checkpoints.steps(Kind::Step).unwrap_or_default().last() {
-            Some(&step) => self.checkpoints.place(Kind::Step, step),
+        match self.checkpoints.steps(CheckpointKind::Step).unwrap_or_default().last() {
+            Some(&step) => self.checkpoints.place(CheckpointKind::Step, step),
             None => "none".to_owned(),
         }
     }

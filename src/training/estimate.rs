@@ -17,8 +17,8 @@ use crate::model::{Graph, Result};
 use crate::motion::{Channel, MOTION_DIM, Normalizer};
 use crate::units::FPS;
 
-/// The next derivative of captured motion is so many times as large, 1/s: its jerk is 19 times its acceleration
-/// (38 m/s³ and 2 m/s² on constructed dance, 42 and 2.2 on captured).
+/// Ratio of the size of a derivative of captured motion to that of the one before, 1/s: its jerk is 19 times its
+/// acceleration (38 m/s³ and 2 m/s² on constructed dance, 42 and 2.2 on captured).
 const RATE_PER_S: f64 = 20.0;
 
 /// Weights of the losses on the estimate; with zeros nothing is added.
@@ -132,10 +132,10 @@ fn estimate<I: Interpreter>(
         return Ok(prediction.clone());
     }
     let size = prediction.len() / t.len().max(1);
-    let whole = |g: &I, of: fn(&(f64, f64)) -> f64| {
+    let whole = |g: &I, factor: fn(&(f64, f64)) -> f64| {
         let values: Vec<_> = factors
             .iter()
-            .flat_map(|factors| std::iter::repeat_n(I::Element::from_f64(of(factors)), size))
+            .flat_map(|factors| std::iter::repeat_n(I::Element::from_f64(factor(factors)), size))
             .collect();
         g.constant(prediction.shape(), &values)
     };
@@ -260,13 +260,13 @@ mod tests {
         };
         let said = |b, t, i| at(&|k| estimate[k], b, t, i);
         let true_at = |b, t, i| at(&|k| f64::from(motion[k]), b, t, i);
-        let mean = |order: usize, of: &dyn Fn(usize, usize) -> Vec<f64>| {
+        let mean = |order: usize, vector: &dyn Fn(usize, usize) -> Vec<f64>| {
             let mut sum = 0.0;
             for b in 0..2 {
                 for t in 0..FRAMES - order {
                     let counts = (t..=t + order).all(|t| mask[b * FRAMES + t] == 1.0);
                     if counts {
-                        let values = of(b, t);
+                        let values = vector(b, t);
                         sum += values.iter().map(|x| x * x).sum::<f64>() / values.len() as f64;
                     }
                 }

@@ -25,8 +25,8 @@ use super::averaged::{MOMENTS, section};
 use super::checkpoint::Progress;
 use super::config::{FinetuneConfig, NetworkConfig};
 use super::decoder::DECODER;
-use super::diffusion::{Given, UNET, Withhold, tape_seed};
-use super::drive::{Alone, Learner, Losses, Reducer, Step, Validation};
+use super::diffusion::{DiffusionInputs, UNET, WithholdProbabilities, tape_seed};
+use super::drive::{Learner, Losses, NoReduction, Reducer, StepResult, Validation};
 use super::error::TrainingError;
 use super::objective::{Objective, reconstruction};
 use super::pipeline::{Pipeline, weighted_sum};
@@ -40,16 +40,16 @@ const N_VALIDATION: usize = 64;
 /// Section of both networks beside the optimizer's.
 const BOTH: &str = "model.";
 
-/// What is said of motion that was sampled and decoded.
-struct Sampled<T> {
+/// Motion that was sampled and decoded, with its losses.
+struct SampledMotion<T> {
     position: T,
     quaternion: T,
     temporal: TemporalLosses<T>,
     decoded: T,
 }
 
-/// What end-to-end training adds up, and the motion that it is about.
-pub struct EndToEnd<T> {
+/// The losses of end-to-end training, and the decoded motion that they measure.
+pub struct EndToEndLosses<T> {
     pub total: T,
     pub diffusion: T,
     pub position: T,
@@ -69,7 +69,7 @@ pub struct FinetuneLearner {
     threads: Arc<Threads>,
     schedule: Schedule,
     objective: Objective,
-    withhold: Withhold,
+    withhold: WithholdProbabilities,
     config: FinetuneConfig,
     windows: Arc<Windows>,
     reducer: Box<dyn Reducer>,
@@ -83,7 +83,7 @@ impl FinetuneLearner {
     /// A configuration that makes no network; more sampling steps than there are.
     pub fn new(
         network: &NetworkConfig,
-        (objective, withhold): (&Objective, Withhold),
+        (objective, withhold): (&Objective, WithholdProbabilities),
         config: &FinetuneConfig,
         windows: &Arc<Windows>,
         [unet, decoder]: [&Parameters<f32>; 2],
@@ -109,7 +109,7 @@ impl FinetuneLearner {
             withhold,
             config: config.clone(),
             windows: Arc::clone(windows),
-            reducer: Box::new(Alone),
+            reducer: Box::new(NoReduction),
         })
     }
 
@@ -132,13 +132,13 @@ impl FinetuneLearner {
         &self,
         g: &mut I,
         batch: &Batch,
-    ) -> Result<EndToEnd<Tensor<f32>>, TrainingError> {
+    ) -> Result<EndToEndLosses<Tensor<f32>>, TrainingError> {
         let diffusion = self.diffusion(g, batch)?;
         let sampled = self.sampled(g, batch)?;
         let rest = self.total(g, &sampled)?;
         let total = weighted_sum(g, &[(&diffusion, self.config.diffusion_weight), (&rest, 1.0)])?;
-        let Sampled { position, quaternion, temporal, decoded } = sampled;
-        Ok(EndToEnd { total, diffusion, position, quaternion, temporal, decoded })
+        let SampledMotion { position, quaternion, temporal, decoded } = sampled;
+        Ok(EndToEndLosses { total, diffusion, position, quaternion, temporal, decoded })
     }
 
     /// The loss of the UNet's prediction.
@@ -148,7 +148,7 @@ impl FinetuneLearner {
         batch: &Batch,
     ) -> Result<Tensor<f32>, TrainingError> {
         let Self { pipeline, schedule, .. } = self;
-        let given = Given::of(batch, schedule, self.withhold, pipeline.takes_style);
+        let given = DiffusionInputs::of(batch, schedule, self.withhold, pipeline.takes_style);
         given.loss(g, &pipeline.unet, self.windows.normalizer(), schedule, &self.objective)
     }
 
@@ -157,7 +157,7 @@ impl FinetuneLearner {
         &self,
         g: &mut I,
         batch: &Batch,
-    ) -> Result<Sampled<Tensor<f32>>, TrainingError> {
+    ) -> Result<SampledMotion<Tensor<f32>>, TrainingError> {
         let Self { pipeline, schedule, config: c, .. } = self;
         // The sample begins with the same noise that was added for the prediction, turned round: independent
         // of where a network that sees only the other went, and no further draw.
@@ -170,14 +170,14 @@ impl FinetuneLearner {
         let found = reconstruction(g, normalizer, &decoded, &batch.motion, &batch.mask)?;
         let temporal = temporal_losses(g, &c.temporal, &decoded, &batch.mask)?;
         let (position, quaternion) = (found.position, found.quaternion);
-        Ok(Sampled { position, quaternion, temporal, decoded })
+        Ok(SampledMotion { position, quaternion, temporal, decoded })
     }
 
     /// The weighted sum of what is said of sampled motion.
     fn total<I: Interpreter<Element = f32>>(
         &self,
         g: &mut I,
-        sampled: &Sampled<Tensor<f32>>,
+        sampled: &SampledMotion<Tensor<f32>>,
     ) -> Result<Tensor<f32>, TrainingError> {
         let c = &self.config;
         let mut terms =
@@ -306,7 +306,12 @@ impl Coherence {
 impl Learner for FinetuneLearner {
     const STAGE: &'static str = "finetune";
 
-    fn step(&mut self, batch: &Batch, step: u64, _n_steps: u64) -> Result<Step, TrainingError> {
+    fn step(
+        &mut self,
+        batch: &Batch,
+        step: u64,
+        _n_steps: u64,
+    ) -> Result<StepResult, TrainingError> {
         let threads = Arc::clone(&self.threads);
         let FinetuneConfig { lr_diffusion, lr_decoder, .. } = self.config;
         threads.run(|| {
@@ -319,7 +324,7 @@ impl Learner for FinetuneLearner {
                 f64::NAN
             };
             let lr_decoder = Some(lr_decoder);
-            Ok(Step { losses, gradient_norm, learning_rate: lr_diffusion, lr_decoder })
+            Ok(StepResult { losses, gradient_norm, learning_rate: lr_diffusion, lr_decoder })
         })
     }
 
@@ -338,7 +343,7 @@ impl Learner for FinetuneLearner {
                 let mut g = Eager::new(&self.parameters, &self.arena);
                 self.losses(&mut g, &batch)
             })?;
-            let EndToEnd { total, diffusion, position, quaternion, temporal, .. } = &found;
+            let EndToEndLosses { total, diffusion, position, quaternion, temporal, .. } = &found;
             let mut losses = named(value(total), value(diffusion), position, quaternion, temporal);
             let decoded = self.threads.run(|| self.generated(&batch))?;
             let motions = decoded.data().chunks_exact(batch.n_frames * MOTION_DIM);
@@ -361,8 +366,8 @@ impl Learner for FinetuneLearner {
                 counted.map(|(row, _)| norm(&row[Channel::Velocity.range()])).sum()
             };
             let speed_ratio = speed(decoded.data()) / speed(&real).max(f64::MIN_POSITIVE);
-            let mean = |of: &dyn Fn(&Coherence) -> f64| {
-                measured.iter().map(of).sum::<f64>() / measured.len() as f64
+            let mean = |value: &dyn Fn(&Coherence) -> f64| {
+                measured.iter().map(value).sum::<f64>() / measured.len() as f64
             };
             losses.parts.extend([
                 ("velocity_error", mean(&|c| c.velocity_m_s)),

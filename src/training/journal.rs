@@ -11,10 +11,10 @@ use crate::store::{
 };
 
 use super::checkpoint::Progress;
-use super::drive::{Losses, Step};
+use super::drive::{Losses, StepResult};
 use super::error::TrainingError;
 
-/// What a row tells of.
+/// The event that a row records.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RowKind {
     Step,
@@ -40,7 +40,7 @@ pub struct Entry<'a> {
     pub step: u64,
     pub losses: &'a Losses,
     pub live_loss: Option<f64>,
-    pub taken: Option<&'a Step>,
+    pub taken: Option<&'a StepResult>,
     pub is_skipped: bool,
     pub samples_per_s: Option<f64>,
     pub data_wait_s: Option<f64>,
@@ -85,7 +85,7 @@ pub struct Journal<'a> {
     command: &'static str,
     /// Digest of the run's configuration.
     params_hash: String,
-    /// What determines the rows beside configuration and steps.
+    /// Identity of the data, which determines the rows beside configuration and steps.
     data: String,
     ledger: Ledger,
     first_step: u64,
@@ -213,8 +213,8 @@ impl<'a> Journal<'a> {
             let mut commit = Commit::new(self.store, self.command, &self.params_hash, &self.run);
             let schema = TrainingLogRow::schema;
             commit.part(schema().name, schema)?.write_rows(&self.rows)?;
-            // The same steps of the same run have the same losses, whoever takes them: a run is a name, and what it
-            // learns from and how.
+            // The same steps of the same run have the same losses, whichever process takes them: a run is
+            // determined by its name, its data and its settings.
             let input_hash = digest(format!("{id} to {step} of {}", self.data).as_bytes());
             let fingerprint = input_hash.clone();
             let item = Item { id: id.clone(), fingerprint, input_hash, failure: None };

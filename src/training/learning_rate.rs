@@ -4,10 +4,10 @@ use std::f64::consts::PI;
 
 use serde::{Deserialize, Serialize};
 
-/// The course after the warm-up.
+/// The course of the learning rate after the warm-up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Course {
+pub enum LearningRateSchedule {
     /// Stays.
     Constant,
     /// (1 + cos π p) / 2 over the share p of the steps after the warm-up.
@@ -22,7 +22,7 @@ pub enum Course {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LearningRate {
     pub peak: f64,
-    pub course: Course,
+    pub course: LearningRateSchedule,
     /// Steps of the warm-up; in a short training at most a tenth of all.
     pub warmup_steps: u64,
 }
@@ -38,9 +38,9 @@ impl LearningRate {
         let p = p.min(1.0);
         self.peak
             * match self.course {
-                Course::Constant => 1.0,
-                Course::Cosine => (1.0 + (PI * p).cos()) / 2.0,
-                Course::Linear => 1.0 - p,
+                LearningRateSchedule::Constant => 1.0,
+                LearningRateSchedule::Cosine => (1.0 + (PI * p).cos()) / 2.0,
+                LearningRateSchedule::Linear => 1.0 - p,
             }
     }
 }
@@ -51,7 +51,8 @@ mod tests {
 
     #[test]
     fn it_rises_to_the_peak_and_falls_to_zero() {
-        let rate = LearningRate { peak: 2e-4, course: Course::Cosine, warmup_steps: 1000 };
+        let rate =
+            LearningRate { peak: 2e-4, course: LearningRateSchedule::Cosine, warmup_steps: 1000 };
         let n = 21_000;
         // The first of 1000 equal parts of the peak, but for one rounding.
         assert!((rate.at(0, n) / 2e-7 - 1.0).abs() < 1e-15, "{}", rate.at(0, n));
@@ -64,15 +65,16 @@ mod tests {
             assert!((rate.at(step, n) / 2e-4 - share).abs() < 1e-12, "{step}");
         }
         assert!(rate.at(n - 1, n) < 2e-12);
-        let linear = LearningRate { course: Course::Linear, ..rate };
+        let linear = LearningRate { course: LearningRateSchedule::Linear, ..rate };
         assert!((linear.at(6000, n) - 1.5e-4).abs() < 1e-18);
-        let constant = LearningRate { course: Course::Constant, ..rate };
+        let constant = LearningRate { course: LearningRateSchedule::Constant, ..rate };
         assert_eq!(constant.at(20_999, n), 2e-4);
     }
 
     #[test]
     fn a_short_training_warms_up_for_a_tenth() {
-        let rate = LearningRate { peak: 1.0, course: Course::Linear, warmup_steps: 1000 };
+        let rate =
+            LearningRate { peak: 1.0, course: LearningRateSchedule::Linear, warmup_steps: 1000 };
         assert_eq!((rate.at(0, 50), rate.at(4, 50), rate.at(5, 50)), (0.2, 1.0, 1.0));
         assert_eq!(rate.at(0, 1), 1.0);
         assert_eq!(rate.at(60, 50), 0.0, "beyond the end");

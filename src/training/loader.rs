@@ -17,7 +17,7 @@ const AHEAD: usize = 2;
 ///
 /// Window number i of training is number i mod n of the order of epoch ⌊i / n⌋, n windows an epoch: a
 /// batch may reach over the end of an epoch, and none is left out. So a batch depends on its number
-/// alone, whoever makes it.
+/// alone, whichever thread makes it.
 pub struct Loader {
     threads: Vec<JoinHandle<()>>,
     batches: Vec<Receiver<Result<Batch, StoreError>>>,
@@ -43,7 +43,7 @@ impl Loader {
                     for number in (first + thread..).step_by(n as usize) {
                         let batch = windows.train(&order.batch(&windows, number, batch_size));
                         let failed = batch.is_err();
-                        // Nobody listens any more: training is over.
+                        // The receiver is dropped once training is over.
                         if sender.send(batch).is_err() || failed {
                             return;
                         }
@@ -81,7 +81,7 @@ impl Drop for Loader {
     fn drop(&mut self) {
         self.batches.clear();
         for thread in self.threads.drain(..) {
-            // A panic was seen by whoever waited for the batch.
+            // A panic was already reported to the thread that waited for the batch.
             thread.join().ok();
         }
     }

@@ -24,21 +24,23 @@ mod sampling;
 mod temporal;
 mod window;
 
-pub use checkpoint::{Best, Checkpoints, Kind, Progress, State};
+pub use checkpoint::{Best, CheckpointKind, Checkpoints, Progress, State};
 pub use config::{
     DecoderTraining, DiffusionTraining, FinetuneConfig, NetworkConfig, OptimizerConfig,
     TrainConfig, differences,
 };
-pub use dataset::{Dataset, DatasetError, LeftOut, Phrase, Reading, Split};
+pub use dataset::{Dataset, DatasetError, DatasetOptions, ExcludedPhrase, Phrase, Split};
 pub use decoder::DecoderLearner;
-pub use diffusion::{Baselines, DiffusionLearner, Given, Withhold};
-pub use drive::{Alone, Drive, End, Learner, Losses, Plan, Reducer, Step, Validation, Watch};
+pub use diffusion::{Baselines, DiffusionInputs, DiffusionLearner, WithholdProbabilities};
+pub use drive::{
+    Drive, Learner, Losses, NoReduction, Plan, Reducer, StepResult, TrainingEnd, Validation, Watch,
+};
 pub use ema::{Ema, EmaConfig};
 pub use error::TrainingError;
 pub use estimate::EstimateLosses;
-pub use finetune::{EndToEnd, FinetuneLearner};
+pub use finetune::{EndToEndLosses, FinetuneLearner};
 pub use journal::{Journal, RowKind};
-pub use learning_rate::{Course, LearningRate};
+pub use learning_rate::{LearningRate, LearningRateSchedule};
 pub use loader::Loader;
 pub use objective::{ChannelWeights, Objective, Reconstruction, reconstruction};
 pub use sampling::{Condition, Denoiser};

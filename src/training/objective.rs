@@ -23,7 +23,7 @@ pub struct Objective {
     /// How channels are weighed; as release 0.1 did, all alike, where a run says nothing.
     #[serde(default)]
     pub channels: ChannelWeights,
-    /// What is asked of the estimate of clean motion beside.
+    /// Additional losses on the estimate of clean motion.
     #[serde(default)]
     pub estimate: EstimateLosses,
 }
@@ -226,18 +226,18 @@ mod tests {
         let target = g.input(&[2, 3, 2], &[0.0; 12]);
         let mask = [1.0, 1.0, 0.0, 1.0, 0.0, 0.0];
         let t = [20, 700];
-        let of = |g: &mut Eager<f64>, objective: &Objective| {
+        let loss_of = |g: &mut Eager<f64>, objective: &Objective| {
             let loss = objective.loss(g, &schedule, &t, [&prediction, &target], &mask);
             loss.expect("shapes fit").scalar()
         };
         // Squares of 0 to 3 and of 6 and 7, over six numbers.
-        assert_eq!(of(&mut g, &Objective::default()), (14.0 + 85.0) / 6.0);
+        assert_eq!(loss_of(&mut g, &Objective::default()), (14.0 + 85.0) / 6.0);
         let l1 = Objective { loss: LossType::L1, ..Objective::default() };
-        assert_eq!(of(&mut g, &l1), (6.0 + 13.0) / 6.0);
+        assert_eq!(loss_of(&mut g, &l1), (6.0 + 13.0) / 6.0);
         let weighted = Objective { min_snr_gamma: Some(5.0), ..Objective::default() };
         let w = t.map(|t| schedule.snr(t).min(5.0) / schedule.snr(t));
         let wanted = (w[0] * 14.0 + w[1] * 85.0) / 6.0;
-        assert!((of(&mut g, &weighted) - wanted).abs() < 1e-12 * wanted);
+        assert!((loss_of(&mut g, &weighted) - wanted).abs() < 1e-12 * wanted);
     }
 
     #[test]

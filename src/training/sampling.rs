@@ -21,7 +21,7 @@ pub struct Denoiser<'a> {
     pub takes_style: bool,
 }
 
-/// What a denoiser listens to.
+/// The conditions of a denoiser.
 #[derive(Clone, Copy, Debug)]
 pub struct Condition<'a> {
     /// Features, `[batch, frames, 163]`.
@@ -30,7 +30,7 @@ pub struct Condition<'a> {
     pub mask: &'a [f32],
     /// Mean normalised style, `[batch, 8]`.
     pub style: &'a [f32],
-    /// Samples that go without the music, 1 for each, `[batch]`; nobody where empty.
+    /// 1 for each sample that goes without the music, `[batch]`; empty where all have music.
     pub drop_audio: &'a [f32],
 }
 

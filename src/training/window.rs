@@ -17,7 +17,7 @@ use crate::store::StoreError;
 
 use super::dataset::{Dataset, Phrase, Split};
 
-/// What makes more of each phrase; zero and false leave it as it is.
+/// Augmentation of windows; zero and false leave them as they are.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Augmentation {
     /// Standard deviation of the noise added to features, in units of their spread.
@@ -57,7 +57,7 @@ pub struct Batch {
     pub phrase_ids: Vec<Arc<str>>,
 }
 
-/// What is decided by chance for each window, as numbers uniform in \[0, 1).
+/// Random decisions for each window, as numbers uniform in \[0, 1).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Chances {
     /// How much noise is added: step ⌊u T⌋.
@@ -109,7 +109,7 @@ impl Batch {
     }
 }
 
-/// What networks see motion and music through.
+/// Normalization of motion and music for the networks.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Scales {
     pub motion: Normalizer,
@@ -207,7 +207,7 @@ impl Windows {
         self.validation.len()
     }
 
-    /// Returns which phrase each window of an epoch is of: the same for anyone who asks.
+    /// Returns which phrase each window of an epoch is of, determined by seed and epoch alone.
     ///
     /// Fisher and Yates; each swap takes its number from the stream of the seed and epoch.
     pub fn order(&self, epoch: u64) -> Vec<u32> {

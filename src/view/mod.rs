@@ -11,10 +11,10 @@ use ndarray::Array2;
 
 pub use page::page;
 
-/// What a page shows.
+/// The content of a page.
 #[derive(Clone, Debug, PartialEq)]
 pub struct View {
-    /// What stands over the page.
+    /// The title of the page.
     pub title: String,
     /// Motions to choose from, the first of which is shown at first.
     pub samples: Vec<ViewSample>,

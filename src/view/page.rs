@@ -50,8 +50,8 @@ pub fn page(view: &View) -> String {
 /// Returns about how long the page will be.
 fn size_bytes(view: &View) -> usize {
     let in_base64 = |n_bytes: usize| n_bytes.div_ceil(3) * 4;
-    let of = |sample: &ViewSample| in_base64(size_of::<f32>() * sample.frames.len());
-    let motions: usize = view.samples.iter().map(of).sum();
+    let motion_bytes = |sample: &ViewSample| in_base64(size_of::<f32>() * sample.frames.len());
+    let motions: usize = view.samples.iter().map(motion_bytes).sum();
     let audio = view.audio.as_ref().map_or(0, |audio| in_base64(audio.bytes.len()));
     let own: usize = SCRIPTS.iter().map(|script| script.len()).sum();
     motions + audio + own + STYLE.len() + TEMPLATE.len() + (16 << 10)
@@ -66,7 +66,7 @@ fn write_audio(out: &mut String, audio: Option<&Audio>) {
     out.push_str("\"></audio>\n");
 }
 
-/// What the script reads.
+/// The data that the script reads.
 #[derive(Serialize)]
 struct Data<'a> {
     fps: f64,

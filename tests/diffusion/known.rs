@@ -1,6 +1,8 @@
 //! In-painting with the exact denoiser of a Gaussian.
 
-use motiongen::diffusion::{BetaSchedule, Known, Prediction, Sampler, Spacing, sample, steps};
+use motiongen::diffusion::{
+    BetaSchedule, KnownValues, Prediction, Sampler, Spacing, sample, steps,
+};
 use ndarray::{Array3, ArrayView3};
 
 use super::gaussian::{D, Gaussian, Moments, PAIR};
@@ -20,7 +22,7 @@ fn known_values_stay_and_the_rest_follows_them() {
     let conditional = slope * (VALUE - mean_fixed);
     let values = Array3::from_elem((N, 1, D), VALUE as f32);
     let mask = Array3::from_shape_fn((N, 1, D), |(_, _, k)| k == fixed);
-    let known = Known::new(values, mask).expect("known values");
+    let known = KnownValues::new(values, mask).expect("known values");
     for (seed, (sampler, n_steps, prediction)) in (70..).zip([
         (Sampler::Ddpm, 250, Prediction::Epsilon),
         (Sampler::Ddpm, 50, Prediction::Velocity),

@@ -2,7 +2,7 @@
 //!
 //! The samplers are stated here once more, from their papers and in plain ᾱ.
 
-use motiongen::diffusion::{Sampler, SamplerConfig, Schedule, Step, steps};
+use motiongen::diffusion::{Sampler, SamplerConfig, SamplerStep, Schedule, steps};
 
 use super::gaussian::{D, Gaussian, Moments};
 
@@ -16,10 +16,15 @@ pub struct Weights {
 }
 
 /// Returns step i as its paper has it.
-pub fn published(sampler: Sampler, schedule: &Schedule, steps: &[Step], i: usize) -> Weights {
+pub fn published(
+    sampler: Sampler,
+    schedule: &Schedule,
+    steps: &[SamplerStep],
+    i: usize,
+) -> Weights {
     let alpha_bar = |t: Option<usize>| t.map_or(1.0, |t| schedule.alpha_bar(t));
     let lambda = |t: Option<usize>| 0.5 * (alpha_bar(t) / (1.0 - alpha_bar(t))).ln();
-    let Step { t, next } = steps[i];
+    let SamplerStep { t, next } = steps[i];
     let (from, to) = (alpha_bar(Some(t)), alpha_bar(next));
     match sampler {
         // Ho et al. 2020, eq. 7, with β of the respaced steps.
@@ -81,7 +86,7 @@ pub fn propagate(
     gaussian: &Gaussian,
     schedule: &Schedule,
     sampler: Sampler,
-    steps: &[Step],
+    steps: &[SamplerStep],
     start: Axes,
 ) -> Axes {
     let mut end = start;

@@ -2,8 +2,8 @@
 
 use motiongen::autodiff::Stream;
 use motiongen::diffusion::{
-    BetaSchedule, DiffusionConfig, Level, Prediction, Sampler, SamplerConfig, Schedule, Spacing,
-    Step, sample, steps,
+    BetaSchedule, DiffusionConfig, Level, Prediction, Sampler, SamplerConfig, SamplerStep,
+    Schedule, Spacing, sample, steps,
 };
 use ndarray::{Array3, ArrayView3};
 
@@ -76,7 +76,7 @@ fn samples_have_the_mean_and_covariance_that_follow_from_the_steps() {
 
 /// Returns the largest error, over the axes, of the deviation that `steps` leave of x_t distributed
 /// exactly as it is at the first of them.
-fn deviation_error(schedule: &Schedule, sampler: Sampler, steps: &[Step]) -> f64 {
+fn deviation_error(schedule: &Schedule, sampler: Sampler, steps: &[SamplerStep]) -> f64 {
     let gaussian = Gaussian::new();
     let exact = |t| {
         let Level { signal, noise } = schedule.level(t);
@@ -131,8 +131,8 @@ fn ddim_is_of_first_order_and_dpm_solver_of_second() {
     let schedule = schedule(BetaSchedule::Cosine, Prediction::Epsilon);
     let error = |sampler, width: usize| {
         let t: Vec<usize> = (100..=900).rev().step_by(width).collect();
-        let steps: Vec<Step> =
-            t.windows(2).map(|pair| Step { t: pair[0], next: Some(pair[1]) }).collect();
+        let steps: Vec<SamplerStep> =
+            t.windows(2).map(|pair| SamplerStep { t: pair[0], next: Some(pair[1]) }).collect();
         deviation_error(&schedule, sampler, &steps)
     };
     for (sampler, order) in [(DDIM, 1.0), (Sampler::DpmSolver, 2.0)] {

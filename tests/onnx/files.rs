@@ -2,14 +2,16 @@
 
 use bytes::Bytes;
 use motiongen::model::Preset;
-use motiongen::onnx::{Encoded, Form, Model, Session, Storage, UNetNames, check, unet, values_of};
+use motiongen::onnx::{
+    EncodedModel, Form, Model, Session, Storage, UNetNames, check, unet, values_of,
+};
 use proptest::prelude::*;
 use prost::Message as _;
 
 use super::networks::{file, random, scale};
 use super::{OPTIONS, floats, runtime, write};
 
-fn tiny() -> Encoded {
+fn tiny() -> EncodedModel {
     let config = Preset::Tiny.config();
     let parameters = random(motiongen::model::UNet1D::new(&config).1, 5);
     let weights = |id| parameters.unpacked(id);
@@ -99,7 +101,7 @@ fn rules_that_are_broken_are_named() {
 #[test]
 fn weights_lie_beside_their_file() {
     let model = Model::read(tiny().model, None, "m.onnx").expect("a model");
-    let Encoded { model, weights } =
+    let EncodedModel { model, weights } =
         file(model.graph.expect("a graph")).encode("unet.weights.bin", 0);
     let mut model = Model::read(model, weights.as_ref(), "m.onnx").expect("a model");
     check(&model, "m.onnx").expect("the rules are kept");

@@ -12,7 +12,8 @@ use motiongen::model::{
 use motiongen::motion::postprocess::{Coherence, FusionVariances, PostProcessConfig, process};
 use motiongen::motion::{Channel, ChannelLimits, MOTION_DIM};
 use motiongen::onnx::{
-    DecoderNames, Form, ModelFile, Session, Storage, Tensor, UNetNames, decoder, unet, values_of,
+    DecoderNames, Form, ModelFile, NamedTensor, Session, Storage, UNetNames, decoder, unet,
+    values_of,
 };
 use ndarray::{Array2, ArrayViewMut2, s};
 
@@ -206,7 +207,7 @@ fn a_decoder_that_fuses_is_the_same_network_in_onnx() {
     for (batch, frames) in [(2, 121), (3, 7), (1, 1)] {
         let latent = slow_waves(batch, frames);
         let shape = [batch, frames, MOTION_DIM];
-        let inputs: [Tensor; 1] = [floats(DecoderNames::LATENT, &shape, &latent)];
+        let inputs: [NamedTensor; 1] = [floats(DecoderNames::LATENT, &shape, &latent)];
         let (found_shape, found) = session.run(&inputs, DecoderNames::MOTION).expect("motion");
         let arena = Arena::default();
         let mut g = Eager::new(&parameters, &arena);
@@ -323,7 +324,7 @@ fn a_decoder_gives_motion_within_its_limits() {
     for (batch, frames) in [(1, 120), (3, 7)] {
         let latent = normal(batch * frames * MOTION_DIM, 6);
         let shape = [batch, frames, MOTION_DIM];
-        let inputs: [Tensor; 1] = [floats(DecoderNames::LATENT, &shape, &latent)];
+        let inputs: [NamedTensor; 1] = [floats(DecoderNames::LATENT, &shape, &latent)];
         let (found_shape, found) = session.run(&inputs, DecoderNames::MOTION).expect("motion");
         let arena = Arena::default();
         let mut g = Eager::new(&parameters, &arena);

@@ -8,7 +8,7 @@ use motiongen::model::{
     Activation, Attention, Channels, Convolution, Graph, GroupNormalization, Init, Mirror,
     Parameter, ParameterId, ParameterList, Result, Role,
 };
-use motiongen::onnx::{Axes, Builder, Form, ModelFile, Storage, Tensor};
+use motiongen::onnx::{Axes, Builder, Form, ModelFile, NamedTensor, Storage};
 use ndarray::Array2;
 
 use super::{floats, integers, max_difference, normal, session};
@@ -281,7 +281,7 @@ fn by_onnxruntime(call: Call, form: Form) -> (Vec<usize>, Vec<f32>) {
     let folder = tempfile::tempdir().expect("a folder");
     let mut session = session(file, folder.path(), "call.onnx");
     let values = values();
-    let inputs: Vec<Tensor> = ["x", "other", "context", "samples", "film", "choice", "mask"]
+    let inputs: Vec<NamedTensor> = ["x", "other", "context", "samples", "film", "choice", "mask"]
         .iter()
         .map(|&name| floats(name, &values[name].0, &values[name].1))
         .chain([integers("index", &[8, 0, 3])])

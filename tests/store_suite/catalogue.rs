@@ -3,7 +3,8 @@
 use std::collections::BTreeMap;
 
 use motiongen::store::{
-    Commit, Item, Ledger, Location, Put, Row as _, StoreSnapshot, checkpoint, tables::FailureRow,
+    Commit, Item, Ledger, Location, PutOutcome, Row as _, StoreSnapshot, checkpoint,
+    tables::FailureRow,
 };
 
 use super::{Backend, backends, chain, paths, put, read};
@@ -162,7 +163,7 @@ fn a_catalogue_that_is_damaged_or_of_others_is_passed_over() {
     // A catalogue of another stage, under a higher number.
     replace(&bytes);
     let other = "catalogue/train/00000009-0123456789abcdef.parquet";
-    assert_eq!(put(location, other, &bytes), Put::Written);
+    assert_eq!(put(location, other, &bytes), PutOutcome::Written);
     let mut train = Commit::new(location, "train", "", "run");
     train.settle(item("run/0", "1"), &Ledger::default());
     train.publish().expect("published");

@@ -2,7 +2,7 @@
 
 use motiongen::store::tables::{FailureRow, motion};
 use motiongen::store::{
-    Commit, Committed, Item, Ledger, Location, Row as _, Snapshot, StoreError, TableSchema,
+    Commit, CommitResult, Item, Ledger, Location, Row as _, Snapshot, StoreError, TableSchema,
     TimestampUs,
 };
 use ndarray::Array2;
@@ -33,7 +33,11 @@ pub(super) fn item(id: &str, message: &str) -> Item {
 }
 
 /// Commits outcomes as a process does that has read `ledger`.
-pub(super) fn commit(location: &Location, ledger: &Ledger, outcomes: &[(&str, &str)]) -> Committed {
+pub(super) fn commit(
+    location: &Location,
+    ledger: &Ledger,
+    outcomes: &[(&str, &str)],
+) -> CommitResult {
     let mut commit = Commit::new(location, STAGE, "rules", "file:///source");
     let rows: Vec<_> = outcomes.iter().map(|(id, message)| outcome(id, message)).collect();
     let part = commit.part("failures", FailureRow::schema).expect("a temporary file");
@@ -141,7 +145,7 @@ fn the_same_work_by_several_processes_leaves_one_commit() {
     for backend in backends("same") {
         let location = &backend.location;
         let work = [("a", "1"), ("b", "2"), ("c", "3")];
-        let outcomes: Vec<Committed> = std::thread::scope(|scope| {
+        let outcomes: Vec<CommitResult> = std::thread::scope(|scope| {
             let process = |_| scope.spawn(|| commit(location, &Ledger::default(), &work));
             let processes: Vec<_> = (0..5).map(process).collect();
             processes.into_iter().map(|p| p.join().expect("no panic")).collect()

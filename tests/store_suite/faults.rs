@@ -1,7 +1,7 @@
 //! What goes wrong on the way to a remote store: refusals, throttling, lost answers, broken lines.
 
 use bytes::Bytes;
-use motiongen::store::Put;
+use motiongen::store::PutOutcome;
 
 use super::{Backend, Remote, chain, noise, paths, put, put_file, read, remote_backends};
 use crate::servers::faults::Faults;
@@ -57,7 +57,7 @@ fn a_refusal_names_the_place_and_the_variables_that_grant_access() {
 fn slow_answers_are_waited_for() {
     for backend in with_object("slow", 0, &noise(5_003, 1)) {
         remote(&backend).stores.inject(Faults { delay_ms: 70, ..Faults::default() });
-        assert_eq!(put(&backend.location, "new", b"x"), Put::Written, "{backend}");
+        assert_eq!(put(&backend.location, "new", b"x"), PutOutcome::Written, "{backend}");
         assert_eq!(read(&backend.location, "data"), noise(5_003, 1), "{backend}");
         assert_eq!(paths(&backend.location, ""), ["data", "new"], "{backend}");
     }
@@ -70,14 +70,14 @@ fn throttled_and_failed_requests_are_tried_again_until_they_succeed() {
         let faults =
             Faults { too_many_requests_first: 3, server_error_first: 2, ..Faults::default() };
         stores.inject(faults);
-        assert_eq!(put(&backend.location, "new", b"x"), Put::Written, "{backend}");
+        assert_eq!(put(&backend.location, "new", b"x"), PutOutcome::Written, "{backend}");
         assert_eq!(stores.injected(), 5, "{backend}");
         assert_eq!(read(&backend.location, "data"), noise(5_003, 1), "{backend}");
         assert_eq!(paths(&backend.location, ""), ["data", "new"], "{backend}");
         // One write, one HEAD, one GET and one listing.
         assert_eq!(stores.injected(), 20, "{backend}");
         let large = noise((8 << 20) + 1, 3);
-        assert_eq!(put_file(&backend.location, "large", &large), Put::Written, "{backend}");
+        assert_eq!(put_file(&backend.location, "large", &large), PutOutcome::Written, "{backend}");
         assert!(read(&backend.location, "large") == large, "{backend}: bytes differ");
     }
 }
@@ -112,10 +112,14 @@ fn a_creation_whose_answer_was_lost_is_no_error_and_happened_once() {
             let (stores, bytes) = (&remote(&backend).stores, noise(n, 2));
             stores.inject(Faults { lose_response_first: 1, ..Faults::default() }.only(is_put));
             // Whose object it is cannot be told if the client itself repeated the request.
-            let _either: Put = put(&backend.location, "new", &bytes);
+            let _either: PutOutcome = put(&backend.location, "new", &bytes);
             assert_eq!(stores.injected(), 1, "{backend}: {n}");
             assert!(read(&backend.location, "new") == bytes, "{backend}: {n} bytes differ");
-            assert_eq!(put(&backend.location, "new", b"other"), Put::AlreadyThere, "{backend}");
+            assert_eq!(
+                put(&backend.location, "new", b"other"),
+                PutOutcome::AlreadyThere,
+                "{backend}"
+            );
         }
     }
 }
@@ -139,7 +143,7 @@ fn a_large_upload_whose_last_answer_was_lost_is_whole() {
             Faults { lose_response_first: 1, ..Faults::default() }
                 .only(|method, _| method == "POST"),
         );
-        assert_eq!(put_file(&backend.location, "large", &bytes), Put::Written, "{backend}");
+        assert_eq!(put_file(&backend.location, "large", &bytes), PutOutcome::Written, "{backend}");
         // The start of the upload and its end.
         assert!(stores.injected() >= 2, "{backend}: {} answers were lost", stores.injected());
         stores.inject(Faults::default());
@@ -172,7 +176,11 @@ fn broken_connections_are_opened_again_for_reads_writes_and_listings() {
         for backend in with_object("dropped", 3, &noise(n, 1)) {
             let stores = &remote(&backend).stores;
             stores.inject(Faults { drop_connection_first: 2, ..Faults::default() });
-            assert_eq!(put(&backend.location, "new", &noise(n, 2)), Put::Written, "{backend}: {n}");
+            assert_eq!(
+                put(&backend.location, "new", &noise(n, 2)),
+                PutOutcome::Written,
+                "{backend}: {n}"
+            );
             assert!(read(&backend.location, "data") == noise(n, 1), "{backend}: {n}");
             assert!(read(&backend.location, "new") == noise(n, 2), "{backend}: {n}");
             assert_eq!(paths(&backend.location, ""), ["data", "new"], "{backend}: {n}");

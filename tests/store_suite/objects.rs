@@ -3,7 +3,7 @@
 use std::sync::Barrier;
 
 use bytes::Bytes;
-use motiongen::store::{ClientOptions, Listed, Location, Put};
+use motiongen::store::{ClientOptions, ListedObject, Location, PutOutcome};
 
 use super::{backends, noise, paths, put, put_file, read};
 
@@ -12,7 +12,11 @@ fn a_new_object_of_any_size_reads_back_as_it_was_written() {
     for backend in backends("new") {
         for n in [0, 1, 13_001, (1 << 20) + 3] {
             let (path, bytes) = (format!("folder {n}/ä{n}.bin"), noise(n, 1 + n as u64));
-            assert_eq!(put(&backend.location, &path, &bytes), Put::Written, "{backend}: {n}");
+            assert_eq!(
+                put(&backend.location, &path, &bytes),
+                PutOutcome::Written,
+                "{backend}: {n}"
+            );
             assert!(read(&backend.location, &path) == bytes, "{backend}: {n} bytes differ");
         }
     }
@@ -21,10 +25,14 @@ fn a_new_object_of_any_size_reads_back_as_it_was_written() {
 #[test]
 fn a_put_over_an_existing_object_leaves_it_as_it_was() {
     for backend in backends("over") {
-        assert_eq!(put(&backend.location, "commits/a.json", b"first"), Put::Written, "{backend}");
+        assert_eq!(
+            put(&backend.location, "commits/a.json", b"first"),
+            PutOutcome::Written,
+            "{backend}"
+        );
         for second in [&b"second, and longer"[..], b"", b"first"] {
             let again = put(&backend.location, "commits/a.json", second);
-            assert_eq!(again, Put::AlreadyThere, "{backend}");
+            assert_eq!(again, PutOutcome::AlreadyThere, "{backend}");
             assert_eq!(read(&backend.location, "commits/a.json"), b"first", "{backend}");
         }
     }
@@ -38,7 +46,7 @@ fn a_listing_is_sorted_and_ends_at_the_border_of_its_folder() {
         }
         let listed = backend.location.list("b").expect("a listing");
         let expected = [("b/10", 7), ("b/x/2", 5)]
-            .map(|(path, size_bytes)| Listed { path: path.to_owned(), size_bytes });
+            .map(|(path, size_bytes)| ListedObject { path: path.to_owned(), size_bytes });
         assert_eq!(listed, expected, "{backend}");
         let all = ["a", "b.txt", "b/10", "b/x/2", "bc/1"];
         assert_eq!(paths(&backend.location, ""), all, "{backend}");
@@ -82,8 +90,10 @@ fn many_objects_are_read_in_the_order_asked_for_repetitions_included() {
             put(&backend.location, &path(i), &noise(3 * i, i as u64));
         }
         let order: Vec<usize> = (0..59).map(|k| k * 17 % 41).collect();
-        let listed: Vec<_> =
-            order.iter().map(|&i| Listed { path: path(i), size_bytes: 3 * i as u64 }).collect();
+        let listed: Vec<_> = order
+            .iter()
+            .map(|&i| ListedObject { path: path(i), size_bytes: 3 * i as u64 })
+            .collect();
         let contents = backend.location.read_many(&listed).expect("all are there");
         assert_eq!(contents.len(), 59, "{backend}");
         for (i, content) in order.into_iter().zip(contents) {
@@ -100,8 +110,8 @@ fn a_missing_object_is_named_in_the_error() {
         let expected = format!("{place}: not found");
         let error = backend.location.read("not/here.json").expect_err("nothing to read");
         assert_eq!(error.to_string(), expected, "{backend}");
-        let both =
-            ["there", "not/here.json"].map(|path| Listed { path: path.to_owned(), size_bytes: 1 });
+        let both = ["there", "not/here.json"]
+            .map(|path| ListedObject { path: path.to_owned(), size_bytes: 1 });
         let error = backend.location.read_many(&both).expect_err("one is missing");
         assert_eq!(error.to_string(), expected, "{backend}");
         if let Some(remote) = &backend.remote {
@@ -117,10 +127,14 @@ fn a_published_file_reads_back_whatever_its_size() {
     for (n, n_parts) in [(0, 0), (40_961, 0), ((9 << 20) + 7, 2)] {
         for backend in backends("file") {
             let (location, bytes) = (&backend.location, noise(n, 7));
-            assert_eq!(put_file(location, "t/a.parquet", &bytes), Put::Written, "{backend}: {n}");
+            assert_eq!(
+                put_file(location, "t/a.parquet", &bytes),
+                PutOutcome::Written,
+                "{backend}: {n}"
+            );
             let other = noise(n + 1, 8);
             let again = put_file(location, "t/a.parquet", &other);
-            assert_eq!(again, Put::AlreadyThere, "{backend}: {n}");
+            assert_eq!(again, PutOutcome::AlreadyThere, "{backend}: {n}");
             assert!(read(location, "t/a.parquet") == bytes, "{backend}: {n} bytes differ");
             assert_eq!(paths(location, ""), ["t/a.parquet"], "{backend}: {n}");
             if let Some(root) = location.local_path() {
@@ -140,7 +154,7 @@ fn a_published_file_reads_back_whatever_its_size() {
 fn a_large_object_is_read_in_ranges_of_8_mib() {
     for backend in backends("ranges") {
         let bytes = noise((17 << 20) + 11, 5);
-        assert_eq!(put_file(&backend.location, "large", &bytes), Put::Written, "{backend}");
+        assert_eq!(put_file(&backend.location, "large", &bytes), PutOutcome::Written, "{backend}");
         assert!(read(&backend.location, "large") == bytes, "{backend}: bytes differ");
         let Some(remote) = &backend.remote else { continue };
         let requests = remote.stores.requests();
@@ -161,7 +175,7 @@ fn of_eight_threads_that_create_one_object_exactly_one_succeeds() {
             let path = format!("commits/ingest/{round}.json");
             let start = Barrier::new(8);
             let bytes_of = |i: usize| noise(100 + i, i as u64);
-            let outcomes: Vec<Put> = std::thread::scope(|scope| {
+            let outcomes: Vec<PutOutcome> = std::thread::scope(|scope| {
                 let create = |i| {
                     let (location, path, start) = (&backend.location, &path, &start);
                     scope.spawn(move || {
@@ -172,7 +186,7 @@ fn of_eight_threads_that_create_one_object_exactly_one_succeeds() {
                 let threads: Vec<_> = (0..8).map(create).collect();
                 threads.into_iter().map(|t| t.join().expect("no panic")).collect()
             });
-            let winners: Vec<_> = (0..8).filter(|&i| outcomes[i] == Put::Written).collect();
+            let winners: Vec<_> = (0..8).filter(|&i| outcomes[i] == PutOutcome::Written).collect();
             let [winner] = winners[..] else { panic!("{backend}: {outcomes:?}") };
             assert_eq!(read(&backend.location, &path), bytes_of(winner), "{backend}");
         }

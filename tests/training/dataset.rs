@@ -6,8 +6,8 @@ use std::sync::Arc;
 use motiongen::autodiff::Parameters;
 use motiongen::model::{DecoderConfig, MotionDecoder, ParameterList};
 use motiongen::motion::Normalizer;
-use motiongen::store::{Location, Patience, Put};
-use motiongen::training::{Checkpoints, Dataset, Kind, Reading, Split, State};
+use motiongen::store::{Location, Patience, PutOutcome};
+use motiongen::training::{CheckpointKind, Checkpoints, Dataset, DatasetOptions, Split, State};
 use motiongen::weights::Section;
 use ndarray::Array2;
 
@@ -39,7 +39,7 @@ fn phrases_at_hand_are_read_back_in_order_of_name() {
 
 /// What is read of a store, wherever it lies.
 fn read(store: &Location, in_memory: bool) -> Dataset {
-    let reading = Reading {
+    let reading = DatasetOptions {
         in_memory,
         n_threads: NonZeroUsize::new(3).expect("above 0"),
         patience: Patience::default(),
@@ -81,22 +81,22 @@ fn a_bucket_and_a_folder_hold_the_same_phrases() {
     for step in [3, 5, 9] {
         state.progress.step = step;
         assert_eq!(
-            checkpoints.write(Kind::Step, &state, &[section]).expect("written"),
-            Put::Written
+            checkpoints.write(CheckpointKind::Step, &state, &[section]).expect("written"),
+            PutOutcome::Written
         );
     }
-    assert_eq!(checkpoints.steps(Kind::Step).expect("listed"), [5, 9]);
+    assert_eq!(checkpoints.steps(CheckpointKind::Step).expect("listed"), [5, 9]);
     assert_eq!(
-        checkpoints.write(Kind::Step, &state, &[section]).expect("there"),
-        Put::AlreadyThere
+        checkpoints.write(CheckpointKind::Step, &state, &[section]).expect("there"),
+        PutOutcome::AlreadyThere
     );
-    let back = checkpoints.read(Kind::Step, 9, |archive, place| {
+    let back = checkpoints.read(CheckpointKind::Step, 9, |archive, place| {
         assert_eq!(State::<u32>::of(archive, place)?, state);
         Ok(archive.section::<f32>("unet.", small_list()).expect("weights"))
     });
     assert_eq!(back.expect("read").all(), weights.all());
     checkpoints.clear().expect("removed");
-    assert_eq!(checkpoints.steps(Kind::Step).expect("listed"), [0_u64; 0]);
+    assert_eq!(checkpoints.steps(CheckpointKind::Step).expect("listed"), [0_u64; 0]);
 }
 
 fn small_list() -> ParameterList {

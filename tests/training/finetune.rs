@@ -6,8 +6,8 @@ use motiongen::autodiff::{Arena, Eager, Gradients, Parameters, Tape, Tensor};
 use motiongen::diffusion::{BetaSchedule, DiffusionConfig, LossType, Prediction};
 use motiongen::model::{DecoderConfig, MotionDecoder, Preset, UNet1D, UNetConfig};
 use motiongen::training::{
-    Batch, EndToEnd, FinetuneConfig, FinetuneLearner, Learner, NetworkConfig, Objective,
-    OptimizerConfig, TemporalConfig, Withhold,
+    Batch, EndToEndLosses, FinetuneConfig, FinetuneLearner, Learner, NetworkConfig, Objective,
+    OptimizerConfig, TemporalConfig, WithholdProbabilities,
 };
 
 use super::given;
@@ -77,7 +77,7 @@ impl Case {
         let both = [&unet, &decoder];
         let learner = FinetuneLearner::new(
             &network,
-            (objective, Withhold::default()),
+            (objective, WithholdProbabilities::default()),
             config,
             &windows,
             both,
@@ -220,8 +220,8 @@ fn config(num_steps: usize, [diffusion, decoder, temporal]: [f64; 3]) -> Finetun
 }
 
 /// Returns all losses in the order of their names.
-fn all(found: &EndToEnd<Tensor<f32>>) -> Vec<&Tensor<f32>> {
-    let EndToEnd { total, diffusion, position, quaternion, temporal, .. } = found;
+fn all(found: &EndToEndLosses<Tensor<f32>>) -> Vec<&Tensor<f32>> {
+    let EndToEndLosses { total, diffusion, position, quaternion, temporal, .. } = found;
     [diffusion, position, quaternion].into_iter().chain(temporal.all()).chain([total]).collect()
 }
 

@@ -6,7 +6,8 @@ use std::sync::Arc;
 use motiongen::autodiff::Parameters;
 use motiongen::motion::{MOTION_DIM, Normalizer};
 use motiongen::training::{
-    Augmentation, Batch, Chances, Course, Dataset, Learner, LearningRate, Progress, Windows,
+    Augmentation, Batch, Chances, Dataset, Learner, LearningRate, LearningRateSchedule, Progress,
+    Windows,
 };
 use motiongen::weights::{Archive, Precision, Section, save_to_file};
 
@@ -72,7 +73,7 @@ pub fn windows(normalizer: Normalizer, n_frames: usize) -> Arc<Windows> {
 }
 
 pub fn constant_rate(peak: f64) -> LearningRate {
-    LearningRate { peak, course: Course::Constant, warmup_steps: 0 }
+    LearningRate { peak, course: LearningRateSchedule::Constant, warmup_steps: 0 }
 }
 
 /// Gives a learner its weights, and an optimizer that has seen nothing.

@@ -9,8 +9,8 @@ use motiongen::diffusion::{DiffusionConfig, LossType, Prediction, Schedule};
 use motiongen::model::{DecoderConfig, Preset, UNet1D, UNetConfig, UNetInputs};
 use motiongen::motion::Normalizer;
 use motiongen::training::{
-    Augmentation, Batch, DiffusionLearner, DiffusionTraining, EmaConfig, Given, Learner,
-    NetworkConfig, Objective, OptimizerConfig, Withhold,
+    Augmentation, Batch, DiffusionInputs, DiffusionLearner, DiffusionTraining, EmaConfig, Learner,
+    NetworkConfig, Objective, OptimizerConfig, WithholdProbabilities,
 };
 
 use super::given;
@@ -168,8 +168,8 @@ fn every_objective_is_pytorchs() {
     let mut wanted = golden.values("objectives").iter();
     for prediction in predictions {
         let schedule = schedule(prediction);
-        let withhold = Withhold { audio: DROPPED, ..Withhold::default() };
-        let given = Given::of(&batch, &schedule, withhold, false);
+        let withhold = WithholdProbabilities { audio: DROPPED, ..WithholdProbabilities::default() };
+        let given = DiffusionInputs::of(&batch, &schedule, withhold, false);
         for loss in losses {
             for min_snr_gamma in [None, Some(5.0)] {
                 let objective = Objective { loss, min_snr_gamma, ..Objective::default() };

@@ -18,7 +18,7 @@ pub struct Conv {
 
 /// Rows of one product: output row `target[i]` is Σ over `taps` of the source row times the weight.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Gather {
+pub struct GatherRows {
     /// Taps of the weight, in the order in which they are summed.
     pub taps: Vec<usize>,
     /// Output rows.
@@ -58,7 +58,7 @@ impl Conv {
     }
 
     /// Rows of the forward product.
-    pub fn forward(&self) -> Gather {
+    pub fn forward(&self) -> GatherRows {
         let out = self.out_frames();
         let mut source = Vec::with_capacity(self.taps * self.out_rows());
         for tap in 0..self.taps {
@@ -72,14 +72,18 @@ impl Conv {
                 }));
             }
         }
-        Gather { taps: (0..self.taps).collect(), target: (0..self.out_rows()).collect(), source }
+        GatherRows {
+            taps: (0..self.taps).collect(),
+            target: (0..self.out_rows()).collect(),
+            source,
+        }
     }
 
     /// Rows of the product for the input's gradient, which is a sum over output rows.
     ///
     /// With a stride, input frames that lie differently to it meet different taps; each such phase
     /// is a product of its own, so that nothing is multiplied by zeros.
-    pub fn backward(&self) -> Vec<Gather> {
+    pub fn backward(&self) -> Vec<GatherRows> {
         let out = self.out_frames();
         let frames_of = |phase: usize| {
             (0..self.frames).filter(move |i| (i + self.padding) % self.stride == phase)
@@ -101,7 +105,7 @@ impl Conv {
                     }));
                 }
             }
-            Gather { taps, target, source }
+            GatherRows { taps, target, source }
         };
         (0..self.stride).map(phase).collect()
     }
@@ -151,7 +155,7 @@ mod tests {
             Conv { batch: 2, frames: 10, taps: 4, stride: 2, padding: 1, dilation: 1 },
             Conv { batch: 2, frames: 8, taps: 2, stride: 3, padding: 0, dilation: 1 },
         ] {
-            let pairs = |gather: &Gather, turned: bool| {
+            let pairs = |gather: &GatherRows, turned: bool| {
                 let n = gather.target.len();
                 let mut pairs = Vec::new();
                 for (i, &source) in gather.source.iter().enumerate() {

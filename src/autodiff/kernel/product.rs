@@ -12,7 +12,7 @@ use crate::autodiff::arena::Arena;
 use crate::autodiff::element::Element;
 
 use super::few_rows::input_gradient_of_few;
-use super::gather::{Conv, Gather, ZERO_ROW};
+use super::gather::{Conv, GatherRows, ZERO_ROW};
 use super::pack::{PANEL, panels, transpose_16};
 use super::tile::{MAX_PANELS, MAX_ROWS, Tile};
 
@@ -59,7 +59,7 @@ fn zeros<E: Element>() -> Vec<E> {
     vec![E::ZERO; BLOCK]
 }
 
-/// What a product multiplies with its rows: panels for a run of k.
+/// The right-hand side of a product, as panels for a run of k.
 struct Block<E> {
     b: *const E,
     b_panel: usize,
@@ -79,7 +79,7 @@ struct Block<E> {
     reason = "one loop of two products, split off to be written once"
 )]
 unsafe fn run_rows<E: Element>(
-    gather: &Gather,
+    gather: &GatherRows,
     rows: Range<usize>,
     source: &[E],
     source_channels: usize,
@@ -133,7 +133,7 @@ unsafe fn run_rows<E: Element>(
 pub fn product<E: Element>(
     source: &[E],
     channels: usize,
-    gather: &Gather,
+    gather: &GatherRows,
     weight: &[E],
     bias: Option<&[E]>,
     out: &mut [E],

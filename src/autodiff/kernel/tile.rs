@@ -37,8 +37,8 @@ pub struct Tile<E> {
     pub n_columns: usize,
     /// Whether C is added to or overwritten.
     pub add: bool,
-    /// Whether C is large and not read soon, so that it should not pass through the caches; who asks
-    /// for it calls [`fence`] before other threads may read.
+    /// Whether C is large and not read soon, so that it should not pass through the caches; the
+    /// caller must call [`fence`] before other threads may read.
     pub stream: bool,
 }
 

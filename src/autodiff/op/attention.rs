@@ -10,7 +10,7 @@ use crate::model::{GraphError, Result};
 
 /// Where queries, keys or values lie: which input, and from which channel on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Place {
+pub struct InputChannels {
     pub input: usize,
     pub first: usize,
 }
@@ -24,18 +24,18 @@ pub struct Place {
 /// # Shapes
 /// inputs: \[batch, queries, …\], \[batch, keys, …\]; mask: \[batch, keys\] → \[batch, queries, width\]
 pub struct Attend<E: Element> {
-    pub query: Place,
-    pub key: Place,
-    pub value: Place,
+    pub query: InputChannels,
+    pub key: InputChannels,
+    pub value: InputChannels,
     pub width: usize,
     pub heads: usize,
     pub causal: bool,
     /// Whether the last input is a mask of the keys.
     pub masked: bool,
-    kept: Option<Kept<E>>,
+    kept: Option<AttentionActivations<E>>,
 }
 
-struct Kept<E: Element> {
+struct AttentionActivations<E: Element> {
     inputs: Vec<Tensor<E>>,
     /// Softmax, \[batch, heads, queries, keys\].
     weights: Tensor<E>,
@@ -43,7 +43,7 @@ struct Kept<E: Element> {
 
 /// The sizes of one head.
 #[derive(Clone, Copy)]
-struct Head {
+struct HeadShape {
     queries: usize,
     keys: usize,
     dim: usize,
@@ -51,7 +51,12 @@ struct Head {
 
 impl<E: Element> Attend<E> {
     /// Returns the operation.
-    pub fn new([query, key, value]: [Place; 3], width: usize, heads: usize, causal: bool) -> Self {
+    pub fn new(
+        [query, key, value]: [InputChannels; 3],
+        width: usize,
+        heads: usize,
+        causal: bool,
+    ) -> Self {
         Self { query, key, value, width, heads, causal, masked: false, kept: None }
     }
 
@@ -61,7 +66,7 @@ impl<E: Element> Attend<E> {
         self
     }
 
-    fn check(&self, x: &[&Tensor<E>]) -> Result<Head> {
+    fn check(&self, x: &[&Tensor<E>]) -> Result<HeadShape> {
         let label = "attention";
         for (what, place) in [("query", self.query), ("key", self.key), ("value", self.value)] {
             let input = x[place.input];
@@ -91,11 +96,17 @@ impl<E: Element> Attend<E> {
             }
         }
         let queries = x[self.query.input].shape()[1];
-        Ok(Head { queries, keys, dim: self.width / self.heads })
+        Ok(HeadShape { queries, keys, dim: self.width / self.heads })
     }
 
     /// Returns one head of one sample of an input as a matrix \[frames, dim\].
-    fn head<'a>(&self, x: &'a Tensor<E>, place: Place, b: usize, h: usize) -> Matrix<'a, E> {
+    fn head<'a>(
+        &self,
+        x: &'a Tensor<E>,
+        place: InputChannels,
+        b: usize,
+        h: usize,
+    ) -> Matrix<'a, E> {
         let (frames, channels) = (x.shape()[1], x.channels());
         let first = b * frames * channels + place.first + h * self.width / self.heads;
         Matrix { data: &x.data()[first.min(x.len())..], strides: [channels, 1] }
@@ -151,7 +162,7 @@ impl<E: Element> Operation<E> for Attend<E> {
     }
 
     fn forward(&mut self, x: &[&Tensor<E>], run: &Run<E>) -> Result<Tensor<E>> {
-        let Head { queries, keys, dim } = self.check(x)?;
+        let HeadShape { queries, keys, dim } = self.check(x)?;
         let batch = x[self.query.input].shape()[0];
         let mask = self.masked.then(|| x[x.len() - 1]);
         let all_kept = vec![E::ONE; keys];
@@ -186,7 +197,7 @@ impl<E: Element> Operation<E> for Attend<E> {
         });
         if run.recording {
             let inputs = x.iter().map(|&x| x.clone()).collect();
-            self.kept = Some(Kept { inputs, weights });
+            self.kept = Some(AttentionActivations { inputs, weights });
         }
         Ok(y)
     }
@@ -194,14 +205,15 @@ impl<E: Element> Operation<E> for Attend<E> {
     /// With P the weights: dV = Pᵀ dO, dP = dO Vᵀ, dS = P ∘ (dP − Σ_j dP P), dQ = dS K/√d,
     /// dK = dSᵀ Q/√d.
     fn backward(&mut self, dy: Tensor<E>, at: &mut Backward<E>) -> Vec<Option<Tensor<E>>> {
-        let Kept { inputs, weights } = self.kept.take().expect("kept by the forward");
+        let AttentionActivations { inputs, weights } =
+            self.kept.take().expect("kept by the forward");
         let [batch, heads, queries, keys] = *weights.shape() else { unreachable!("its own shape") };
         let dim = self.width / heads;
         let scale = E::from_f64(1.0 / (dim as f64).sqrt());
         let [query, key, value] = [self.query, self.key, self.value].map(|p| &inputs[p.input]);
         let tensor = |frames: usize| at.tensor(&[batch, heads, frames, dim], |_| {});
         let [mut dq, mut dk, mut dv] = [tensor(queries), tensor(keys), tensor(keys)];
-        let all = Place { input: 0, first: 0 };
+        let all = InputChannels { input: 0, first: 0 };
         let parts = (dq.data_mut().par_chunks_mut((queries * dim).max(1)))
             .zip(dk.data_mut().par_chunks_mut((keys * dim).max(1)))
             .zip(dv.data_mut().par_chunks_mut((keys * dim).max(1)));

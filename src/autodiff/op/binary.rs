@@ -13,7 +13,7 @@ pub fn add_assign<E: Element>(y: &mut [E], x: &[E]) {
     update(y, x, |y, x| y + x);
 }
 
-/// What is done with two numbers.
+/// The operation on two numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pair {
     Add,

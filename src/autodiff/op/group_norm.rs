@@ -20,10 +20,10 @@ use crate::model::{Activation, GraphError, GroupNormalization, ParameterId, Resu
 pub struct NormFilmActivate<E: Element> {
     norm: GroupNormalization,
     activation: Activation,
-    kept: Option<Kept<E>>,
+    kept: Option<NormActivations<E>>,
 }
 
-struct Kept<E: Element> {
+struct NormActivations<E: Element> {
     x: Tensor<E>,
     film: Option<Tensor<E>>,
     /// μ and r of each sample and group.
@@ -210,7 +210,7 @@ impl<E: Element> Operation<E> for NormFilmActivate<E> {
             all = moments.collect::<Vec<_>>().concat();
         });
         if run.recording {
-            self.kept = Some(Kept { x: x.clone(), film: film.cloned(), moments: all });
+            self.kept = Some(NormActivations { x: x.clone(), film: film.cloned(), moments: all });
         }
         Ok(y)
     }
@@ -219,7 +219,7 @@ impl<E: Element> Operation<E> for NormFilmActivate<E> {
     /// ds = γ S₂ + β S₁, dh = S₁, dγ = Σ_b (1 + s) S₂, dβ = Σ_b (1 + s) S₁, and with g = γ (1 + s),
     /// m₁ and m₂ the means of g dz and g dz x̂ over the group, dx = r (g dz − m₁ − x̂ m₂).
     fn backward(&mut self, mut dy: Tensor<E>, at: &mut Backward<E>) -> Vec<Option<Tensor<E>>> {
-        let Kept { x, film, moments } = self.kept.take().expect("kept by the forward");
+        let NormActivations { x, film, moments } = self.kept.take().expect("kept by the forward");
         let norm = self.norm;
         let channels = x.channels();
         let width = channels / norm.groups;

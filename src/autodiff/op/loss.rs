@@ -5,7 +5,7 @@ use crate::autodiff::operation::{Backward, Operation, Run};
 use crate::autodiff::tensor::Tensor;
 use crate::model::{GraphError, Result};
 
-/// What one difference d costs.
+/// The cost of one difference d.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Cost {
     /// d².

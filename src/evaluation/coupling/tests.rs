@@ -39,24 +39,24 @@ fn constructed_motion_has_coefficient_one_and_its_faults_are_told() {
     let bar_s = 1.9;
     let song = song(601, bar_s, 0.3);
     let rise = song.rise(bar_s, 0.0);
-    let of = |rise: &[f64], rotation: f64| {
+    let coefficient_of = |rise: &[f64], rotation: f64| {
         sums(&Coupling::Constructed, &[song.passage(rise)]).coefficient(rotation).expect("moves")
     };
     // The construction and the coupling are one function, computed twice.
-    assert!((of(&rise, 0.0) - 1.0).abs() < 1e-9, "{}", of(&rise, 0.0));
+    assert!((coefficient_of(&rise, 0.0) - 1.0).abs() < 1e-9, "{}", coefficient_of(&rise, 0.0));
     let half: Vec<f64> = rise.iter().map(|v| 0.5 * v + 0.7).collect();
-    assert!((of(&half, 0.0) - 0.5).abs() < 1e-9);
+    assert!((coefficient_of(&half, 0.0) - 0.5).abs() < 1e-9);
     let upside_down: Vec<f64> = rise.iter().map(|v| -v).collect();
-    assert!((of(&upside_down, 0.0) + 1.0).abs() < 1e-9);
+    assert!((coefficient_of(&upside_down, 0.0) + 1.0).abs() < 1e-9);
     // A beat late: far from 1 with the bar where it is, and 1 with the bar a beat late too.
     let late = song.rise(bar_s, -0.25);
-    assert!(of(&late, 0.0).abs() < 0.4, "{}", of(&late, 0.0));
+    assert!(coefficient_of(&late, 0.0).abs() < 0.4, "{}", coefficient_of(&late, 0.0));
     // The norm is that of the bar where it is, so that a rotated coefficient is off by a few percent.
-    assert!((of(&late, -0.25) - 1.0).abs() < 0.05, "{}", of(&late, -0.25));
+    assert!((coefficient_of(&late, -0.25) - 1.0).abs() < 0.05, "{}", coefficient_of(&late, -0.25));
     // Another tempo, and a body that stands.
     let other = self::song(601, 1.3, 0.3).rise(1.3, 0.0);
-    assert!(of(&other, 0.0).abs() < 0.2, "{}", of(&other, 0.0));
-    assert!(of(&[0.0; 600], 0.0).abs() < 1e-12);
+    assert!(coefficient_of(&other, 0.0).abs() < 0.2, "{}", coefficient_of(&other, 0.0));
+    assert!(coefficient_of(&[0.0; 600], 0.0).abs() < 1e-12);
     let still = CoupledPassage { bars: &[0.4; 601], ..song.passage(&rise) };
     assert_eq!(sums(&Coupling::Constructed, &[still]).coefficient(0.0), None);
     let nan = [f64::NAN; 600];

@@ -53,7 +53,7 @@ fn a_share_stays_between_nothing_and_all() {
     near(share_estimate(13, 13), [1.0, 1.0 / (1.0 + 1.96 * 1.96 / 13.0), 1.0]);
     near(share_estimate(0, 7), [0.0, 0.0, 1.0 - 1.0 / (1.0 + 1.96 * 1.96 / 7.0)]);
     assert_eq!(share_estimate(0, 0), Estimate::plain(None, 0));
-    // Songs whose windows are all alike are so many items, here two, and t(1) = 12.7062 tells next to nothing.
+    // Songs whose windows are all alike count as one item each, here two, and t(1) = 12.7062 tells next to nothing.
     let alike =
         clustered_share_estimate(&[true, true, true, false, false, false], &[0, 0, 0, 1, 1, 1]);
     near(alike, [0.5, 0.001_54, 0.998_46]);

@@ -17,7 +17,7 @@ pub use ratio::{coupling_ratio, motion_ratios};
 use std::collections::BTreeMap;
 
 use super::interval::{Estimate, clustered_mean_estimate};
-use super::measured::Measured;
+use super::measured::WindowMeasures;
 
 /// Seed of all resampling and pairing, so that two evaluations of the same motions agree.
 const SEED: u64 = 2026;
@@ -64,14 +64,14 @@ impl Music {
 
 /// A window of motion, and what it was danced to.
 #[derive(Clone, Debug)]
-pub struct Danced<'a> {
+pub struct MotionWindow<'a> {
     /// Number of the song; windows of one song are no independent ones.
     pub song: usize,
     /// Number of the phrase, of which there may be several motions.
     pub phrase: usize,
     /// Where in the phrase the window begins.
     pub first_frame: usize,
-    pub motion: &'a Measured,
+    pub motion: &'a WindowMeasures,
     /// None for music without beats.
     pub music: Option<MusicWindow<'a>>,
 }
@@ -109,8 +109,8 @@ impl Number {
 
 /// Mean over windows that have a value, with songs as clusters, and the mean of each song.
 fn mean_over(
-    danced: &[Danced],
-    value: impl Fn(&Danced) -> Option<f64>,
+    danced: &[MotionWindow],
+    value: impl Fn(&MotionWindow) -> Option<f64>,
 ) -> (Estimate, BTreeMap<usize, f64>) {
     let (values, songs): (Vec<f64>, Vec<usize>) =
         danced.iter().filter_map(|item| Some((value(item)?, item.song))).unzip();

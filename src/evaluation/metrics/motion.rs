@@ -15,11 +15,11 @@ use super::super::interval::{
     Estimate, clustered_mean_estimate, clustered_share_estimate, jackknife_estimate, share_estimate,
 };
 use super::super::kinetic::CHUNK_FRAMES;
-use super::super::measured::Measured;
+use super::super::measured::WindowMeasures;
 use super::super::reference_statistics::{FeatureSet, ReferenceStatistics};
 use super::super::sanity::CheckSet;
 use super::super::window_range::Posture;
-use super::{Danced, Number, SEED, mean_over, staged};
+use super::{MotionWindow, Number, SEED, mean_over, staged};
 use crate::motion::CHANNEL_NAMES;
 
 /// Windows, evenly among all, whose pairs are compared: every one with every other.
@@ -32,7 +32,7 @@ const MAX_COMPARED_PER_SONG: usize = 24;
 /// Songs, evenly among all, that are compared with each other.
 const MAX_COMPARED_SONGS: usize = 48;
 
-/// What windows are held against.
+/// Reference values that windows are compared with.
 #[derive(Clone, Copy, Debug)]
 pub struct MotionContext<'a> {
     pub reference: Option<&'a ReferenceStatistics>,
@@ -41,7 +41,7 @@ pub struct MotionContext<'a> {
 }
 
 /// Measures how windows compare with the training split, and how different they are.
-pub fn motion_numbers(danced: &[Danced], context: &MotionContext) -> Vec<Number> {
+pub fn motion_numbers(danced: &[MotionWindow], context: &MotionContext) -> Vec<Number> {
     let mut numbers = posture_numbers(danced);
     for set in FeatureSet::ALL {
         numbers.push(frechet_number(danced, set, context));
@@ -78,7 +78,7 @@ pub fn whole_numbers(motions: &[(usize, bool, bool)]) -> Vec<Number> {
 /// Measures the share of windows that pass all checks of a set, and means of what the checks look at.
 ///
 /// `stage` is added to the variants, where it is not empty.
-pub fn soundness_numbers(danced: &[Danced], stage: &str) -> Vec<Number> {
+pub fn soundness_numbers(danced: &[MotionWindow], stage: &str) -> Vec<Number> {
     let passed = |set: CheckSet| {
         let (is_true, songs): (Vec<bool>, Vec<usize>) =
             danced.iter().map(|item| (item.motion.passes(set), item.song)).unzip();
@@ -94,8 +94,8 @@ pub fn soundness_numbers(danced: &[Danced], stage: &str) -> Vec<Number> {
         numbers
             .push(Number::new("pass_rate", variant(name), "", share, checks).with_songs(by_song));
     }
-    type Part = fn(&Consistency) -> Option<f64>;
-    let parts: [(&'static str, &'static str, Part); 8] = [
+    type ConsistencyPart = fn(&Consistency) -> Option<f64>;
+    let parts: [(&'static str, &'static str, ConsistencyPart); 8] = [
         ("velocity_error", "m/s", |c| Some(c.velocity_error_m_s)),
         ("acceleration_error", "m/s²", |c| Some(c.acceleration_error_m_s2)),
         ("turn_error", "rad/s", |c| Some(c.turn_error_rad_s)),
@@ -129,9 +129,9 @@ pub fn soundness_numbers(danced: &[Danced], stage: &str) -> Vec<Number> {
 }
 
 /// Speeds and jerk, as positions say them.
-fn posture_numbers(danced: &[Danced]) -> Vec<Number> {
-    type Part = fn(&Posture) -> f64;
-    let parts: [(&'static str, &str, &'static str, Part); 6] = [
+fn posture_numbers(danced: &[MotionWindow]) -> Vec<Number> {
+    type PosturePart = fn(&Posture) -> f64;
+    let parts: [(&'static str, &str, &'static str, PosturePart); 6] = [
         ("axis_speed", "x", "m/s", |p| p.axis_speed_m_s[0]),
         ("axis_speed", "y", "m/s", |p| p.axis_speed_m_s[1]),
         ("axis_speed", "z", "m/s", |p| p.axis_speed_m_s[2]),
@@ -158,8 +158,8 @@ const MAX_GROUPS: usize = 40;
 
 /// Rows of features by group of songs: each song is one, where there are few.
 fn rows_by_song(
-    danced: &[Danced],
-    rows: impl Fn(&Measured) -> Option<Array2<f64>>,
+    danced: &[MotionWindow],
+    rows: impl Fn(&WindowMeasures) -> Option<Array2<f64>>,
 ) -> Vec<Vec<Array2<f64>>> {
     let mut songs: BTreeMap<usize, Vec<Array2<f64>>> = BTreeMap::new();
     for item in danced {
@@ -186,12 +186,12 @@ fn evenly(len: usize, n: usize) -> impl Iterator<Item = usize> {
 }
 
 /// The Fréchet distance from the training split, without the bias of few songs.
-fn frechet_number(danced: &[Danced], set: FeatureSet, context: &MotionContext) -> Number {
+fn frechet_number(danced: &[MotionWindow], set: FeatureSet, context: &MotionContext) -> Number {
     let (metric, variant) = match set {
         FeatureSet::Geometric => ("fid_g", ""),
         kinetic => ("fid_k", kinetic.name()),
     };
-    let chosen: Vec<Danced> =
+    let chosen: Vec<MotionWindow> =
         evenly(danced.len(), context.n_frechet).map(|i| danced[i].clone()).collect();
     let songs = rows_by_song(&chosen, |motion| motion.features(set).map(|rows| rows.to_owned()));
     let n_chunks: usize = songs.iter().flatten().map(Array2::nrows).sum();
@@ -212,7 +212,7 @@ fn frechet_number(danced: &[Danced], set: FeatureSet, context: &MotionContext) -
 }
 
 /// `√⟨μ_j²⟩` over the mean features of windows, in deviations of the training split.
-fn shift_number(danced: &[Danced]) -> Number {
+fn shift_number(danced: &[MotionWindow]) -> Number {
     let songs = rows_by_song(danced, joined);
     let shift = |left_out: Option<usize>| {
         let kept = songs.iter().enumerate().filter(|(song, _)| Some(*song) != left_out);
@@ -227,13 +227,13 @@ fn shift_number(danced: &[Danced]) -> Number {
 }
 
 /// Kinetic features of the axes and geometric ones side by side, `[n, 24]`.
-fn joined(motion: &Measured) -> Option<Array2<f64>> {
+fn joined(motion: &WindowMeasures) -> Option<Array2<f64>> {
     let (a, b) = (motion.features(FeatureSet::Axes)?, motion.features(FeatureSet::Geometric)?);
     concatenate(Axis(1), &[a, b]).ok()
 }
 
 /// How different windows are: all of them, those of different songs, and those of one place of one phrase.
-fn variety_numbers(danced: &[Danced]) -> Vec<Number> {
+fn variety_numbers(danced: &[MotionWindow]) -> Vec<Number> {
     let groups = rows_by_song(danced, joined);
     let n_windows = groups.iter().map(Vec::len).sum();
     let most = MAX_COMPARED.div_ceil(groups.len().max(1));
@@ -273,7 +273,7 @@ fn variety_numbers(danced: &[Danced]) -> Vec<Number> {
 }
 
 /// Distance of windows of different songs, anywhere in them and at the same place.
-fn song_distances(danced: &[Danced]) -> [Number; 2] {
+fn song_distances(danced: &[MotionWindow]) -> [Number; 2] {
     let mut songs: BTreeMap<usize, Vec<(usize, Array2<f64>)>> = BTreeMap::new();
     for item in danced {
         if let Some(rows) = joined(item.motion).filter(|rows| rows.nrows() > 0) {
@@ -320,10 +320,10 @@ fn song_distances(danced: &[Danced]) -> [Number; 2] {
 }
 
 /// How different motions are for one place of one phrase.
-fn multimodality_number(danced: &[Danced]) -> Number {
+fn multimodality_number(danced: &[MotionWindow]) -> Number {
     // By phrase and first frame: the song, and a row for each motion.
-    type Place = (usize, usize);
-    let mut places: BTreeMap<Place, (usize, Vec<Array2<f64>>)> = BTreeMap::new();
+    type WindowPlace = (usize, usize);
+    let mut places: BTreeMap<WindowPlace, (usize, Vec<Array2<f64>>)> = BTreeMap::new();
     for item in danced {
         if let Some(rows) = joined(item.motion).filter(|rows| rows.nrows() > 0) {
             let place = places.entry((item.phrase, item.first_frame)).or_default();
@@ -332,14 +332,15 @@ fn multimodality_number(danced: &[Danced]) -> Number {
         }
     }
     let several = places.values().filter(|(_, rows)| rows.len() > 1);
-    let of_place = |(song, rows): &(usize, Vec<Array2<f64>>)| {
+    let multimodality_of_place = |(song, rows): &(usize, Vec<Array2<f64>>)| {
         let rows = stacked(rows)?;
         let seeds = SEED..SEED + N_MULTIMODALITY;
         let found: Option<Vec<f64>> =
             seeds.map(|seed| multimodality(&[rows.view()], MULTIMODALITY_PAIRS, seed)).collect();
         Some((found?.iter().sum::<f64>() / N_MULTIMODALITY as f64, *song))
     };
-    let (values, songs): (Vec<f64>, Vec<usize>) = several.filter_map(of_place).unzip();
+    let (values, songs): (Vec<f64>, Vec<usize>) =
+        several.filter_map(multimodality_of_place).unzip();
     let protocol = format!(
         "motions at one place of one phrase, {MULTIMODALITY_PAIRS} pairs, {N_MULTIMODALITY} replications"
     );

@@ -12,15 +12,15 @@ use super::super::coupling::{
 };
 use super::super::interval::{Estimate, clustered_mean_estimate, mean_estimate};
 use super::super::locking::{BarLocking, Passage, r2_at, wrong_tempi};
-use super::{Danced, MusicWindow, Number, SEED, mean_over, staged};
+use super::{MotionWindow, MusicWindow, Number, SEED, mean_over, staged};
 
 /// Wrong tempi that locking is held against.
 pub const N_WRONG_TEMPI: usize = 199;
 
-/// What windows are held against.
+/// Reference values that windows are compared with.
 #[derive(Clone, Copy, Debug)]
 pub struct MusicContext<'a> {
-    /// What vertical velocity is known to owe to the bar; none where that is not known.
+    /// The known dependence of vertical velocity on the phase in the bar; none where it is not known.
     pub coupling: Option<&'a Coupling>,
     /// Wrong tempi that are tried; none of them where there is no need.
     pub n_wrong_tempi: usize,
@@ -30,7 +30,7 @@ pub struct MusicContext<'a> {
 /// Measures how far windows follow the bars and beats of their music; those without music do not count.
 ///
 /// The result is the same for any number of threads.
-pub fn music_numbers(danced: &[Danced], context: &MusicContext) -> Vec<Number> {
+pub fn music_numbers(danced: &[MotionWindow], context: &MusicContext) -> Vec<Number> {
     let mut numbers = locking_numbers(danced, context);
     numbers.extend(coupling_numbers(danced, context.coupling));
     numbers.extend(beat_numbers(danced));
@@ -38,7 +38,7 @@ pub fn music_numbers(danced: &[Danced], context: &MusicContext) -> Vec<Number> {
 }
 
 /// Windows with music, by number of the song.
-fn passages<'a>(danced: &'a [Danced]) -> impl Iterator<Item = (usize, CoupledPassage<'a>)> {
+fn passages<'a>(danced: &'a [MotionWindow]) -> impl Iterator<Item = (usize, CoupledPassage<'a>)> {
     danced.iter().filter_map(|item| {
         let music = item.music.as_ref()?;
         let passage = CoupledPassage {
@@ -52,7 +52,7 @@ fn passages<'a>(danced: &'a [Danced]) -> impl Iterator<Item = (usize, CoupledPas
 }
 
 /// Returns the harmonics of the bar of each song's vertical velocity.
-pub fn song_harmonics(danced: &[Danced]) -> BTreeMap<usize, Harmonics> {
+pub fn song_harmonics(danced: &[MotionWindow]) -> BTreeMap<usize, Harmonics> {
     let mut songs: BTreeMap<usize, Harmonics> = BTreeMap::new();
     for (song, passage) in passages(danced) {
         songs.entry(song).or_default().add(&passage);
@@ -60,7 +60,7 @@ pub fn song_harmonics(danced: &[Danced]) -> BTreeMap<usize, Harmonics> {
     songs
 }
 
-fn song_couplings(danced: &[Danced], coupling: &Coupling) -> BTreeMap<usize, CouplingSums> {
+fn song_couplings(danced: &[MotionWindow], coupling: &Coupling) -> BTreeMap<usize, CouplingSums> {
     let mut songs: BTreeMap<usize, CouplingSums> = BTreeMap::new();
     for (song, passage) in passages(danced) {
         songs.entry(song).or_default().add(coupling, &passage);
@@ -69,7 +69,7 @@ fn song_couplings(danced: &[Danced], coupling: &Coupling) -> BTreeMap<usize, Cou
 }
 
 /// The coefficient on the known coupling, and the probability of as high a one by chance.
-fn coupling_numbers(danced: &[Danced], coupling: Option<&Coupling>) -> Vec<Number> {
+fn coupling_numbers(danced: &[MotionWindow], coupling: Option<&Coupling>) -> Vec<Number> {
     let Some(coupling) = coupling else {
         let songs: Vec<Harmonics> = song_harmonics(danced).into_values().collect();
         let protocol = format!(
@@ -101,7 +101,7 @@ fn coupling_numbers(danced: &[Danced], coupling: Option<&Coupling>) -> Vec<Numbe
 }
 
 /// Measures the coefficient on the known coupling with the bar shifted by whole beats: of each song the highest.
-pub fn shifted_numbers(danced: &[Danced], coupling: &Coupling) -> Vec<Number> {
+pub fn shifted_numbers(danced: &[MotionWindow], coupling: &Coupling) -> Vec<Number> {
     let beats: BTreeMap<usize, u32> = danced
         .iter()
         .filter_map(|item| Some((item.song, item.music.as_ref()?.beats_per_bar)))
@@ -124,7 +124,7 @@ pub fn shifted_numbers(danced: &[Danced], coupling: &Coupling) -> Vec<Number> {
 
 /// Bar-phase R² of the vertical velocity with one fit for each song, which asks that all motions for it follow
 /// it alike.
-fn locking_numbers(danced: &[Danced], context: &MusicContext) -> Vec<Number> {
+fn locking_numbers(danced: &[MotionWindow], context: &MusicContext) -> Vec<Number> {
     let mut number_of: BTreeMap<usize, usize> = BTreeMap::new();
     let (mut groups, mut windows) = (Vec::new(), Vec::new());
     for (song, passage) in passages(danced) {
@@ -177,7 +177,7 @@ fn locking_numbers(danced: &[Danced], context: &MusicContext) -> Vec<Number> {
 }
 
 /// Beat scores of both directions and three widths, with what chance reaches.
-fn beat_numbers(danced: &[Danced]) -> Vec<Number> {
+fn beat_numbers(danced: &[MotionWindow]) -> Vec<Number> {
     let scored: Vec<(usize, BeatAlignment)> = danced
         .iter()
         .zip(SEED..)
@@ -193,8 +193,8 @@ fn beat_numbers(danced: &[Danced]) -> Vec<Number> {
             scored.iter().filter_map(|(song, found)| Some((value(found)?, *song))).unzip();
         clustered_mean_estimate(&values, &songs)
     };
-    type Value = fn(&BeatScore) -> Option<f64>;
-    let kinds: [(&'static str, Value); 4] = [
+    type ScoreValue = fn(&BeatScore) -> Option<f64>;
+    let kinds: [(&'static str, ScoreValue); 4] = [
         ("beat_alignment", |score| Some(score.score)),
         ("beat_alignment_chance", |score| Some(score.chance)),
         ("beat_alignment_lift", |score| score.lift),
@@ -232,9 +232,9 @@ pub enum PhaseOrigin {
 ///
 /// Where the phase is not the motion's own, or the music's bars were read from the motion, there is nothing to hold
 /// it against, and its numbers are absent. `stage` is added to the variants, where it is not empty.
-pub fn phase_numbers(danced: &[Danced], origin: PhaseOrigin, stage: &str) -> Vec<Number> {
-    type Value<'a> = &'a dyn Fn(&Danced, &MusicWindow, &[f64]) -> Option<f64>;
-    let mean = |needs_own_phase: bool, value: Value| {
+pub fn phase_numbers(danced: &[MotionWindow], origin: PhaseOrigin, stage: &str) -> Vec<Number> {
+    type WindowValue<'a> = &'a dyn Fn(&MotionWindow, &MusicWindow, &[f64]) -> Option<f64>;
+    let mean = |needs_own_phase: bool, value: WindowValue| {
         mean_over(danced, |item| {
             let music = item.music.as_ref()?;
             if needs_own_phase && (origin != PhaseOrigin::Own || music.is_of_motion) {
@@ -249,11 +249,12 @@ pub fn phase_numbers(danced: &[Danced], origin: PhaseOrigin, stage: &str) -> Vec
         PhaseOrigin::Relocked => "by construction: post-processing sets the phase to the music's",
         PhaseOrigin::Absent => "the motion says no phase",
     };
-    let number = |metric: &'static str, variant: &str, unit, needs_own_phase, value: Value| {
-        let (estimate, by_song) = mean(needs_own_phase, value);
-        Number::new(metric, staged(variant, stage), unit, estimate.non_negative(), protocol)
-            .with_songs(by_song)
-    };
+    let number =
+        |metric: &'static str, variant: &str, unit, needs_own_phase, value: WindowValue| {
+            let (estimate, by_song) = mean(needs_own_phase, value);
+            Number::new(metric, staged(variant, stage), unit, estimate.non_negative(), protocol)
+                .with_songs(by_song)
+        };
     vec![
         number("phase_error", "", "bars", true, &|item, _, phase| {
             phase_error(&item.motion.phase, phase)

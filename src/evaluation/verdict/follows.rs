@@ -79,8 +79,8 @@ fn paired(name: &'static str, what: &str, own: Option<&Number>, control: &[Numbe
     let differences: Vec<f64> = own
         .zip(other)
         .map(|(own, other)| {
-            let of_song = |(song, x): (&usize, &f64)| Some(x - other.by_song.get(song)?);
-            own.by_song.iter().filter_map(of_song).collect()
+            let difference_of_song = |(song, x): (&usize, &f64)| Some(x - other.by_song.get(song)?);
+            own.by_song.iter().filter_map(difference_of_song).collect()
         })
         .unwrap_or_default();
     let found = paired_difference(&differences);

@@ -3,7 +3,7 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::diffusion::{DiffusionConfig, Prediction, Sampler, SamplerConfig, Schedule, Spacing};
-use crate::generation::control::Wanted;
+use crate::generation::control::WantedValue;
 use crate::generation::engine::Inputs;
 use crate::generation::walk::walk;
 use crate::motion::{Channel, ChannelLimits};
@@ -80,7 +80,7 @@ fn sampler() -> SamplerConfig {
 fn run(
     engine: &ByHeart,
     seed: u64,
-    constraints: Option<Constrained>,
+    constraints: Option<WeightedConstraints>,
     overlap: usize,
 ) -> (Array2<f32>, Vec<usize>) {
     run_at(engine, seed, constraints, overlap, None)
@@ -90,7 +90,7 @@ fn run(
 fn run_at(
     engine: &ByHeart,
     seed: u64,
-    constraints: Option<Constrained>,
+    constraints: Option<WeightedConstraints>,
     overlap: usize,
     phase: Option<&[f64]>,
 ) -> (Array2<f32>, Vec<usize>) {
@@ -209,12 +209,12 @@ fn windows_that_disagree_are_joined_smoothly() {
 fn a_track_passes_its_constraints() {
     let engine = by_heart(173, |_| 0.0);
     let wanted = vec![
-        (0, Wanted::Value { channel: 0, value: 1.5 }),
-        (80, Wanted::Value { channel: 1, value: 1.2 }),
-        (150, Wanted::Value { channel: 1, value: 0.5 }),
+        (0, WantedValue::Value { channel: 0, value: 1.5 }),
+        (80, WantedValue::Value { channel: 1, value: 1.2 }),
+        (150, WantedValue::Value { channel: 1, value: 0.5 }),
     ];
     let constraints = Constraints::new(wanted, 173, ChannelLimits::Wide).expect("constraints");
-    let constrained = Constrained { constraints: &constraints, strength: 1.0 };
+    let constrained = WeightedConstraints { constraints: &constraints, strength: 1.0 };
     let (motion, _) = run(&engine, 3, Some(constrained), 10);
     for miss in constraints.errors(motion.view()) {
         // The windows are placed one after another, and neighbours that share a frame are faded.
@@ -280,7 +280,7 @@ fn a_track_begins_from_the_motion_of_its_windows_each_in_its_own_place() {
     let features = numbered(173);
     // How far the motion is from the walk, in units of its spread.
     let off = |n_left: Option<usize>| {
-        let primed = n_left.map(|n_left| Primed { motion: own.view(), n_left });
+        let primed = n_left.map(|n_left| PrimingMotion { motion: own.view(), n_left });
         let track_of = Track {
             condition: features.view(),
             phase: None,
@@ -325,7 +325,7 @@ fn noise_belongs_to_frames_and_seeds() {
     let all = fill(0..windows.len(), 5, 0);
     let shift = windows.shift(1);
     let window = 40 * MOTION_DIM;
-    // What two windows share has one noise, and a window has the same in any run.
+    // Frames that two windows share have one noise, and a window has the same in any run.
     assert_eq!(all[shift * MOTION_DIM..window], all[window..window + (40 - shift) * MOTION_DIM]);
     assert_eq!(fill(1..2, 5, 0), all[window..2 * window]);
     assert!(fill(1..2, 5, 1) != fill(1..2, 5, 0) && fill(1..2, 6, 0) != fill(1..2, 5, 0));

@@ -12,7 +12,7 @@ pub struct Unit {
     pub size_m: f64,
 }
 
-/// What was found out about a take.
+/// The findings on a take.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CaptureAccount {
     /// Name of the joint whose motion the trajectory is.
@@ -23,7 +23,7 @@ pub struct CaptureAccount {
     pub unit_m: f64,
     /// Length of what was cut off at the start, s.
     pub cut_s: f64,
-    /// What a reader should know.
+    /// Notes for a reader.
     pub notes: Vec<CaptureNote>,
 }
 

@@ -2,7 +2,7 @@
 
 use super::super::exchange;
 use super::super::quaternion::from_axis_angle;
-use super::person::{Does, Person};
+use super::person::{Person, PersonAction};
 use super::*;
 use ndarray::Array2;
 use proptest::prelude::*;
@@ -81,7 +81,9 @@ fn a_root_that_never_moves_is_not_the_body() {
 
 #[test]
 fn any_axis_may_be_up_and_any_unit_written() {
-    for does in [Does::Walks, Does::Sits, Does::Crouches, Does::Lies] {
+    for does in
+        [PersonAction::Walks, PersonAction::Sits, PersonAction::Crouches, PersonAction::Lies]
+    {
         let base = Person { does, n_frames: 121, ..Person::default() };
         let want = converted(&base);
         assert_eq!(told(&want), [""; 0], "{does:?}");
@@ -104,7 +106,7 @@ fn any_axis_may_be_up_and_any_unit_written() {
 
 #[test]
 fn no_names_own_axes_and_six_channels_do_not_matter() {
-    for does in [Does::Walks, Does::Sits] {
+    for does in [PersonAction::Walks, PersonAction::Sits] {
         let base = Person { does, ..Person::default() };
         let want = converted(&base);
         for up in [Axis::Y, Axis::Z] {
@@ -135,13 +137,13 @@ fn a_given_axis_wins() {
 fn only_a_pose_that_is_jumped_out_of_is_cut() {
     for rate_hz in [24.0, 30.0, 60.0, 120.0] {
         let n_frames = (3.0 * rate_hz) as usize + 1;
-        for does in [Does::Walks, Does::HitsAndFreezes, Does::StandsStill] {
+        for does in [PersonAction::Walks, PersonAction::HitsAndFreezes, PersonAction::StandsStill] {
             let person = Person { does, rate_hz, n_frames, ..Person::default() };
             let capture = converted(&person);
             assert_eq!(capture.account.cut_s, 0.0, "{does:?} at {rate_hz} Hz");
             assert_eq!(capture.trajectory.n_frames(), 89, "{does:?} at {rate_hz} Hz");
         }
-        let person = Person { does: Does::Pops, rate_hz, n_frames, ..Person::default() };
+        let person = Person { does: PersonAction::Pops, rate_hz, n_frames, ..Person::default() };
         let capture = converted(&person);
         assert!((capture.account.cut_s - 2.0 / rate_hz).abs() < 1e-12, "{rate_hz} Hz");
         assert!(told(&capture)[0].starts_with("the first 2 frames ("), "{:?}", told(&capture));
@@ -150,7 +152,7 @@ fn only_a_pose_that_is_jumped_out_of_is_cut() {
 
 #[test]
 fn what_stands_still_is_told() {
-    let capture = converted(&Person { does: Does::StandsStill, ..Person::default() });
+    let capture = converted(&Person { does: PersonAction::StandsStill, ..Person::default() });
     assert_eq!(told(&capture), ["root Hips stands still, it moves within 0.0 mm"]);
     // A body in no unit.
     let capture = converted(&Person { units_per_m: 8.0, ..Person::default() });

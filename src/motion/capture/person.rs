@@ -41,9 +41,9 @@ const ENDS: [(usize, Vector); 5] = [
     (15, [-0.15, 0.0, 0.0]),
 ];
 
-/// What the person does.
+/// The action of the person.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Does {
+pub enum PersonAction {
     Walks,
     /// Sits with the legs stretched out.
     Sits,
@@ -61,7 +61,7 @@ pub enum Does {
 /// A file of the person.
 #[derive(Clone, Debug)]
 pub struct Person {
-    pub does: Does,
+    pub does: PersonAction,
     pub n_frames: usize,
     pub rate_hz: f64,
     pub units_per_m: f64,
@@ -73,7 +73,7 @@ pub struct Person {
     pub own_axes: bool,
     /// Whether every joint has position channels, and offsets are zero.
     pub six_channels: bool,
-    /// What stands above the hips: place, m, and constant turn.
+    /// The nodes above the hips: place, m, and constant turn.
     pub above: Vec<(Vector, Quaternion)>,
     /// Whether the topmost joint also holds a thing that stays where it is.
     pub prop: bool,
@@ -82,7 +82,7 @@ pub struct Person {
 impl Default for Person {
     fn default() -> Self {
         Self {
-            does: Does::Walks,
+            does: PersonAction::Walks,
             n_frames: 121,
             rate_hz: 60.0,
             units_per_m: 100.0,
@@ -112,36 +112,36 @@ impl Person {
         q[10] = mul(turn(Z, -70.0), turn(y, 30.0 * wave(1.0, 1.0)));
         q[13] = mul(turn(Z, 70.0), turn(y, 30.0 * wave(1.0, 2.0)));
         match self.does {
-            Does::Walks => {}
-            Does::Sits => {
+            PersonAction::Walks => {}
+            PersonAction::Sits => {
                 p[1] = 0.18 + 0.01 * wave(0.9, 0.0);
                 q[1] = turn(X, -85.0 + 4.0 * wave(0.6, 0.0));
                 q[4] = turn(X, -85.0 - 4.0 * wave(0.6, 0.0));
             }
-            Does::Lies => {
+            PersonAction::Lies => {
                 p[1] = 0.14 + 0.005 * wave(0.9, 0.0);
                 // On the back, the head towards -Z.
                 q[0] = mul(turn(X, -90.0), turn(y, 8.0 * wave(0.4, 0.0)));
                 q[1] = turn(X, 5.0 * wave(0.5, 0.0));
                 q[4] = turn(X, 5.0 * wave(0.5, 1.0));
             }
-            Does::Crouches => {
+            PersonAction::Crouches => {
                 p[1] = 0.45;
                 q[1] = turn(X, -100.0);
                 q[2] = turn(X, 130.0);
                 q[4] = turn(X, -100.0);
                 q[5] = turn(X, 130.0);
             }
-            Does::StandsStill => {
+            PersonAction::StandsStill => {
                 p = [0.4, 0.94, -0.2];
                 q[0] = IDENTITY;
             }
-            Does::Pops if t < 2 => {
+            PersonAction::Pops if t < 2 => {
                 p = [-2.0, 0.94, 1.0];
                 q = vec![IDENTITY; BONES.len()];
             }
-            Does::Pops => {}
-            Does::HitsAndFreezes => {
+            PersonAction::Pops => {}
+            PersonAction::HitsAndFreezes => {
                 // Smoothly in 0.1 s, up to 10 m/s at the hand.
                 let u = ((s - 0.05) / 0.1).clamp(0.0, 1.0);
                 let smooth = u * u * (3.0 - 2.0 * u);

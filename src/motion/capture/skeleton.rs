@@ -43,7 +43,7 @@ pub struct Body {
     pub landmarks: Option<Landmarks>,
 }
 
-/// What tells head from foot, by places among the nodes of a body.
+/// Landmarks that tell head from foot, by places among the nodes of a body.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Landmarks {
     pub head: usize,

@@ -11,7 +11,7 @@ use super::own::{OWN_UNIT_M, is_own};
 use super::own_axes::OwnAxes;
 use super::skeleton::{Body, Positions};
 use super::unit::{DEFAULT_HEIGHT_M, is_usual, unit_of};
-use super::upright::{Axis, Up, UpBy, find_up, tilt};
+use super::upright::{Axis, UpAxis, UpEvidence, find_up, tilt};
 use super::{
     CaptureError, DIFFERENCED_FRAMES, MAX_NODE_POSITIONS, MAX_RESAMPLED_FRAMES,
     MIN_RESAMPLED_FRAMES, check_size,
@@ -85,15 +85,15 @@ impl Take {
             return Err(CaptureError::NoHeight { height });
         }
         let found = match up {
-            Some(axis) => Up { axis, rest: None, by: UpBy::Found },
-            None if is_own => Up { axis: Axis::Y, rest: None, by: UpBy::Found },
+            Some(axis) => UpAxis { axis, rest: None, by: UpEvidence::Found },
+            None if is_own => UpAxis { axis: Axis::Y, rest: None, by: UpEvidence::Found },
             None => find_up(&body, &world, &world_root)?,
         };
         account.up = found.axis;
         account.notes.extend(match found.by {
-            UpBy::Floor(other) => Some(CaptureNote::UpByFloor { up: found.axis, other }),
-            UpBy::Assumed => Some(CaptureNote::UpAssumed),
-            UpBy::Found => {
+            UpEvidence::Floor(other) => Some(CaptureNote::UpByFloor { up: found.axis, other }),
+            UpEvidence::Assumed => Some(CaptureNote::UpAssumed),
+            UpEvidence::Found => {
                 (found.axis != Axis::Y).then_some(CaptureNote::Turned { up: found.axis })
             }
         });
@@ -133,13 +133,13 @@ impl Take {
         let at_rest = match (found.rest, &body.landmarks) {
             (Some(rest), Some(_)) => rest.to_y(),
             _ => {
-                let of_file = tilt(mul(to_y, above));
-                match OwnAxes::find(bvh, &body, &world, &world_root, of_file) {
+                let file_tilt = tilt(mul(to_y, above));
+                match OwnAxes::find(bvh, &body, &world, &world_root, file_tilt) {
                     Some(OwnAxes { up, to_body }) => {
                         account.notes.push(CaptureNote::OwnAxes { root: account.root.clone(), up });
                         to_body
                     }
-                    None => of_file,
+                    None => file_tilt,
                 }
             }
         };

@@ -21,7 +21,7 @@ pub const RATE_RANGE_HZ: (f64, f64) = (1.0, 10_000.0);
 pub struct RigidTrack {
     /// Where it comes from, as the column `motion_format` spells it.
     pub format: &'static str,
-    /// What moves, as the file calls it.
+    /// The name of the moving object in the file.
     pub root: String,
     pub rate_hz: f64,
     /// The axis that is up by the format's definition; none where the body tells it.

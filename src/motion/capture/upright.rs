@@ -102,17 +102,17 @@ impl fmt::Display for Axis {
 
 /// The axis that is up, and how it is known.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Up {
+pub struct UpAxis {
     /// In the world of the take.
     pub axis: Axis,
     /// In the rest pose, that is in the frame of the body's root; none where it cannot be told.
     pub rest: Option<Axis>,
-    pub by: UpBy,
+    pub by: UpEvidence,
 }
 
 /// How the axis is known.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum UpBy {
+pub enum UpEvidence {
     Found,
     /// Skeleton and poses differ, and the floor decided against this axis.
     Floor(Axis),
@@ -132,7 +132,7 @@ pub fn find_up(
     body: &Body,
     world: &Positions,
     orientation: &[Quaternion],
-) -> Result<Up, CaptureError> {
+) -> Result<UpAxis, CaptureError> {
     let rest = rest_up(body);
     let (trunk, legs) = match &body.landmarks {
         Some(landmarks) => posed(body, landmarks, world),
@@ -144,28 +144,28 @@ pub fn find_up(
             (turned.flatten(), None)
         }
     };
-    let found = |axis, by| Ok(Up { axis, rest, by });
+    let found = |axis, by| Ok(UpAxis { axis, rest, by });
     let Some(posed) = trunk.or(legs) else {
         return match rest {
-            Some(axis) => found(axis, UpBy::Found),
-            None => found(Axis::Y, UpBy::Assumed),
+            Some(axis) => found(axis, UpEvidence::Found),
+            None => found(Axis::Y, UpEvidence::Assumed),
         };
     };
     let other = match rest {
-        Some(rest) if rest == posed => return found(posed, UpBy::Found),
+        Some(rest) if rest == posed => return found(posed, UpEvidence::Found),
         Some(rest) => rest,
-        None if posed == Axis::Y => return found(posed, UpBy::Found),
+        None if posed == Axis::Y => return found(posed, UpEvidence::Found),
         None => Axis::Y,
     };
     let height = body.height(world);
     let unsteady = |axis: Axis| floor_motion(body, world, axis).max(STEADY_PER_HEIGHT * height);
     let (of_posed, of_other) = (unsteady(posed), unsteady(other));
     if of_posed * STEADIER <= of_other {
-        found(posed, if posed == Axis::Y { UpBy::Found } else { UpBy::Floor(other) })
+        found(posed, if posed == Axis::Y { UpEvidence::Found } else { UpEvidence::Floor(other) })
     } else if of_other * STEADIER <= of_posed {
-        found(other, if other == Axis::Y { UpBy::Found } else { UpBy::Floor(posed) })
+        found(other, if other == Axis::Y { UpEvidence::Found } else { UpEvidence::Floor(posed) })
     } else if posed == Axis::Y || rest == Some(Axis::Y) {
-        found(Axis::Y, UpBy::Found)
+        found(Axis::Y, UpEvidence::Found)
     } else {
         Err(CaptureError::UpUnknown { one: posed, other })
     }

@@ -6,7 +6,7 @@ use std::f64::consts::{FRAC_PI_2, PI, TAU};
 use super::super::kinematics::Poses;
 use super::super::quaternion::{from_axis_angle, make_sign_continuous, mul, rotate};
 use super::primitive::UP;
-use super::selection::Phrase;
+use super::selection::DancePhrase;
 use crate::chance::Chance;
 use crate::units::frames_to_s;
 
@@ -41,7 +41,7 @@ const MAX_RISE_HZ: f64 = 6.0;
 /// Where each phrase turns and how far.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Turn {
-    pub phrase: Phrase,
+    pub phrase: DancePhrase,
     pub angle_rad: f64,
 }
 
@@ -52,7 +52,7 @@ pub struct Turn {
 /// `10u³ - 15u⁴ + 6u⁵`. Which, is chance among those that stay within 2.4 m of the middle; where none
 /// does, whichever strays least. Beyond 2.4 m what still moves outwards is slowed smoothly, to nothing
 /// at 3.4 m.
-pub fn wander(path: &mut Poses, phrases: &[Phrase], chance: &mut Chance) -> Vec<Turn> {
+pub fn wander(path: &mut Poses, phrases: &[DancePhrase], chance: &mut Chance) -> Vec<Turn> {
     let n_frames = path.len();
     let Some(&first) = path.position_m.first() else { return Vec::new() };
     let steps: Vec<[f64; 3]> = path
@@ -92,19 +92,19 @@ struct Stretch {
     n: usize,
     position: [f64; 3],
     heading_rad: f64,
-    phrase: Phrase,
+    phrase: DancePhrase,
 }
 
 impl Stretch {
     fn heading(&self, i: usize, angle_rad: f64) -> f64 {
-        let Phrase { start_s, end_s } = self.phrase;
+        let DancePhrase { start_s, end_s } = self.phrase;
         let u = ((frames_to_s(self.frame + i) - start_s) / (end_s - start_s)).clamp(0.0, 1.0);
         self.heading_rad + angle_rad * u * u * u * (10.0 + u * (6.0 * u - 15.0))
     }
 }
 
 /// A phrase danced with one turn.
-struct Danced {
+struct TurnedPhrase {
     angle_rad: f64,
     positions: Vec<[f64; 3]>,
     /// Where the next phrase begins.
@@ -113,7 +113,7 @@ struct Danced {
     strays_m: f64,
 }
 
-fn choose_turn(from: &Stretch, steps: &[[f64; 3]], chance: &mut Chance) -> Danced {
+fn choose_turn(from: &Stretch, steps: &[[f64; 3]], chance: &mut Chance) -> TurnedPhrase {
     let duration_s = from.phrase.end_s - from.phrase.start_s;
     let mut wanted =
         if duration_s >= LONG_PHRASE_S { LONG_TURNS.to_vec() } else { SHORT_TURNS.to_vec() };
@@ -121,7 +121,7 @@ fn choose_turn(from: &Stretch, steps: &[[f64; 3]], chance: &mut Chance) -> Dance
     chance.shuffle(&mut wanted);
     chance.shuffle(&mut others);
     let in_time = |angle_rad: &f64| angle_rad.abs() * MIN_TURN_S_PER_RAD <= duration_s;
-    let mut best: Option<Danced> = None;
+    let mut best: Option<TurnedPhrase> = None;
     for angle_rad in wanted.into_iter().chain(others).filter(in_time) {
         let danced = dance(from, steps, angle_rad);
         if danced.strays_m <= SLOWED_FROM_M {
@@ -134,7 +134,7 @@ fn choose_turn(from: &Stretch, steps: &[[f64; 3]], chance: &mut Chance) -> Dance
     best.unwrap_or_else(|| dance(from, steps, 0.0))
 }
 
-fn dance(from: &Stretch, steps: &[[f64; 3]], angle_rad: f64) -> Danced {
+fn dance(from: &Stretch, steps: &[[f64; 3]], angle_rad: f64) -> TurnedPhrase {
     let mut position = from.position;
     let mut positions = Vec::with_capacity(from.n);
     let mut strays_m = 0.0_f64;
@@ -147,7 +147,7 @@ fn dance(from: &Stretch, steps: &[[f64; 3]], angle_rad: f64) -> Danced {
             position[axis] += step[axis] * freedom(position[axis], step[axis]);
         }
     }
-    Danced { angle_rad, positions, next: position, strays_m }
+    TurnedPhrase { angle_rad, positions, next: position, strays_m }
 }
 
 /// Returns the share of a step that is made: 1 inwards and near the middle, 0 outwards at the edge.
@@ -196,10 +196,10 @@ mod tests {
         Poses { position_m, orientation: vec![IDENTITY; n] }
     }
 
-    fn phrases(n: usize, length_s: f64) -> Vec<Phrase> {
+    fn phrases(n: usize, length_s: f64) -> Vec<DancePhrase> {
         let phrase = |k: usize| {
             let start_s = k as f64 * length_s;
-            Phrase { start_s, end_s: start_s + length_s }
+            DancePhrase { start_s, end_s: start_s + length_s }
         };
         (0..n).map(phrase).collect()
     }

@@ -6,7 +6,7 @@ use super::super::quaternion::{
     Quaternion, from_axis_angle, make_sign_continuous, mul, rotate, slerp,
 };
 use super::primitive::{Repertoire, UP, lowpass_orientation};
-use super::selection::Step;
+use super::selection::DanceStep;
 use crate::units::{FPS, frames_to_s};
 
 /// A join bends at most this much time on either side of its beat, s.
@@ -19,15 +19,15 @@ const VELOCITY_STEP_S: f64 = 1.0 / 120.0;
 const JOINED_LOWPASS_HZ: f64 = 6.0;
 
 /// A step with its place in the dance.
-struct Placed<'a> {
-    step: &'a Step,
+struct PlacedStep<'a> {
+    step: &'a DanceStep,
     repertoire: &'a Repertoire,
     /// Where it begins on the floor, m.
     origin: [f64; 2],
     heading_rad: f64,
 }
 
-impl Placed<'_> {
+impl PlacedStep<'_> {
     /// Returns the poses at times of the song, also a little before and after the step itself.
     fn poses(&self, times_s: &[f64]) -> Poses {
         let [x, z] = self.origin;
@@ -65,12 +65,12 @@ impl Placed<'_> {
 /// Hermite curve between the positions and velocities of both sides, and the orientation the slerp
 /// `q_a (q_a* q_b)^s`, `s = 3u² - 2u³`, from the step that ends to the one that begins. The whole is
 /// low-passed at 6 Hz. Heights are above the captures' medians.
-pub fn path(steps: &[Step], repertoire: &Repertoire, n_frames: usize) -> Poses {
+pub fn path(steps: &[DanceStep], repertoire: &Repertoire, n_frames: usize) -> Poses {
     let mut poses = Poses::default();
-    let mut placed: Vec<Placed> = Vec::with_capacity(steps.len());
+    let mut placed: Vec<PlacedStep> = Vec::with_capacity(steps.len());
     let (mut origin, mut heading_rad) = ([0.0; 2], 0.0);
     for step in steps {
-        let next = Placed { step, repertoire, origin, heading_rad };
+        let next = PlacedStep { step, repertoire, origin, heading_rad };
         let ([x, _, z], _) = next.pose(step.end_s);
         origin = [x, z];
         let turn_rad = step.primitive.map_or(0.0, |i| repertoire.primitives()[i].turn_rad);
@@ -108,8 +108,8 @@ pub fn path(steps: &[Step], repertoire: &Repertoire, n_frames: usize) -> Poses {
 
 /// The bend from one step into the next.
 struct Join<'a> {
-    before: &'a Placed<'a>,
-    after: &'a Placed<'a>,
+    before: &'a PlacedStep<'a>,
+    after: &'a PlacedStep<'a>,
     beat_s: f64,
     half_s: f64,
     /// Position and velocity at its two ends.
@@ -118,11 +118,11 @@ struct Join<'a> {
 }
 
 impl<'a> Join<'a> {
-    fn new(before: &'a Placed<'a>, after: &'a Placed<'a>) -> Self {
+    fn new(before: &'a PlacedStep<'a>, after: &'a PlacedStep<'a>) -> Self {
         let beat_s = after.step.start_s;
         let shorter_s = before.step.duration_s().min(after.step.duration_s());
         let half_s = MAX_JOIN_S.min(MAX_JOIN_PER_STEP * shorter_s);
-        let end = |placed: &Placed<'_>, t: f64| (placed.pose(t).0, placed.velocity_m_s(t));
+        let end = |placed: &PlacedStep<'_>, t: f64| (placed.pose(t).0, placed.velocity_m_s(t));
         let (from, to) = (end(before, beat_s - half_s), end(after, beat_s + half_s));
         Self { before, after, beat_s, half_s, from, to }
     }

@@ -33,7 +33,7 @@ pub use activity::activity;
 pub use beat_grid::{Beat, BeatGrid};
 pub use floor::Turn;
 pub use primitive::{Primitive, PrimitiveError, Repertoire};
-pub use selection::Step;
+pub use selection::DanceStep;
 
 /// Tempi that are danced to, beats per minute; the upper end is the beat tracker's own.
 pub const TEMPI_BPM: std::ops::RangeInclusive<f64> = 20.0..=320.0;
@@ -55,7 +55,7 @@ pub enum SongError {
          its beats, one time in seconds per line, into a .beats.txt file beside it"
     )]
     NoBeats { n_beats: usize, duration_s: f64 },
-    /// A tempo that nobody dances to.
+    /// A tempo outside of those that are danced to.
     #[error(
         "song has {tempo_bpm:.1} beats/min, and {} to {} are danced to; correct its .beats.txt file",
         TEMPI_BPM.start(),
@@ -64,7 +64,7 @@ pub enum SongError {
     Tempo { tempo_bpm: f64 },
 }
 
-/// What a dance hears of a song; T frames at 30 fps.
+/// The music that a dance is constructed to; T frames at 30 fps.
 #[derive(Clone, Debug)]
 pub struct Song<'a> {
     beats: &'a Beats,
@@ -112,9 +112,9 @@ impl<'a> Song<'a> {
 pub struct Dance {
     /// The 25 channels of every frame, shape `[T, 25]`.
     pub frames: Array2<f32>,
-    /// What is danced when.
-    pub steps: Vec<Step>,
-    /// What turns when.
+    /// The steps in order of time.
+    pub steps: Vec<DanceStep>,
+    /// The turns in order of time.
     pub turns: Vec<Turn>,
 }
 

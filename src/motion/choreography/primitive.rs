@@ -54,7 +54,7 @@ pub enum PrimitiveError {
 
 /// One capture as curves in time.
 #[derive(Clone, Debug)]
-struct Capture {
+struct CaptureCurves {
     /// x, height above the capture's median, z; m.
     position: [CubicSpline; 3],
     orientation: [CubicSpline; 4],
@@ -83,7 +83,7 @@ pub struct Primitive {
 /// The primitives of some captures.
 #[derive(Clone, Debug, Default)]
 pub struct Repertoire {
-    captures: Vec<Capture>,
+    captures: Vec<CaptureCurves>,
     primitives: Vec<Primitive>,
     /// Energies of all primitives, ascending.
     energies: Vec<f64>,
@@ -114,7 +114,7 @@ impl Repertoire {
             let upright = poses.orientation.iter().map(|&q| rotate(q, UP)[1]).sum::<f64>();
             return Err(PrimitiveError::NeverUpright { upright: upright / n_frames as f64 });
         }
-        self.captures.push(Capture::fit(&poses)?);
+        self.captures.push(CaptureCurves::fit(&poses)?);
         let n_found = found.len();
         // Two runs, of which the first is sorted: the sort merges them.
         self.energies.extend(found.iter().map(|p| p.energy));
@@ -157,7 +157,7 @@ impl Repertoire {
     }
 }
 
-impl Capture {
+impl CaptureCurves {
     fn fit(poses: &Poses) -> Result<Self, SplineError> {
         let n_frames = poses.len();
         let times_s: Vec<f64> = (0..n_frames).map(frames_to_s).collect();

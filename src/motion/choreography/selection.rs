@@ -22,7 +22,7 @@ const N_LOOKED_AT: usize = 256;
 
 /// One step of a dance: a primitive between two beats, or a rest.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Step {
+pub struct DanceStep {
     /// The beat on which it begins, an index into the grid.
     pub beat: usize,
     pub n_beats: usize,
@@ -34,7 +34,7 @@ pub struct Step {
     pub rate: f64,
 }
 
-impl Step {
+impl DanceStep {
     /// Returns the length, s.
     pub fn duration_s(&self) -> f64 {
         self.end_s - self.start_s
@@ -43,7 +43,7 @@ impl Step {
 
 /// A choreographic phrase: the unit of turns.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Phrase {
+pub struct DancePhrase {
     pub start_s: f64,
     pub end_s: f64,
 }
@@ -60,11 +60,11 @@ pub fn steps(
     activity: &[f64],
     repertoire: &Repertoire,
     chance: &mut Chance,
-) -> (Vec<Step>, Vec<Phrase>) {
+) -> (Vec<DanceStep>, Vec<DancePhrase>) {
     let beats = grid.beats();
     let short = grid.short_phrase_beats();
     let chooser = Chooser { grid, activity, repertoire, fills: fills(grid, repertoire, 2 * short) };
-    let (mut steps, mut phrases): (Vec<Step>, Vec<Phrase>) = (Vec::new(), Vec::new());
+    let (mut steps, mut phrases): (Vec<DanceStep>, Vec<DancePhrase>) = (Vec::new(), Vec::new());
     let mut start = 0;
     while start + 1 < beats.len() {
         let n_beats = if chance.below(2) == 0 { short } else { 2 * short };
@@ -76,7 +76,7 @@ pub fn steps(
             beat += step.n_beats;
             steps.push(step);
         }
-        phrases.push(Phrase { start_s: beats[start].time_s, end_s: beats[end].time_s });
+        phrases.push(DancePhrase { start_s: beats[start].time_s, end_s: beats[end].time_s });
         start = end;
     }
     (steps, phrases)
@@ -110,12 +110,18 @@ struct Chooser<'a> {
     grid: &'a BeatGrid,
     activity: &'a [f64],
     repertoire: &'a Repertoire,
-    /// Whether so many beats can be filled.
+    /// Whether a number of beats can be filled with primitives, by that number.
     fills: Vec<bool>,
 }
 
 impl Chooser<'_> {
-    fn step(&self, beat: usize, end: usize, before: Option<usize>, chance: &mut Chance) -> Step {
+    fn step(
+        &self,
+        beat: usize,
+        end: usize,
+        before: Option<usize>,
+        chance: &mut Chance,
+    ) -> DanceStep {
         let n_primitives = self.repertoire.primitives().len();
         let some: Vec<usize> = if n_primitives <= N_LOOKED_AT {
             (0..n_primitives).collect()
@@ -138,7 +144,7 @@ impl Chooser<'_> {
         }
         found.sort_by(|a, b| a.0.total_cmp(&b.0).then(key(&a.1).cmp(&key(&b.1))));
         found.truncate(N_NEAREST);
-        let rest = Step { primitive: None, rate: 1.0, ..self.span(beat, 1) };
+        let rest = DanceStep { primitive: None, rate: 1.0, ..self.span(beat, 1) };
         if found.is_empty() { rest } else { found[chance.below(found.len())].1 }
     }
 
@@ -150,7 +156,7 @@ impl Chooser<'_> {
         primitives: &[usize],
         before: Option<usize>,
         rest_must_fill: bool,
-    ) -> Vec<(f64, Step)> {
+    ) -> Vec<(f64, DanceStep)> {
         let mut found = Vec::new();
         for n_beats in 1..=MAX_STEP_BEATS.min(end - beat) {
             if rest_must_fill && !self.fills[end - beat - n_beats] {
@@ -162,7 +168,7 @@ impl Chooser<'_> {
                 let primitive = &self.repertoire.primitives()[i];
                 if let Some(rate) = fits(primitive, span.duration_s()) {
                     let quantile = self.repertoire.energy_quantile(primitive.energy * rate * rate);
-                    let step = Step { primitive: Some(i), rate, ..span };
+                    let step = DanceStep { primitive: Some(i), rate, ..span };
                     found.push(((quantile - activity).abs(), step));
                 }
             }
@@ -170,14 +176,14 @@ impl Chooser<'_> {
         found
     }
 
-    fn span(&self, beat: usize, n_beats: usize) -> Step {
+    fn span(&self, beat: usize, n_beats: usize) -> DanceStep {
         let beats = self.grid.beats();
         let (start_s, end_s) = (beats[beat].time_s, beats[beat + n_beats].time_s);
-        Step { beat, n_beats, start_s, end_s, primitive: None, rate: 1.0 }
+        DanceStep { beat, n_beats, start_s, end_s, primitive: None, rate: 1.0 }
     }
 
     /// Mean activity from begin to end of a step; beyond the song, that of its nearest frame.
-    fn mean_activity(&self, step: &Step) -> f64 {
+    fn mean_activity(&self, step: &DanceStep) -> f64 {
         let Some(last) = self.activity.len().checked_sub(1) else { return 0.5 };
         let frame = |s: f64| (s_to_frames(s).round().max(0.0) as usize).min(last);
         let (first, end) = (frame(step.start_s), frame(step.end_s));
@@ -186,7 +192,7 @@ impl Chooser<'_> {
     }
 }
 
-/// What orders candidates that are equally near.
-fn key(step: &Step) -> (usize, Option<usize>) {
+/// Returns the sort key of candidates that are equally near.
+fn key(step: &DanceStep) -> (usize, Option<usize>) {
     (step.n_beats, step.primitive)
 }

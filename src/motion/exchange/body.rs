@@ -82,10 +82,10 @@ mod tests {
         let corners = body();
         // Twelve triangles for each of three boxes, four for the nose.
         assert_eq!(corners.len(), 3 * (3 * 12 + 4));
-        let of = |axis: usize| corners.iter().map(move |corner| corner.position_m[axis]);
-        assert_eq!(of(2).reduce(f32::max), Some(0.2));
-        assert_eq!(of(1).reduce(f32::max), Some(0.72));
-        assert_eq!(of(0).reduce(f32::max), of(0).map(|x| -x).reduce(f32::max));
+        let coordinates = |axis: usize| corners.iter().map(move |corner| corner.position_m[axis]);
+        assert_eq!(coordinates(2).reduce(f32::max), Some(0.2));
+        assert_eq!(coordinates(1).reduce(f32::max), Some(0.72));
+        assert_eq!(coordinates(0).reduce(f32::max), coordinates(0).map(|x| -x).reduce(f32::max));
     }
 
     #[test]
@@ -110,8 +110,8 @@ mod tests {
             let edges: Vec<(usize, usize)> =
                 part.triangles.iter().flat_map(|&[a, b, c]| [(a, b), (b, c), (c, a)]).collect();
             for &(a, b) in &edges {
-                let of = |edge| edges.iter().filter(|&&other| other == edge).count();
-                assert_eq!((of((a, b)), of((b, a))), (1, 1), "edge {a} to {b}");
+                let count_of = |edge| edges.iter().filter(|&&other| other == edge).count();
+                assert_eq!((count_of((a, b)), count_of((b, a))), (1, 1), "edge {a} to {b}");
             }
         }
     }

@@ -27,7 +27,7 @@ const GIMBAL_COSINE: f64 = 1e-8;
 /// places. A frame lasts `1 / FPS` s to all digits: at 0.0333333 s an hour would be 3.6 ms short.
 ///
 /// # Errors
-/// What `out` says, and [`super::PoseError`] for what BVH cannot hold.
+/// The error of `out`, and [`super::PoseError`] for what BVH cannot hold.
 ///
 /// # Panics
 /// When there are other than 25 channels.

@@ -69,7 +69,7 @@ pub fn csv_header() -> String {
 /// Writes motion, `[T, 25]`, with its header.
 ///
 /// # Errors
-/// What `out` says.
+/// The error of `out`.
 pub fn write_csv(frames: ArrayView2<'_, f32>, out: &mut dyn Write) -> io::Result<()> {
     out.write_all(csv_header().as_bytes())?;
     write_csv_rows(frames, 0, out)
@@ -79,7 +79,7 @@ pub fn write_csv(frames: ArrayView2<'_, f32>, out: &mut dyn Write) -> io::Result
 /// may come in pieces.
 ///
 /// # Errors
-/// What `out` says.
+/// The error of `out`.
 pub fn write_csv_rows(
     frames: ArrayView2<'_, f32>,
     first_frame: usize,

@@ -34,7 +34,7 @@ const TRIANGLES: u32 = 4;
 /// Frame t is at `t / FPS` s; players interpolate linearly, and spherically between orientations.
 ///
 /// # Errors
-/// What `out` says, [`super::PoseError`] for what glTF cannot hold, and more than 4 GiB.
+/// The error of `out`, [`super::PoseError`] for what glTF cannot hold, and more than 4 GiB.
 ///
 /// # Panics
 /// When there are other than 25 channels.
@@ -171,7 +171,7 @@ impl Buffer {
             view["target"] = target.into();
         }
         let bound = |pick: fn(f32, f32) -> f32| -> Vec<f64> {
-            // As f64 the digits name the very number, whoever reads them in which precision.
+            // As f64 the digits name the exact number in whichever precision they are read.
             (0..N)
                 .filter_map(|i| items.iter().map(|item| item[i]).reduce(pick).map(f64::from))
                 .collect()

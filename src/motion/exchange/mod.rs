@@ -51,7 +51,7 @@ pub enum PoseError {
 /// Writes motion, `[T, 25]`, as a NumPy array of `<f4`, equal byte for byte to `numpy.save`'s.
 ///
 /// # Errors
-/// What `out` says.
+/// The error of `out`.
 pub fn write_npy(frames: ArrayView2<'_, f32>, out: &mut dyn Write) -> io::Result<()> {
     out.write_all(&npy::header::<f32>(frames.shape()))?;
     let mut bytes = Vec::with_capacity(frames.ncols() * size_of::<f32>());

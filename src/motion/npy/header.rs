@@ -13,7 +13,7 @@ const MAX_DEPTH: usize = 16;
 
 /// The family of a plain numeric data type.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Kind {
+pub(super) enum DtypeKind {
     Bool,
     Int,
     Uint,
@@ -23,7 +23,7 @@ pub(super) enum Kind {
 /// A plain numeric data type as stored.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Dtype {
-    pub kind: Kind,
+    pub kind: DtypeKind,
     pub size_bytes: usize,
     pub big_endian: bool,
     /// As written in the header, for messages.
@@ -120,10 +120,10 @@ fn plain_dtype(descr: &str) -> Result<Dtype, NpyError> {
     let mut chars = body.chars();
     let code = chars.next();
     let kind = match (code, chars.as_str()) {
-        (Some('b'), "1") => Kind::Bool,
-        (Some('i'), "1" | "2" | "4" | "8") => Kind::Int,
-        (Some('u'), "1" | "2" | "4" | "8") => Kind::Uint,
-        (Some('f'), "2" | "4" | "8") => Kind::Float,
+        (Some('b'), "1") => DtypeKind::Bool,
+        (Some('i'), "1" | "2" | "4" | "8") => DtypeKind::Int,
+        (Some('u'), "1" | "2" | "4" | "8") => DtypeKind::Uint,
+        (Some('f'), "2" | "4" | "8") => DtypeKind::Float,
         (Some('O'), _) => return Err(NpyError::Pickle),
         (Some('f'), "10" | "12" | "16") => {
             return refused(

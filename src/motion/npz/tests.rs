@@ -204,9 +204,9 @@ fn what_is_written_is_read() {
     let mut npz = Npz::open(&bytes).unwrap();
     assert_eq!(npz.keys(), ["large", "scalar", "counts", "none"]);
     assert_eq!(npz.read_f32("large").unwrap(), NpyArray { shape: vec![30_011], values: large });
-    let of =
+    let array =
         |shape: &[usize], values: &[f64]| NpyArray { shape: shape.into(), values: values.into() };
-    assert_eq!(npz.read_f64("scalar").unwrap(), of(&[], &[-2.5]));
-    assert_eq!(npz.read_f64("counts").unwrap(), of(&[1, 3], &[7.0, -1.0, (1u64 << 40) as f64]));
-    assert_eq!(npz.read_f64("none").unwrap(), of(&[0], &[]));
+    assert_eq!(npz.read_f64("scalar").unwrap(), array(&[], &[-2.5]));
+    assert_eq!(npz.read_f64("counts").unwrap(), array(&[1, 3], &[7.0, -1.0, (1u64 << 40) as f64]));
+    assert_eq!(npz.read_f64("none").unwrap(), array(&[0], &[]));
 }

@@ -25,13 +25,13 @@ impl Equation {
 
 /// The lower half of a symmetric matrix A, `[n, n]`, with `A[i, j] = 0` where `i - j > bandwidth`.
 #[derive(Clone, Debug)]
-struct Banded {
+struct BandedMatrix {
     bandwidth: usize,
     /// `A[i, i - k]` at `i (bandwidth + 1) + k`.
     entries: Vec<f64>,
 }
 
-impl Banded {
+impl BandedMatrix {
     fn zeros(n: usize, bandwidth: usize) -> Self {
         Self { bandwidth, entries: vec![0.0; n * (bandwidth + 1)] }
     }
@@ -69,7 +69,7 @@ impl Solution {
         is_free: Vec<bool>,
         bandwidth: usize,
     ) -> Self {
-        let mut a = Banded::zeros(is_free.len(), bandwidth);
+        let mut a = BandedMatrix::zeros(is_free.len(), bandwidth);
         let mut x = vec![0.0; is_free.len()];
         for equation in equations {
             let free = equation.terms().filter(|(i, _)| is_free[*i]);
@@ -91,7 +91,7 @@ impl Solution {
 }
 
 /// Puts L and D of `A = L D Lᵀ` in the place of A.
-fn factor(a: &mut Banded) {
+fn factor(a: &mut BandedMatrix) {
     for i in 0..a.len() {
         let first = i.saturating_sub(a.bandwidth);
         // L[i, j] D[j] first, of which L[i, j] and D[i] follow.
@@ -109,7 +109,7 @@ fn factor(a: &mut Banded) {
 }
 
 /// Puts the solution of `L D Lᵀ x = b` in the place of b.
-fn substitute(a: &Banded, b: &mut [f64]) {
+fn substitute(a: &BandedMatrix, b: &mut [f64]) {
     let n = a.len();
     for i in 0..n {
         for j in i.saturating_sub(a.bandwidth)..i {

@@ -70,8 +70,8 @@ impl Displacement {
     }
 }
 
-/// What was decoded of a motion, frame by frame; all four of one length.
-pub(super) struct Measured {
+/// The decoded channels of a motion, frame by frame, as measurements to fuse; all of one length.
+pub(super) struct FusionMeasurements {
     /// p̂, m.
     pub position: Vec<[f64; 3]>,
     /// v̂, m/s.
@@ -84,7 +84,7 @@ pub(super) struct Measured {
     pub angular_velocity: Vec<[f64; 3]>,
 }
 
-impl Measured {
+impl FusionMeasurements {
     /// Returns how far fusion moves each position, m; 0 where it is held or not finite.
     pub fn shifts(&self, variances: &FusionVariances, held: &HeldPoses) -> Vec<[f64; 3]> {
         let axes: [Vec<f64>; 3] =
@@ -177,7 +177,7 @@ impl FusionFilters {
             residual[middle] = [1.0; 3];
             let (velocity, acceleration) =
                 if is_velocity { (residual, still.clone()) } else { (still.clone(), residual) };
-            let measured = Measured {
+            let measured = FusionMeasurements {
                 position: still.clone(),
                 velocity,
                 acceleration,

@@ -2,7 +2,7 @@
 
 use ndarray::Array2;
 
-use super::fusion::{Displacement, HeldPoses, Measured};
+use super::fusion::{Displacement, FusionMeasurements, HeldPoses};
 use super::variances::{AxisVariances, FusionVariances};
 use crate::motion::channels::MOTION_DIM;
 use crate::motion::kinematics::Poses;
@@ -56,8 +56,8 @@ pub fn truth(n: usize) -> Poses {
     }
 }
 
-/// What a decoder without any error says of poses, in double precision.
-pub fn exact(poses: &Poses) -> Measured {
+/// Returns the output of a decoder without any error for poses, in double precision.
+pub fn exact(poses: &Poses) -> FusionMeasurements {
     let held = |x: &dyn Fn(usize) -> [f64; 3], n: usize, lost: usize| -> Vec<[f64; 3]> {
         (0..n).map(|t| if n > lost { x(t.min(n - 1 - lost)) } else { [0.0; 3] }).collect()
     };
@@ -65,7 +65,7 @@ pub fn exact(poses: &Poses) -> Measured {
     let v = |t: usize| std::array::from_fn(|i| FPS * (p[t + 1][i] - p[t][i]));
     let a = |t: usize| std::array::from_fn(|i| FPS * (v(t + 1)[i] - v(t)[i]));
     let n = poses.len();
-    Measured {
+    FusionMeasurements {
         position: p.clone(),
         velocity: held(&v, n, 1),
         acceleration: held(&a, n, 2),
@@ -75,7 +75,7 @@ pub fn exact(poses: &Poses) -> Measured {
 }
 
 /// Adds errors of some variances to every channel, and flips a sign now and then.
-pub fn noisy(poses: &Poses, variances: &FusionVariances, seed: u64) -> Measured {
+pub fn noisy(poses: &Poses, variances: &FusionVariances, seed: u64) -> FusionMeasurements {
     let mut noise = Noise(seed);
     let mut measured = exact(poses);
     let groups = [
@@ -99,7 +99,7 @@ pub fn noisy(poses: &Poses, variances: &FusionVariances, seed: u64) -> Measured 
 }
 
 /// Rows of \[p 3, v 3, a 3, q 4, ω 3\] as motion, the rest 0.
-pub fn frames(measured: &Measured) -> Array2<f32> {
+pub fn frames(measured: &FusionMeasurements) -> Array2<f32> {
     let mut frames = Array2::zeros((measured.position.len(), MOTION_DIM));
     for t in 0..frames.nrows() {
         let row = [
@@ -116,7 +116,11 @@ pub fn frames(measured: &Measured) -> Array2<f32> {
     frames
 }
 
-pub fn fused(measured: &Measured, variances: &FusionVariances, held: &HeldPoses) -> Vec<[f64; 3]> {
+pub fn fused(
+    measured: &FusionMeasurements,
+    variances: &FusionVariances,
+    held: &HeldPoses,
+) -> Vec<[f64; 3]> {
     let shifts = measured.shifts(variances, held);
     let sum = |(p, d): (&[f64; 3], &[f64; 3])| std::array::from_fn(|i| p[i] + d[i]);
     measured.position.iter().zip(&shifts).map(sum).collect()

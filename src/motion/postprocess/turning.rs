@@ -3,7 +3,7 @@
 use std::f64::consts::TAU;
 
 use super::banded::{Equation, SPAN, Solution};
-use super::fusion::{HeldPoses, Measured, size};
+use super::fusion::{FusionMeasurements, HeldPoses, size};
 use super::variances::{AxisVariances, FusionVariances};
 use crate::motion::quaternion::{
     Quaternion, angular_velocity, dot, from_rotation_vector, mul, normalize,
@@ -31,7 +31,7 @@ pub(super) struct Turning<'a> {
 }
 
 impl<'a> Turning<'a> {
-    pub fn new(measured: &'a Measured, held: &HeldPoses) -> Self {
+    pub fn new(measured: &'a FusionMeasurements, held: &HeldPoses) -> Self {
         let q = &measured.orientation;
         let norm = |q: &Quaternion| dot(*q, *q).sqrt();
         let has_direction: Vec<bool> =
@@ -123,17 +123,17 @@ impl<'a> Turning<'a> {
 
     /// The sum that is made smallest.
     fn sum(&self, q: &[Quaternion], variances: &FusionVariances) -> f64 {
-        let weigh = |x: [f64; 3], of: &AxisVariances| -> f64 {
-            (0..3).map(|axis| x[axis] * x[axis] / of.of_axis(axis)).sum()
+        let weigh = |x: [f64; 3], variances: &AxisVariances| -> f64 {
+            (0..3).map(|axis| x[axis] * x[axis] / variances.of_axis(axis)).sum()
         };
-        let of_frame = |t: usize| {
+        let weighted_error = |t: usize| {
             let error = angular_velocity(self.q_hat[t], q[t], 1.0);
             let known = if self.has_direction[t] { error } else { [0.0; 3] };
             let missing = self.turn(q, t).map_or([0.0; 3], |(_, missing)| missing);
             weigh(known, &variances.orientation_rad2)
                 + weigh(missing, &variances.angular_velocity_rad2_s2)
         };
-        (0..q.len()).map(of_frame).sum()
+        (0..q.len()).map(weighted_error).sum()
     }
 }
 

@@ -3,7 +3,7 @@
 use ndarray::{Array2, ArrayView2};
 use serde::{Deserialize, Serialize};
 
-use super::fusion::Measured;
+use super::fusion::FusionMeasurements;
 use crate::motion::channels::Channel;
 
 /// Horizontal and vertical variances of five channel groups.
@@ -109,7 +109,7 @@ impl FusionVariances {
     }
 }
 
-impl Measured {
+impl FusionMeasurements {
     /// Takes frames, `[T, 25]`, as measurements.
     pub fn of(frames: ArrayView2<f32>) -> Self {
         let frames: Array2<f32> = frames.to_owned();

@@ -22,7 +22,7 @@ pub struct WrittenNote {
     pub is_tied: bool,
 }
 
-/// What stands between two bar lines.
+/// The notes and chords between two bar lines.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Measure {
     pub line: usize,
@@ -72,7 +72,7 @@ struct Reader {
     /// Letter, octave and pitch of what sounded last, and of that from which a tie leads on.
     sounded: Vec<(char, i32, i32)>,
     tied: Vec<(char, i32, i32)>,
-    /// What the next note's length is multiplied by, of a broken rhythm.
+    /// The factor of the next note's length, of a broken rhythm.
     broken: Option<(u32, u32)>,
     /// A tuplet under way: p notes in the time of q, and how many are left.
     tuplet: Option<(u32, u32, u32)>,

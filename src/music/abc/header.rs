@@ -37,7 +37,7 @@ impl Meter {
     }
 }
 
-/// A tempo: so many notes of a length in a minute.
+/// A tempo: `per_minute` notes of the length `ticks` in a minute.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Tempo {
     pub ticks: u32,
@@ -64,7 +64,7 @@ impl Key {
     }
 }
 
-/// What the header of a tune says.
+/// The fields of a tune's header.
 #[derive(Clone, Debug)]
 pub struct Header {
     pub title: String,

@@ -67,9 +67,9 @@ pub struct TuneNote {
 /// A tune, its repeats written out.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tune {
-    /// What `T:` says first.
+    /// The first `T:` field.
     pub title: String,
-    /// What `R:` says.
+    /// The `R:` field.
     pub rhythm: String,
     pub meter: Meter,
     pub tempo: Option<Tempo>,
@@ -85,7 +85,7 @@ pub struct Tune {
 
 /// A tune of a file, or why it has none.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Found {
+pub struct TuneEntry {
     /// Line of its X: field, from 1.
     pub line: usize,
     /// Its text, with what the file says of all tunes.
@@ -94,7 +94,7 @@ pub struct Found {
 }
 
 /// Reads every tune of a file: UTF-8, or else Latin-1.
-pub fn read(bytes: &[u8]) -> Vec<Found> {
+pub fn read(bytes: &[u8]) -> Vec<TuneEntry> {
     let text = match std::str::from_utf8(bytes) {
         Ok(text) => text.to_owned(),
         Err(_) => bytes.iter().map(|byte| char::from(*byte)).collect(),
@@ -116,7 +116,7 @@ pub fn read(bytes: &[u8]) -> Vec<Found> {
             common.push(line);
         }
     }
-    let found = |(line, lines): (usize, Vec<&str>)| Found {
+    let found = |(line, lines): (usize, Vec<&str>)| TuneEntry {
         line,
         text: common.iter().chain(&lines).map(|line| format!("{line}\n")).collect(),
         tune: tune(&common, &lines, line),
@@ -155,12 +155,12 @@ fn tune(common: &[&str], lines: &[&str], first_line: usize) -> Result<Tune, AbcE
     if laid.notes.is_empty() {
         return Err(AbcError::NoNotes);
     }
-    let Laid { notes, chords, n_bars, parts } = laid;
+    let TuneLayout { notes, chords, n_bars, parts } = laid;
     let (title, rhythm) = (header.title, header.rhythm);
     Ok(Tune { title, rhythm, meter, tempo, key, notes, chords, n_bars, parts })
 }
 
-struct Laid {
+struct TuneLayout {
     notes: Vec<TuneNote>,
     chords: Vec<(i64, super::harmony::Chord)>,
     n_bars: usize,
@@ -171,14 +171,15 @@ struct Laid {
 ///
 /// A short measure and the one after it are one bar where they have its length together, as at repeats with
 /// a pickup; any other short one is followed by silence. A short first one is a pickup.
-fn lay(written: &[Measure], played: &[usize], meter: Meter) -> Result<Laid, AbcError> {
+fn lay(written: &[Measure], played: &[usize], meter: Meter) -> Result<TuneLayout, AbcError> {
     let full = meter.ticks();
     let measures: Vec<&Measure> = played.iter().filter_map(|i| written.get(*i)).collect();
-    let mut laid = Laid { notes: Vec::new(), chords: Vec::new(), n_bars: 0, parts: Vec::new() };
+    let mut laid =
+        TuneLayout { notes: Vec::new(), chords: Vec::new(), n_bars: 0, parts: Vec::new() };
     let (mut at, mut n_short, mut i) = (0_i64, 0, 0);
     // Onsets by pitch of notes that a tie goes on from.
     let mut tied: Vec<usize> = Vec::new();
-    let mut place = |laid: &mut Laid, measure: &Measure, at: i64| {
+    let mut place = |laid: &mut TuneLayout, measure: &Measure, at: i64| {
         for note in &measure.notes {
             let onset = at + i64::from(note.onset);
             let ends_here = |n: &TuneNote| {
@@ -209,11 +210,11 @@ fn lay(written: &[Measure], played: &[usize], meter: Meter) -> Result<Laid, AbcE
     }
     while let Some(measure) = measures.get(i) {
         if measure.ticks > full {
-            let of = |ticks: u32| format!("{}/{TICKS_PER_WHOLE}", ticks);
+            let in_ticks = |ticks: u32| format!("{}/{TICKS_PER_WHOLE}", ticks);
             return Err(AbcError::Overfull {
                 line: measure.line,
-                found: fraction(measure.ticks).unwrap_or_else(|| of(measure.ticks)),
-                expected: fraction(full).unwrap_or_else(|| of(full)),
+                found: fraction(measure.ticks).unwrap_or_else(|| in_ticks(measure.ticks)),
+                expected: fraction(full).unwrap_or_else(|| in_ticks(full)),
             });
         }
         if measure.begins_part {

@@ -3,7 +3,7 @@
 use super::super::score::Voice::{ClosedHat, Kick, OpenHat, Ride, Rim, Shaker, Snare, Tom};
 use super::super::style::{
     Style,
-    Swung::{Eighths, Sixteenths},
+    SwingGrid::{Eighths, Sixteenths},
 };
 
 pub const ROCK: Style = Style {

@@ -3,7 +3,7 @@
 use super::super::score::Voice::{Clap, ClosedHat, Kick, OpenHat, Ride, Rim, Shaker, Snare};
 use super::super::style::{
     Style,
-    Swung::{Eighths, Sixteenths},
+    SwingGrid::{Eighths, Sixteenths},
 };
 
 /// Styles in bars of three.

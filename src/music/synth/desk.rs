@@ -37,7 +37,7 @@ const RUMBLE_HZ: f64 = 22.0;
 /// Corners of the shelves, in Hz.
 const SHELVES_HZ: (f64, f64) = (220.0, 3200.0);
 
-/// What a bus is given.
+/// The settings of a bus.
 #[derive(Clone, Copy, Debug)]
 struct Channel {
     gain: f32,

@@ -57,7 +57,7 @@ impl DrumKit {
     }
 }
 
-/// What a drum is made of.
+/// The parameters of a drum's sound.
 #[derive(Clone, Copy, Debug)]
 struct Recipe {
     /// Pitch of the skin, in Hz, and how many times that it begins with.

@@ -48,7 +48,7 @@ fn log_between(low: f64, high: f64, chance: &mut Chance) -> f64 {
 }
 
 impl Timbre {
-    /// Partials that nobody has heard before: falling as k^−p, each more or less.
+    /// Random partials: falling as k^−p, each more or less.
     fn organ(chance: &mut Chance) -> Self {
         let fall = between(0.8, 2.4, chance);
         let n = 6 + chance.below(26);

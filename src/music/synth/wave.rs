@@ -144,10 +144,10 @@ mod tests {
         // Of a saw at 5 kHz, three partials are below 18 kHz; tables are halves of 512.
         let table = Wave::saw().at(5000.0);
         let sum = |k: usize| -> f64 {
-            let of = |i: usize| {
+            let term = |i: usize| {
                 f64::from(table.0[i]) * (std::f64::consts::TAU * (k * i) as f64 / LEN as f64).sin()
             };
-            (0..LEN).map(of).sum::<f64>().abs() / LEN as f64
+            (0..LEN).map(term).sum::<f64>().abs() / LEN as f64
         };
         assert!(sum(1) > 0.1 && sum(2) > 0.05 && sum(4) < 1e-6, "{} {}", sum(1), sum(4));
     }

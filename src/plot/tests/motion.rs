@@ -5,7 +5,7 @@ use ndarray::Array2;
 use super::{check_texts, decode, texts};
 use crate::motion::{Channel, MOTION_DIM, Trajectory};
 use crate::plot::motion::scene;
-use crate::plot::scene::{Item, Point, Scene};
+use crate::plot::scene::{Point, Scene, SceneItem};
 use crate::plot::style::{BLUE, GREEN, INK, PURPLE, Rgb, VERMILLION};
 use crate::plot::*;
 
@@ -45,7 +45,7 @@ fn plot<'a>(motion: &'a Trajectory, beat_times_s: &'a [f64]) -> MotionPlot<'a> {
 /// Returns the lines of a colour that have more points than a key of a legend.
 fn curves(scene: &Scene, wanted: Rgb) -> Vec<&[Point]> {
     let curves = scene.items.iter().filter_map(|item| match item {
-        Item::Polyline { points, color, .. } => {
+        SceneItem::Polyline { points, color, .. } => {
             (*color == wanted && points.len() > 2).then_some(points.as_slice())
         }
         _ => None,
@@ -188,7 +188,7 @@ fn scene_of(motion: &Trajectory) -> Scene {
 fn long_motions_are_bands_and_means() {
     let motion = trajectory(circle(8440));
     let scene = scene(&plot(&motion, &[]), &MotionPanel::USUAL, 1000).unwrap();
-    let bands = scene.items.iter().filter(|item| matches!(item, Item::Polygon { .. })).count();
+    let bands = scene.items.iter().filter(|item| matches!(item, SceneItem::Polygon { .. })).count();
     // Three of position and velocity, four of the quaternion, and at least one of each other.
     assert!(bands >= 13, "{bands} bands");
     let texts = texts(&scene);
@@ -201,7 +201,7 @@ fn limits_and_beats_are_marked() {
     let marks = |beats: &[f64], panels: &[MotionPanel]| {
         let scene = scene(&plot(&motion, beats), panels, 1000).unwrap();
         let marks = scene.items.iter().filter_map(|item| match item {
-            Item::Area { rect, color, .. } if *color == VERMILLION => Some(*rect),
+            SceneItem::Area { rect, color, .. } if *color == VERMILLION => Some(*rect),
             _ => None,
         });
         marks.collect::<Vec<_>>()

@@ -1,7 +1,7 @@
 //! Tests of whole plots of training.
 
 use super::{check_texts, decode, texts};
-use crate::plot::scene::{Item, Point, Rect, Scene};
+use crate::plot::scene::{Point, Rect, Scene, SceneItem};
 use crate::plot::style::{BLUE, GREEN, INK, PURPLE, Rgb, VERMILLION};
 use crate::plot::training::scene;
 use crate::plot::*;
@@ -57,7 +57,7 @@ fn plot(stages: &[StageCurves]) -> TrainingPlot<'_> {
 /// Returns the lines of a colour that are no dots.
 fn lines(scene: &Scene, wanted: Rgb) -> Vec<&[Point]> {
     let lines = scene.items.iter().filter_map(|item| match item {
-        Item::Polyline { points, color, .. } => {
+        SceneItem::Polyline { points, color, .. } => {
             let is_line = points.iter().any(|p| (p[0] - points[0][0]).abs() > 0.1);
             (*color == wanted && is_line).then_some(points.as_slice())
         }
@@ -166,7 +166,7 @@ fn many_steps_are_a_band_and_a_mean() {
     let steps: Vec<_> = (1..=9080).map(|step| (step, [0.01, 1.0][step as usize % 2])).collect();
     let scene = scene(&plot(&[alone(TrainingPanel::Loss, steps, 9080)]), 1000).unwrap();
     let band = scene.items.iter().find_map(|item| match item {
-        Item::Polygon { points, .. } => Some(points),
+        SceneItem::Polygon { points, .. } => Some(points),
         _ => None,
     });
     let band = band.expect("a band");

@@ -72,8 +72,8 @@ pub struct BaselineMotion {
     pub frames: Array2<f32>,
 }
 
-/// What is sampled, with what, for which music.
-pub struct Request<'a> {
+/// The windows to sample, with model, settings and seed.
+pub struct BaselineRequest<'a> {
     pub store: &'a Location,
     pub model: &'a OpenModel,
     pub settings: &'a RunSettings,
@@ -173,10 +173,10 @@ fn of_columns(row: &GenerationRow, card: &ModelCard) -> anyhow::Result<MotionSet
 /// refuses; windows that are no music in a sentence.
 pub fn sample(
     baseline: Baseline,
-    request: &Request,
+    request: &BaselineRequest,
     progress: &dyn Progress,
 ) -> anyhow::Result<Vec<BaselineMotion>> {
-    let Request { store, model, settings, windows, .. } = request;
+    let BaselineRequest { store, model, settings, windows, .. } = request;
     for MusicWindow { phrase_id, first_frame, features, phase, .. } in *windows {
         let (n_frames, n_features) = features.dim();
         ensure!(
@@ -212,11 +212,11 @@ pub fn sample(
 
 fn sample_all(
     baseline: Baseline,
-    request: &Request,
+    request: &BaselineRequest,
     settings: &MotionSettings,
     progress: &dyn Progress,
 ) -> anyhow::Result<Vec<BaselineMotion>> {
-    let Request { model, seed, windows, threads, .. } = request;
+    let BaselineRequest { model, seed, windows, threads, .. } = request;
     let card = &model.card;
     // Windows are independent: a worker of one thread for each core keeps all of them busy.
     let engine: EagerEngine = match baseline {

@@ -5,10 +5,10 @@ use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, s};
 
-use super::job::{Job, SampledWindow};
+use super::job::{EvaluationJob, SampledWindow};
 use super::measure::Measurer;
-use super::subjects::{Item, Subject};
-use crate::evaluation::Measured;
+use super::subjects::{MeasuredWindow, Subject};
+use crate::evaluation::WindowMeasures;
 use crate::evaluation::window::window_starts;
 use crate::store::{StoreError, digest, tables};
 
@@ -16,18 +16,18 @@ use crate::store::{StoreError, digest, tables};
 const MAX_RETRIEVED: usize = 500;
 
 /// Baselines that were sampled.
-pub(super) struct Sampled {
-    pub untrained: Vec<Item>,
-    pub no_music: Vec<Item>,
+pub(super) struct SampledBaselines {
+    pub untrained: Vec<MeasuredWindow>,
+    pub no_music: Vec<MeasuredWindow>,
 }
 
-impl Job<'_> {
+impl EvaluationJob<'_> {
     /// Asks the library for the nearest phrases of other songs, for one motion of each phrase.
     pub(super) fn retrieved(
         &self,
         measurer: &Measurer,
-        generated: &[(Item, Array2<f32>)],
-    ) -> Result<Vec<Item>, StoreError> {
+        generated: &[(MeasuredWindow, Array2<f32>)],
+    ) -> Result<Vec<MeasuredWindow>, StoreError> {
         let Some((truth, (index, of_phrase))) =
             self.truth.and_then(|truth| Some((truth, truth.retrieval.as_ref()?)))
         else {
@@ -45,7 +45,7 @@ impl Job<'_> {
         let most = MAX_RETRIEVED.div_ceil(names.len().max(1));
         let owned: BTreeSet<String> = names.iter().map(|id| (*id).to_owned()).collect();
         let length = measurer.window_frames;
-        let mut found: BTreeMap<String, Vec<Item>> = BTreeMap::new();
+        let mut found: BTreeMap<String, Vec<MeasuredWindow>> = BTreeMap::new();
         self.snapshot.table(tables::features())?.visit_items(
             &owned,
             |id, features: Array2<f32>| {
@@ -60,7 +60,7 @@ impl Job<'_> {
                         let window = phrase.motion.slice(s![..length, ..]);
                         self.baseline_item(measurer, generated, id, first, window)
                     });
-                let items: Vec<Item> = items.collect();
+                let items: Vec<MeasuredWindow> = items.collect();
                 found.insert(id.to_owned(), items);
                 Ok::<_, StoreError>(())
             },
@@ -72,11 +72,11 @@ impl Job<'_> {
     fn baseline_item(
         &self,
         measurer: &Measurer,
-        generated: &[(Item, Array2<f32>)],
+        generated: &[(MeasuredWindow, Array2<f32>)],
         phrase_id: &str,
         first_frame: usize,
         window: ArrayView2<f32>,
-    ) -> Option<Item> {
+    ) -> Option<MeasuredWindow> {
         let place = self.motions.iter().position(|motion| motion.phrase_id == phrase_id)?;
         let motion = &self.motions[place];
         let song = self.phrases.song(phrase_id);
@@ -93,8 +93,8 @@ impl Job<'_> {
                 self.phrases.music(phrase_id, first_frame + measurer.window_frames).map(Arc::new)
             }
         };
-        let measured: Measured = measurer.measure(window).windows.into_iter().next()?;
-        Some(Item {
+        let measured: WindowMeasures = measurer.measure(window).windows.into_iter().next()?;
+        Some(MeasuredWindow {
             song,
             phrase: place,
             first_frame,
@@ -109,8 +109,8 @@ impl Job<'_> {
     pub(super) fn mean_motion(
         &self,
         measurer: &Measurer,
-        generated: &[(Item, Array2<f32>)],
-    ) -> Vec<Item> {
+        generated: &[(MeasuredWindow, Array2<f32>)],
+    ) -> Vec<MeasuredWindow> {
         let Some(truth) = self.truth else { return Vec::new() };
         let Some(still) =
             measurer.measure(truth.mean_motion.view()).windows.into_iter().next().map(Arc::new)
@@ -122,21 +122,29 @@ impl Job<'_> {
             .iter()
             .filter(|(item, _)| places.insert((item.phrase, item.first_frame)))
             .take(MAX_RETRIEVED)
-            .map(|(item, _)| Item { measured: still.clone(), decoded: None, ..item.clone() })
+            .map(|(item, _)| MeasuredWindow {
+                measured: still.clone(),
+                decoded: None,
+                ..item.clone()
+            })
             .collect()
     }
 
-    pub(super) fn sampled(&self, measurer: &Measurer, sampled: &[SampledWindow]) -> Sampled {
+    pub(super) fn sampled(
+        &self,
+        measurer: &Measurer,
+        sampled: &[SampledWindow],
+    ) -> SampledBaselines {
         let item = |window: &SampledWindow| {
             let (id, first) = (window.phrase_id.as_str(), window.first_frame);
             self.baseline_item(measurer, &[], id, first, window.frames.view())
         };
-        let of_subject = |subject: Subject| -> Vec<Item> {
+        let windows_of = |subject: Subject| -> Vec<MeasuredWindow> {
             sampled.iter().filter(|window| window.subject == subject).filter_map(item).collect()
         };
-        Sampled {
-            untrained: of_subject(Subject::Untrained),
-            no_music: of_subject(Subject::NoMusic),
+        SampledBaselines {
+            untrained: windows_of(Subject::Untrained),
+            no_music: windows_of(Subject::NoMusic),
         }
     }
 }

@@ -6,12 +6,12 @@ use std::path::Path;
 use anyhow::{Context as _, bail, ensure};
 use ndarray::Array2;
 
-use super::foreign::{self, ForeignMotions, Refused};
-use super::job::{Evaluated, Job, Motion, Stage as MadeAt};
+use super::foreign::{self, ForeignMotions, RefusedFile};
+use super::job::{EvaluatedMotion, EvaluationJob, EvaluationMotion, MotionStage};
 use super::measure::{MeasuredMotion, stride_for};
-use super::motions::{self, Phrases, is_held_out};
+use super::motions::{self, PhraseIndex, is_held_out};
 use super::params::Params;
-use super::rows::{self, Rows, RunName};
+use super::rows::{self, EvaluationRows, RunName};
 use super::splits::{MusicSplit, telling};
 use super::truth::{self, Truth};
 use crate::evaluation::metrics::PhaseOrigin;
@@ -32,12 +32,12 @@ use crate::units::frames_to_s;
 /// Songs whose activity is read; that of others counts as its mean.
 const MAX_HEARD_SONGS: usize = 500;
 
-/// What is evaluated.
+/// The motions to evaluate: those of a run, or of a folder.
 pub struct Evaluand {
     pub run: String,
     pub model: String,
-    pub phrases: Phrases,
-    pub motions: Vec<Motion>,
+    pub phrases: PhraseIndex,
+    pub motions: Vec<EvaluationMotion>,
     /// What generate said of them, in the same order; none of motions of another program.
     pub generations: Vec<GenerationRow>,
     /// Candidates that each motion was chosen from, at most.
@@ -45,7 +45,7 @@ pub struct Evaluand {
     /// What is to be known beside the numbers.
     pub notes: Vec<String>,
     /// Files that hold no motion.
-    pub refused: Vec<Refused>,
+    pub refused: Vec<RefusedFile>,
     /// Lengths of the motions, frames.
     n_frames: Vec<usize>,
     /// How motions were processed; nothing was done to those of another program.
@@ -80,13 +80,13 @@ impl Evaluand {
         let store = snapshot.store();
         let generations = motions::of_run(&snapshot, run, most)?;
         let phrases =
-            Phrases::read(&snapshot, generations.iter().map(|row| row.phrase_id.as_str()))?;
+            PhraseIndex::read(&snapshot, generations.iter().map(|row| row.phrase_id.as_str()))?;
         refuse_outdated(&snapshot, run, &phrases, &generations)?;
         let (splits, notes) = splits_of(store, &phrases, &generations)?;
         let motions = generations
             .iter()
             .zip(splits)
-            .map(|(row, split)| Motion {
+            .map(|(row, split)| EvaluationMotion {
                 phrase_id: row.phrase_id.clone(),
                 sample: row.sample,
                 split,
@@ -135,14 +135,14 @@ impl Evaluand {
             "store {store} has a run \"{run}\" of generate, whose evaluation this one would replace; give \
              another --name"
         );
-        let all = Phrases::read(&snapshot, [])?;
+        let all = PhraseIndex::read(&snapshot, [])?;
         let mut files = foreign::read(folder, &all.foreign_phrases())?;
         if let Some(n) = params.num_samples {
             files.keep(n.get());
         }
         let phrases =
-            Phrases::read(&snapshot, files.files.iter().map(|file| file.phrase_id.as_str()))?;
-        let mut refused = Refused::all(folder, std::mem::take(&mut files.failures));
+            PhraseIndex::read(&snapshot, files.files.iter().map(|file| file.phrase_id.as_str()))?;
+        let mut refused = RefusedFile::all(folder, std::mem::take(&mut files.failures));
         // A look at every file, so that what holds no motion is known before the others are measured.
         let (mut motions, mut n_frames, mut notes) = (Vec::new(), Vec::new(), Vec::new());
         let mut has_phase = true;
@@ -151,7 +151,7 @@ impl Evaluand {
         for file in std::mem::take(&mut files.files) {
             match file.read() {
                 Ok(motion) => {
-                    motions.push(Motion {
+                    motions.push(EvaluationMotion {
                         phrase_id: file.phrase_id.clone(),
                         sample: i32::try_from(file.sample).unwrap_or(i32::MAX),
                         split: MusicSplit::Unknown,
@@ -165,7 +165,7 @@ impl Evaluand {
                     notes.extend(motion.note);
                     read.push(file);
                 }
-                Err(failure) => refused.extend(Refused::all(folder, [(file.path, failure)])),
+                Err(failure) => refused.extend(RefusedFile::all(folder, [(file.path, failure)])),
             }
         }
         files.files = read;
@@ -259,7 +259,7 @@ impl Evaluand {
         params: &Params,
         data_hash: &str,
         progress: &dyn Progress,
-    ) -> anyhow::Result<Rows> {
+    ) -> anyhow::Result<EvaluationRows> {
         let truth = match params.quick {
             true => None,
             false => truth::read(&self.snapshot, data_hash, params.threads, progress)?,
@@ -274,7 +274,7 @@ impl Evaluand {
         };
         let has_music = self.phrases.has_beats();
         let holds = |check: &str| holds_by_construction(check, &self.postprocess, has_music);
-        let job = Job {
+        let job = EvaluationJob {
             params,
             snapshot: &self.snapshot,
             motions: &self.motions,
@@ -292,7 +292,7 @@ impl Evaluand {
         };
         let evaluated = self.measured(store, &job, progress)?;
         let name = RunName { run: &self.run, model: &self.model };
-        let mut rows = Rows::default();
+        let mut rows = EvaluationRows::default();
         for (motion, found) in self.motions.iter().zip(&evaluated) {
             let (id, sample) = (motion.phrase_id.as_str(), motion.sample);
             if let Some(decoded) = &found.decoded {
@@ -303,10 +303,11 @@ impl Evaluand {
                     "angular_velocity" => false,
                     check => self.decoder_derives && holds_by_derivation(check),
                 };
-                let raw = rows::checks(name, id, sample, MadeAt::Raw, &decoded.checks, &derived);
+                let raw =
+                    rows::checks(name, id, sample, MotionStage::Raw, &decoded.checks, &derived);
                 rows.checks.extend(raw);
             }
-            let is = rows::checks(name, id, sample, MadeAt::Final, &found.is.checks, &holds);
+            let is = rows::checks(name, id, sample, MotionStage::Final, &found.is.checks, &holds);
             rows.checks.extend(is);
         }
         if !params.quick {
@@ -358,9 +359,9 @@ impl Evaluand {
     fn measured(
         &self,
         store: &Location,
-        job: &Job,
+        job: &EvaluationJob,
         progress: &dyn Progress,
-    ) -> anyhow::Result<Vec<Evaluated>> {
+    ) -> anyhow::Result<Vec<EvaluatedMotion>> {
         let stride = stride_for(self.n_frames.iter().sum());
         let measurer = job.measurer(stride);
         progress.start("evaluate", "motions", self.motions.len() as u64);
@@ -377,7 +378,7 @@ impl Evaluand {
             return Ok(found
                 .into_iter()
                 .flatten()
-                .map(|is| Evaluated { is, decoded: None })
+                .map(|is| EvaluatedMotion { is, decoded: None })
                 .collect());
         }
         let places: BTreeMap<&str, usize> =
@@ -411,7 +412,7 @@ impl Evaluand {
             .into_iter()
             .flatten()
             .zip(decoded)
-            .map(|(is, decoded)| Evaluated { is, decoded })
+            .map(|(is, decoded)| EvaluatedMotion { is, decoded })
             .collect())
     }
 }
@@ -420,7 +421,7 @@ impl Evaluand {
 fn refuse_outdated(
     snapshot: &StoreSnapshot,
     run: &str,
-    phrases: &Phrases,
+    phrases: &PhraseIndex,
     generations: &[GenerationRow],
 ) -> anyhow::Result<()> {
     let content_of = |id: &str| phrases.row(id).map(|row| row.content_hash.as_str());
@@ -444,7 +445,7 @@ const MAX_NOTES: usize = 5;
 /// not known.
 fn splits_of(
     store: &Location,
-    phrases: &Phrases,
+    phrases: &PhraseIndex,
     generations: &[GenerationRow],
 ) -> anyhow::Result<(Vec<MusicSplit>, Vec<String>)> {
     let mut models: BTreeMap<(&str, &str), Option<LearnedFrom>> = BTreeMap::new();

@@ -38,7 +38,7 @@ const LENGTH_TOLERANCE: f64 = 0.1;
 
 /// A phrase that motion can be for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Phrase<'a> {
+pub struct ForeignPhrase<'a> {
     pub id: &'a str,
     /// The file with its music.
     pub url: &'a str,
@@ -46,13 +46,13 @@ pub struct Phrase<'a> {
     pub n_frames: Option<usize>,
 }
 
-/// What a folder has: motions that can be read, and why others cannot.
+/// The motions of a folder that can be read, and why others cannot.
 #[derive(Debug, Default)]
 pub struct ForeignMotions {
     /// By phrase and sample.
     pub files: Vec<ForeignFile>,
     pub failures: Vec<(PathBuf, Failure)>,
-    /// Files that are named like no motion, which nobody looks at.
+    /// Number of files whose names are not those of motions; they are not read.
     pub n_others: usize,
 }
 
@@ -66,7 +66,7 @@ pub struct ForeignFile {
     pub n_music_frames: Option<usize>,
 }
 
-/// What a file held, from which its 25 channels came.
+/// The content of a file from which its 25 channels came.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FileContent {
     /// All of them.
@@ -109,7 +109,7 @@ pub struct ForeignMotion {
     pub frames: Array2<f32>,
     pub content: FileContent,
     pub has_phase: bool,
-    /// What is unusual of it and no reason to refuse it.
+    /// Notes on what is unusual about the file, but no reason to refuse it.
     pub note: Option<String>,
 }
 
@@ -121,7 +121,7 @@ pub struct ForeignMotion {
 ///
 /// # Errors
 /// When there is no such folder, or no motion in it.
-pub fn read(dir: &Path, phrases: &[Phrase]) -> anyhow::Result<ForeignMotions> {
+pub fn read(dir: &Path, phrases: &[ForeignPhrase]) -> anyhow::Result<ForeignMotions> {
     let place = dir.display();
     ensure!(
         dir.is_dir(),
@@ -197,13 +197,13 @@ impl ForeignMotions {
 
 /// A file that holds no motion, or none for a phrase.
 #[derive(Debug)]
-pub struct Refused {
+pub struct RefusedFile {
     /// Its path below the folder.
     pub name: String,
     pub failure: Failure,
 }
 
-impl Refused {
+impl RefusedFile {
     /// Names files by their paths below a folder.
     pub fn all(folder: &Path, files: impl IntoIterator<Item = (PathBuf, Failure)>) -> Vec<Self> {
         let name =
@@ -263,7 +263,7 @@ fn walk(dir: &Path, found: &mut ForeignMotions) -> std::io::Result<Vec<PathBuf>>
             }
             if entry.file_type()?.is_dir() {
                 folders.push(path);
-            } else if content::Format::of(&path).is_some() {
+            } else if content::ForeignFormat::of(&path).is_some() {
                 files.push(path);
             } else {
                 found.n_others += 1;

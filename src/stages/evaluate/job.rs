@@ -6,15 +6,15 @@ use std::sync::Arc;
 use ndarray::Array2;
 
 use super::measure::{MeasuredMotion, Measurer, kept_frames, stride_for};
-use super::motions::{Phrases, is_held_out};
+use super::motions::{PhraseIndex, is_held_out};
 use super::params::Params;
 use super::splits::{ALL, MusicSplit, SPLITS};
-use super::subjects::{Finding, Item, Meter, Subject, channels};
+use super::subjects::{Finding, MeasureSettings, MeasuredWindow, Subject, channels};
 use super::truth::{Truth, TruthPhrase};
 use crate::evaluation::coupling::{Coupling, Harmonics, Template, consistency_p};
 use crate::evaluation::metrics::{
-    Danced, Number, PhaseOrigin, control_numbers, coupling_ratio, motion_ratios, song_harmonics,
-    whole_numbers,
+    MotionWindow, Number, PhaseOrigin, control_numbers, coupling_ratio, motion_ratios,
+    song_harmonics, whole_numbers,
 };
 use crate::evaluation::verdict::{Evidence, Verdict, verdicts};
 use crate::evaluation::window::window_starts;
@@ -30,14 +30,14 @@ const COUPLING_SEED: u64 = 2026;
 
 /// Stages of the making of a motion at which it is checked.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Stage {
+pub enum MotionStage {
     /// As it was decoded.
     Raw,
     /// After post-processing.
     Final,
 }
 
-impl Stage {
+impl MotionStage {
     /// Returns the name of the stage in tables.
     pub const fn name(self) -> &'static str {
         match self {
@@ -49,7 +49,7 @@ impl Stage {
 
 /// A motion that is evaluated.
 #[derive(Clone, Debug)]
-pub struct Motion {
+pub struct EvaluationMotion {
     pub phrase_id: String,
     pub sample: i32,
     pub split: MusicSplit,
@@ -58,7 +58,7 @@ pub struct Motion {
 }
 
 /// A motion, measured as it is and, where that is known, as it was decoded.
-pub struct Evaluated {
+pub struct EvaluatedMotion {
     pub is: MeasuredMotion,
     pub decoded: Option<MeasuredMotion>,
 }
@@ -72,18 +72,18 @@ pub struct SampledWindow {
     pub frames: Array2<f32>,
 }
 
-/// What was found.
-pub struct Found {
+/// The numbers and verdicts of an evaluation.
+pub struct EvaluationFindings {
     pub findings: Vec<Finding>,
     pub verdicts: Vec<(MusicSplit, Verdict)>,
 }
 
-/// What is evaluated, and what it is compared with.
-pub struct Job<'a> {
+/// The inputs of an evaluation: motions, and what they are compared with.
+pub struct EvaluationJob<'a> {
     pub params: &'a Params,
     pub snapshot: &'a StoreSnapshot,
-    pub motions: &'a [Motion],
-    pub phrases: &'a Phrases,
+    pub motions: &'a [EvaluationMotion],
+    pub phrases: &'a PhraseIndex,
     pub truth: Option<&'a Truth>,
     /// Frames of a window: as many for all that is compared.
     pub window_frames: usize,
@@ -96,17 +96,17 @@ pub struct Job<'a> {
     pub sampled_split: Option<MusicSplit>,
 }
 
-impl Job<'_> {
+impl EvaluationJob<'_> {
     /// Makes numbers and verdicts of motions that were measured.
     ///
     /// # Errors
     /// [`StoreError`] when features cannot be read.
     pub fn numbers(
         &self,
-        evaluated: &[Evaluated],
+        evaluated: &[EvaluatedMotion],
         sampled: &[SampledWindow],
         progress: &dyn Progress,
-    ) -> Result<Found, StoreError> {
+    ) -> Result<EvaluationFindings, StoreError> {
         let measurer = self.measurer(1);
         let generated = self.generated(evaluated);
         progress.say("measuring what it is compared with");
@@ -116,8 +116,8 @@ impl Job<'_> {
         let constant = self.mean_motion(&measurer, &generated);
         let sampled = self.sampled(&measurer, sampled);
         let training_kept = kept_frames(training.iter().map(|(_, kept)| kept));
-        let held_out_items: Vec<&Item> = held_out.iter().map(|(item, _)| item).collect();
-        let meter = |n_own: usize| Meter {
+        let held_out_items: Vec<&MeasuredWindow> = held_out.iter().map(|(item, _)| item).collect();
+        let meter = |n_own: usize| MeasureSettings {
             reference: self.truth.map(|truth| &truth.statistics),
             coupling: coupling.as_ref(),
             n_frechet: match held_out_items.len() {
@@ -143,7 +143,7 @@ impl Job<'_> {
             findings.push(Finding { subject, split, numbers: truth_numbers });
         }
         if !training.is_empty() {
-            let items: Vec<&Item> = training.iter().map(|(item, _)| item).collect();
+            let items: Vec<&MeasuredWindow> = training.iter().map(|(item, _)| item).collect();
             // Distances from itself say nothing.
             let mut numbers = meter(items.len()).numbers(ALL, &items, real);
             numbers.retain(|number| !DISTANCES.contains(&number.metric));
@@ -155,16 +155,16 @@ impl Job<'_> {
             .collect();
         progress.say("measuring what was generated");
         if splits.len() > 1 {
-            let items: Vec<&Item> = generated.iter().map(|(item, _)| item).collect();
+            let items: Vec<&MeasuredWindow> = generated.iter().map(|(item, _)| item).collect();
             let mut numbers = meter(items.len()).numbers(ALL, &items, own);
             numbers.extend(meter(0).decoded(&items, self.raw_phase()));
             numbers.extend(self.control(None));
             findings.push(Finding { subject: Subject::Generated, split: ALL, numbers });
         }
         for split in splits {
-            let chosen: Vec<&(Item, Array2<f32>)> =
+            let chosen: Vec<&(MeasuredWindow, Array2<f32>)> =
                 generated.iter().filter(|(item, _)| item.split == split).collect();
-            let items: Vec<&Item> = chosen.iter().map(|(item, _)| item).collect();
+            let items: Vec<&MeasuredWindow> = chosen.iter().map(|(item, _)| item).collect();
             let meter = meter(items.len());
             let name = split.name();
             let mut numbers = meter.numbers(name, &items, own);
@@ -176,12 +176,12 @@ impl Job<'_> {
             numbers.extend(self.control(Some(split)));
             let shuffled = meter.shuffled(&items);
             let shifted = meter.shifted(&items);
-            let of_split = |items: &'_ [Item]| -> Vec<Item> {
+            let items_in_split = |items: &'_ [MeasuredWindow]| -> Vec<MeasuredWindow> {
                 items.iter().filter(|item| item.split == split).cloned().collect()
             };
-            let baseline = |subject: Subject, items: &[Item]| -> Finding {
-                let items = of_split(items);
-                let items: Vec<&Item> = items.iter().collect();
+            let baseline = |subject: Subject, items: &[MeasuredWindow]| -> Finding {
+                let items = items_in_split(items);
+                let items: Vec<&MeasuredWindow> = items.iter().collect();
                 let numbers = match items.is_empty() {
                     true => Vec::new(),
                     false => meter.numbers(name, &items, real),
@@ -211,11 +211,11 @@ impl Job<'_> {
             ]);
         }
         findings.retain(|finding| !finding.numbers.is_empty());
-        Ok(Found { findings, verdicts: all_verdicts })
+        Ok(EvaluationFindings { findings, verdicts: all_verdicts })
     }
 
     /// Returns the songs of a split's motions, whether each is finite, and whether it is without seams.
-    fn whole(&self, evaluated: &[Evaluated], split: MusicSplit) -> Vec<(usize, bool, bool)> {
+    fn whole(&self, evaluated: &[EvaluatedMotion], split: MusicSplit) -> Vec<(usize, bool, bool)> {
         let motions = self.motions.iter().zip(evaluated);
         motions
             .filter(|(motion, _)| motion.split == split)
@@ -242,7 +242,7 @@ impl Job<'_> {
     }
 
     /// Returns the windows of the motions with their music, and the frames that are kept of each motion with its first.
-    fn generated(&self, evaluated: &[Evaluated]) -> Vec<(Item, Array2<f32>)> {
+    fn generated(&self, evaluated: &[EvaluatedMotion]) -> Vec<(MeasuredWindow, Array2<f32>)> {
         let mut number_of: BTreeMap<&str, usize> = BTreeMap::new();
         let mut music_of: BTreeMap<&str, Option<Arc<_>>> = BTreeMap::new();
         let mut items = Vec::new();
@@ -266,7 +266,7 @@ impl Job<'_> {
             let firsts = window_starts(found.is.n_frames, self.window_frames);
             for (i, (first_frame, window)) in firsts.zip(&found.is.windows).enumerate() {
                 let decoded = found.decoded.as_ref().and_then(|decoded| decoded.windows.get(i));
-                let item = Item {
+                let item = MeasuredWindow {
                     song: self.phrases.song(id),
                     phrase,
                     first_frame,
@@ -319,7 +319,7 @@ impl Job<'_> {
                 let music = self.phrases.music_of_real(&phrase.id, &phase).map(Arc::new);
                 let firsts = window_starts(measured.n_frames, length);
                 for (i, (first_frame, window)) in firsts.zip(measured.windows).enumerate() {
-                    let item = Item {
+                    let item = MeasuredWindow {
                         song: self.phrases.song(&phrase.id),
                         phrase: place,
                         first_frame,
@@ -349,7 +349,7 @@ impl Job<'_> {
         if self.phrases.is_constructed() {
             return Some(Coupling::Constructed);
         }
-        let danced: Vec<Danced> = training.iter().map(|(item, _)| item.as_danced()).collect();
+        let danced: Vec<MotionWindow> = training.iter().map(|(item, _)| item.as_danced()).collect();
         let songs: Vec<Harmonics> = song_harmonics(&danced).into_values().collect();
         let p = consistency_p(&songs, COUPLING_SEED)?;
         if p < COUPLING_P { Template::fit(&songs).map(Coupling::Learned) } else { None }
@@ -375,7 +375,7 @@ impl Job<'_> {
 }
 
 /// Windows with the frames that are kept of their motions.
-type Measurements = Vec<(Item, Array2<f32>)>;
+type Measurements = Vec<(MeasuredWindow, Array2<f32>)>;
 
 /// Metrics that say how far windows are from the training split.
 const DISTANCES: [&str; 4] = ["fid_k", "fid_g", "feature_shift", "channel_distance"];

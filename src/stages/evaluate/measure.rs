@@ -9,7 +9,7 @@ use ndarray::{Array2, ArrayView2, Axis, s};
 use crate::evaluation::reference_statistics::ReferenceStatistics;
 use crate::evaluation::window::{window, window_starts};
 use crate::evaluation::window_range::RANGE_CHECKS;
-use crate::evaluation::{Check, Measured, checks};
+use crate::evaluation::{Check, WindowMeasures, checks};
 use crate::motion::{ChannelLimits, MOTION_DIM};
 use crate::stages::extract::pool::lock;
 
@@ -31,7 +31,7 @@ pub struct Measurer<'a> {
     pub window_frames: usize,
     /// Most frames of a motion that are looked at.
     pub num_frames: Option<usize>,
-    /// One of so many frames is kept.
+    /// One of every `stride` frames is kept.
     pub stride: usize,
     pub threads: NonZeroUsize,
 }
@@ -43,7 +43,7 @@ pub struct MeasuredMotion {
     /// Checks of the whole motion; those of windows are passed where nine in ten windows pass.
     pub checks: Vec<Check>,
     /// Its windows, one behind the other, without messages.
-    pub windows: Vec<Measured>,
+    pub windows: Vec<WindowMeasures>,
     /// Whether it passes [`FINITE_CHECKS`] from its first frame to its last.
     pub is_finite: bool,
     /// Whether nine in ten windows over the borders of `windows` and at the end of the motion pass
@@ -58,7 +58,7 @@ impl Measurer<'_> {
     /// is never given out stays empty.
     ///
     /// # Errors
-    /// What `feed` says.
+    /// The error of `feed`.
     pub fn run<E: Send>(
         &self,
         n: usize,
@@ -97,7 +97,7 @@ impl Measurer<'_> {
         let (mut windows, mut kept) = (Vec::new(), Array2::zeros((0, MOTION_DIM)));
         for first in window_starts(n, length) {
             let placed = window(frames, first, length);
-            windows.push(Measured::new(placed.view(), self.limits, self.reference));
+            windows.push(WindowMeasures::new(placed.view(), self.limits, self.reference));
             // Windows and kept frames have 25 channels each.
             let _ = kept.append(Axis(0), placed.slice(s![..;self.stride, ..]));
         }
@@ -135,7 +135,7 @@ fn passes(checks: &[Check], names: &[&str]) -> bool {
 }
 
 /// Returns a check of all windows of a motion, with the answer that is worst; none where it was not made.
-fn over_windows(name: &str, windows: &[Measured]) -> Option<Check> {
+fn over_windows(name: &str, windows: &[WindowMeasures]) -> Option<Check> {
     let all: Vec<&Check> = windows
         .iter()
         .filter_map(|window| window.checks.iter().find(|check| check.name == name))

@@ -30,10 +30,10 @@ use crate::store::tables::SanityCheckRow;
 use crate::store::{self, Lease, Location};
 
 use evaluand::Evaluand;
-use foreign::Refused;
-use job::Stage as MadeAt;
+use foreign::RefusedFile;
+use job::MotionStage;
 pub use params::{Params, RequiredVerdict};
-use rows::{Known, Rows};
+use rows::{EvaluationRows, RunIdentity};
 
 /// The name under which sanity checks are committed; numbers and verdicts have the stage's.
 const CHECKS: &str = "evaluate-checks";
@@ -55,12 +55,12 @@ impl Stage for Evaluate {
         let started = Instant::now();
         params.check()?;
         let store = Location::open(&params.store, &params.client.options())?;
-        let against = params.against.as_deref().map(|run| page::Other::read(&store, run));
+        let against = params.against.as_deref().map(|run| page::OtherRun::read(&store, run));
         let against = against.transpose()?;
         let mut subject = Evaluand::read(&store, &params)?;
         let data_hash = subject.phrases.truth_digest();
         let run = subject.run.clone();
-        let known = Known {
+        let known = RunIdentity {
             store: &store,
             run: &run,
             params_hash: &params.digest(params.quick),
@@ -79,7 +79,7 @@ impl Stage for Evaluate {
         if params.dry_run {
             let (n_motions, length_s) = (subject.motions.len(), subject.length_s());
             let n_refused = subject.refused.len();
-            return Ok(Box::new(DryRun {
+            return Ok(Box::new(EvaluateDryRun {
                 store: store.to_string(),
                 run,
                 n_motions,
@@ -98,7 +98,7 @@ impl Stage for Evaluate {
             is_up_to_date = has_waited && look()?;
         }
         let found = if is_up_to_date {
-            Rows::read(&store, &run, params.quick)?
+            EvaluationRows::read(&store, &run, params.quick)?
         } else {
             store.sweep();
             let found = subject.evaluate(&store, &params, &data_hash, progress)?;
@@ -141,11 +141,11 @@ impl Stage for Evaluate {
 }
 
 /// A required verdict that was not won, and how it ended.
-type NotWon = (String, report::Outcome);
+type UnwonVerdict = (String, report::Outcome);
 
 /// Returns the required verdicts that were not won. One of which nothing was measured, for example because every motion
 /// is shorter than a window, is open.
-fn not_won(params: &Params, report: &Report) -> Vec<NotWon> {
+fn not_won(params: &Params, report: &Report) -> Vec<UnwonVerdict> {
     let is_required = |name: &str| params.require.iter().any(|asked| asked.asks_for(name));
     let told = report.verdicts.iter().map(|told| (told.verdict.clone(), told.outcome));
     let is_told = |name: &str| report.verdicts.iter().any(|told| told.verdict == name);
@@ -160,26 +160,26 @@ fn not_won(params: &Params, report: &Report) -> Vec<NotWon> {
 
 /// A check set of which too few motions pass all: its name, the share, the share that was asked for, and how
 /// many failed.
-type Missed = (&'static str, f64, f64, usize);
+type CheckShortfall = (&'static str, f64, f64, usize);
 
-fn missed(params: &Params, checks: &[SanityCheckRow]) -> Vec<Missed> {
+fn missed(params: &Params, checks: &[SanityCheckRow]) -> Vec<CheckShortfall> {
     let wanted = [("reference", params.min_pass_rate), ("strict", params.min_strict_pass_rate)];
     let missed = |(set, least): (&'static str, Option<f64>)| {
         let least = least?;
         let is_of_set = |row: &&SanityCheckRow| {
-            row.check_set == set && row.stage.as_deref() != Some(MadeAt::Raw.name())
+            row.check_set == set && row.stage.as_deref() != Some(MotionStage::Raw.name())
         };
-        let of_set = || checks.iter().filter(is_of_set);
+        let checks_in_set = || checks.iter().filter(is_of_set);
         let motion = |row: &SanityCheckRow| (row.phrase_id.clone(), row.sample);
-        let all: BTreeSet<_> = of_set().map(motion).collect();
-        let failed: BTreeSet<_> = of_set().filter(|row| !row.passed).map(motion).collect();
+        let all: BTreeSet<_> = checks_in_set().map(motion).collect();
+        let failed: BTreeSet<_> = checks_in_set().filter(|row| !row.passed).map(motion).collect();
         let share = 1.0 - failed.len() as f64 / all.len().max(1) as f64;
         (share < least).then_some((set, share, least, failed.len()))
     };
     wanted.into_iter().filter_map(missed).collect()
 }
 
-/// What was measured.
+/// The summary of an evaluation.
 struct EvaluateSummary {
     store: String,
     run: String,
@@ -188,9 +188,9 @@ struct EvaluateSummary {
     is_up_to_date: bool,
     has_metrics: bool,
     /// Files that hold no motion, and why.
-    refused: Vec<Refused>,
-    missed: Vec<Missed>,
-    not_won: Vec<NotWon>,
+    refused: Vec<RefusedFile>,
+    missed: Vec<CheckShortfall>,
+    not_won: Vec<UnwonVerdict>,
     report: Report,
     page: Option<PathBuf>,
     took_s: f64,
@@ -263,8 +263,8 @@ impl Summary for EvaluateSummary {
     }
 }
 
-/// What would be measured.
-struct DryRun {
+/// The summary of a dry run.
+struct EvaluateDryRun {
     store: String,
     run: String,
     n_motions: usize,
@@ -274,7 +274,7 @@ struct DryRun {
     is_up_to_date: bool,
 }
 
-impl Summary for DryRun {
+impl Summary for EvaluateDryRun {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
         let Self { store, run, n_motions, n_refused, length_s, is_up_to_date } = self;
         writeln!(out, "evaluate {run} → {store}")?;

@@ -72,8 +72,8 @@ pub fn has_run(snapshot: &StoreSnapshot, run: &str) -> Result<bool, StoreError> 
     Ok(is_there)
 }
 
-/// What the store says of phrases: their songs and beats.
-pub struct Phrases {
+/// The songs, beats and activities of the store's phrases.
+pub struct PhraseIndex {
     rows: HashMap<String, PhraseRow>,
     /// Number of each song.
     songs: BTreeMap<String, usize>,
@@ -82,7 +82,7 @@ pub struct Phrases {
     activities: HashMap<String, Vec<f64>>,
 }
 
-impl Phrases {
+impl PhraseIndex {
     /// Reads the phrases of a store, and the beats of those that were danced to and of those with real motion.
     ///
     /// # Errors
@@ -108,13 +108,13 @@ impl Phrases {
     }
 
     /// Returns the phrases that motion of another program can be for, in order of name.
-    pub fn foreign_phrases(&self) -> Vec<foreign::Phrase<'_>> {
-        let mut found: BTreeMap<&str, foreign::Phrase> = BTreeMap::new();
+    pub fn foreign_phrases(&self) -> Vec<foreign::ForeignPhrase<'_>> {
+        let mut found: BTreeMap<&str, foreign::ForeignPhrase> = BTreeMap::new();
         #[expect(clippy::iter_over_hash_type, reason = "collected into a map that is in order")]
         for (id, row) in &self.rows {
             let n_frames = row.n_feature_frames.and_then(|n| usize::try_from(n).ok());
             let n_frames = n_frames.or(Some((row.duration_s * FPS) as usize));
-            found.insert(id, foreign::Phrase { id, url: url_of(row), n_frames });
+            found.insert(id, foreign::ForeignPhrase { id, url: url_of(row), n_frames });
         }
         found.into_values().collect()
     }
@@ -193,9 +193,9 @@ impl Phrases {
     }
 
     fn activity(&self, row: &PhraseRow, n_frames: usize) -> Option<Vec<f64>> {
-        let of_song = self.activities.get(song_of(row))?;
+        let song_activity = self.activities.get(song_of(row))?;
         let first = (row.start_s.unwrap_or(0.0) * FPS).round() as usize;
-        of_song.get(first..first + n_frames).map(<[f64]>::to_vec)
+        song_activity.get(first..first + n_frames).map(<[f64]>::to_vec)
     }
 
     /// Returns the song of a phrase and the frame of it at which the phrase begins.
@@ -231,7 +231,7 @@ fn has_truth(row: &PhraseRow) -> bool {
     row.has_motion && (row.has_features || row.has_audio)
 }
 
-/// What tells a phrase's song from others: the digest of its music, or its file where that is not known.
+/// Returns the identity of a phrase's song: the digest of its music, or its file where that is not known.
 fn song_of(row: &PhraseRow) -> &str {
     let file = || if row.is_constructed() { &row.source } else { url_of(row) };
     row.song_hash.as_deref().unwrap_or_else(file)

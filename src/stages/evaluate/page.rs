@@ -4,14 +4,15 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use anyhow::bail;
 
-use super::rows::{self, Rows};
+use super::rows::{self, EvaluationRows};
 use super::splits::{ALL, SPLITS, telling};
 use super::{Evaluand, motions};
 use crate::evaluation::interval::{holm, paired_difference};
 use crate::motion::Trajectory;
 use crate::plot::{self, Format, MOTION_WIDTH_PX, MotionPanel, MotionPlot};
 use crate::report::{
-    self, Against, CheckLine, Metric, Outcome, Paired, Report, Verdict, VerdictTest, Worst,
+    self, CheckLine, ComparedRun, Metric, Outcome, PairedNumber, Report, Verdict, VerdictTest,
+    WorstMotion,
 };
 use crate::store::tables::{GenerationRow, MetricRow, SanityCheckRow, SongMetricRow, VerdictRow};
 use crate::store::{Location, StoreSnapshot};
@@ -19,7 +20,7 @@ use crate::training::TemporalConfig;
 use crate::units::frames_to_s;
 
 /// Another run that was evaluated.
-pub struct Other {
+pub struct OtherRun {
     run: String,
     metrics: Vec<MetricRow>,
     songs: Vec<SongMetricRow>,
@@ -27,7 +28,7 @@ pub struct Other {
     made: Option<GenerationRow>,
 }
 
-impl Other {
+impl OtherRun {
     /// Reads the numbers of a run.
     ///
     /// # Errors
@@ -49,12 +50,12 @@ impl Other {
     }
 }
 
-/// What a report tells of.
+/// The evaluation that a report presents.
 pub struct Page<'a> {
     pub store: &'a Location,
     pub subject: &'a Evaluand,
-    pub found: &'a Rows,
-    pub against: Option<&'a Other>,
+    pub found: &'a EvaluationRows,
+    pub against: Option<&'a OtherRun>,
     pub data_hash: &'a str,
 }
 
@@ -90,11 +91,11 @@ impl Page<'_> {
     }
 
     /// Compares the run with another one.
-    fn compared(&self, other: &Other) -> Against {
+    fn compared(&self, other: &OtherRun) -> ComparedRun {
         let here = self.subject.generations.first().map(settings);
         let there = other.made.as_ref().map(settings);
         let pairs = there.into_iter().flatten().zip(here.into_iter().flatten());
-        Against {
+        ComparedRun {
             run: other.run.clone(),
             metrics: shown(&other.metrics),
             paired: paired(&other.songs, &self.found.songs),
@@ -148,8 +149,8 @@ impl Page<'_> {
         notes
     }
 
-    /// Returns the motions that fail the most checks; of equals those with the lowest score.
-    fn worst(&self, n: usize) -> anyhow::Result<Vec<Worst>> {
+    /// Returns the motions that fail the most checks; among equal counts those with the lowest score.
+    fn worst(&self, n: usize) -> anyhow::Result<Vec<WorstMotion>> {
         let mut failed: BTreeMap<(&str, i32), Vec<&SanityCheckRow>> = BTreeMap::new();
         let is_final = |row: &&SanityCheckRow| row.stage.as_deref() != Some("raw");
         for row in self.found.checks.iter().filter(is_final).filter(|row| !row.passed) {
@@ -172,7 +173,7 @@ impl Page<'_> {
         &self,
         i: usize,
         failed: &BTreeMap<(&str, i32), Vec<&SanityCheckRow>>,
-    ) -> anyhow::Result<Worst> {
+    ) -> anyhow::Result<WorstMotion> {
         let looked_at = &self.subject.motions[i];
         let phrase_id = looked_at.phrase_id.as_str();
         let motion = Trajectory::new(self.subject.frames(self.store, i)?)?;
@@ -192,7 +193,7 @@ impl Page<'_> {
             facts.extend(row.score.map(|score| ("score".to_owned(), format!("{score:.3}"))));
             facts.push(("seed".to_owned(), (row.seed as u64).to_string()));
         }
-        Ok(Worst {
+        Ok(WorstMotion {
             facts,
             failed: messages.into_iter().flatten().map(|row| row.message.clone()).collect(),
             svg: String::from_utf8_lossy(&picture.bytes).into_owned(),
@@ -245,15 +246,15 @@ fn verdicts(rows: &[VerdictRow]) -> Vec<Verdict> {
 }
 
 /// Pairs the numbers of songs that both runs have, and adjusts the probabilities for their number.
-fn paired(there: &[SongMetricRow], here: &[SongMetricRow]) -> Vec<Paired> {
+fn paired(there: &[SongMetricRow], here: &[SongMetricRow]) -> Vec<PairedNumber> {
     let key =
         |row: &SongMetricRow| [&row.metric, &row.variant, &row.split, &row.song].map(String::clone);
     let known: BTreeMap<[String; 4], f64> = there.iter().map(|row| (key(row), row.value)).collect();
     let mut pairs: BTreeMap<[String; 3], Vec<f64>> = BTreeMap::new();
     for row in here {
         let [metric, variant, split, song] = key(row);
-        let of_song = [metric.clone(), variant.clone(), split.clone(), song];
-        if let Some(other) = known.get(&of_song) {
+        let key_of_song = [metric.clone(), variant.clone(), split.clone(), song];
+        if let Some(other) = known.get(&key_of_song) {
             pairs.entry([metric, variant, split]).or_default().push(row.value - other);
         }
     }
@@ -267,7 +268,7 @@ fn paired(there: &[SongMetricRow], here: &[SongMetricRow]) -> Vec<Paired> {
         .into_iter()
         .filter_map(|([metric, variant, split], pair)| {
             let p_holm = pair.p_either().and_then(|_| adjusted.next());
-            Some(Paired {
+            Some(PairedNumber {
                 metric,
                 variant,
                 split,
@@ -281,7 +282,7 @@ fn paired(there: &[SongMetricRow], here: &[SongMetricRow]) -> Vec<Paired> {
         .collect()
 }
 
-/// What determines the motions of a run.
+/// Returns the settings that determine the motions of a run.
 fn settings(row: &GenerationRow) -> [(&'static str, String); 7] {
     [
         ("model", row.model.clone()),
@@ -344,7 +345,7 @@ impl Badness {
 
 /// Returns the rows as a report takes them.
 fn shown(rows: &[MetricRow]) -> Vec<Metric> {
-    let of = |row: &MetricRow| Metric {
+    let to_metric = |row: &MetricRow| Metric {
         subject: row.subject.clone(),
         split: row.split.clone(),
         metric: row.metric.clone(),
@@ -357,7 +358,7 @@ fn shown(rows: &[MetricRow]) -> Vec<Metric> {
         protocol: row.protocol.clone(),
         better: report::better(&row.metric),
     };
-    rows.iter().map(of).collect()
+    rows.iter().map(to_metric).collect()
 }
 
 #[cfg(test)]
@@ -398,12 +399,16 @@ mod tests {
             .into_iter()
             .map(|line| (line.check, line.n_passed, line.n, line.worst_message))
             .collect();
-        let of = |check: &str, n_passed, n, message: &str| {
+        let summary = |check: &str, n_passed, n, message: &str| {
             (check.to_owned(), n_passed, n, message.to_owned())
         };
         assert_eq!(
             told,
-            [of("a", 3, 3, "a Some(0.9)"), of("b", 2, 4, "b Some(4.0)"), of("c", 0, 2, "c None"),]
+            [
+                summary("a", 3, 3, "a Some(0.9)"),
+                summary("b", 2, 4, "b Some(4.0)"),
+                summary("c", 0, 2, "c None"),
+            ]
         );
         assert!(lines(&rows)[2].worst_value.is_nan());
     }

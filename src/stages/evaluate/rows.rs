@@ -1,7 +1,7 @@
 //! What was found, as rows of tables, and the tables' commits.
 
-use super::foreign::Refused;
-use super::job::{Found, Stage as MadeAt};
+use super::foreign::RefusedFile;
+use super::job::{EvaluationFindings, MotionStage};
 use super::{CHECKS, Evaluate};
 use crate::evaluation::{Check, CheckSet};
 use crate::stages::Stage as _;
@@ -16,16 +16,16 @@ const ITEMS_FROM: &str = "generations";
 /// The names under which checks and numbers are committed.
 pub const STAGES: [&str; 2] = [CHECKS, Evaluate::NAME];
 
-/// What an evaluation found, as rows.
+/// The results of an evaluation, as rows.
 #[derive(Clone, Debug, Default)]
-pub struct Rows {
+pub struct EvaluationRows {
     pub checks: Vec<SanityCheckRow>,
     pub metrics: Vec<MetricRow>,
     pub verdicts: Vec<VerdictRow>,
     pub songs: Vec<SongMetricRow>,
 }
 
-/// Whose rows they are.
+/// The run and evaluation that rows belong to.
 #[derive(Clone, Copy, Debug)]
 pub struct RunName<'a> {
     pub run: &'a str,
@@ -45,7 +45,7 @@ pub fn checks<'a>(
     name: RunName<'a>,
     phrase_id: &'a str,
     sample: i32,
-    stage: MadeAt,
+    stage: MotionStage,
     checks: &'a [Check],
     holds: &'a dyn Fn(&str) -> bool,
 ) -> impl Iterator<Item = SanityCheckRow> + 'a {
@@ -65,9 +65,14 @@ pub fn checks<'a>(
     })
 }
 
-impl Rows {
+impl EvaluationRows {
     /// Adds numbers, those of songs, and verdicts.
-    pub fn add(&mut self, name: RunName, found: Found, song_name: &dyn Fn(usize) -> String) {
+    pub fn add(
+        &mut self,
+        name: RunName,
+        found: EvaluationFindings,
+        song_name: &dyn Fn(usize) -> String,
+    ) {
         let time = TimestampUs::now();
         for finding in &found.findings {
             for number in &finding.numbers {
@@ -171,8 +176,8 @@ pub fn songs_of(store: &Location, run: &str) -> Result<Vec<SongMetricRow>, Store
     Snapshot::take(store, SongMetricRow::schema())?.rows_where(|row: &SongMetricRow| row.run == run)
 }
 
-/// What the tables of a store know of a run.
-pub struct Known<'a> {
+/// What identifies an evaluation of a run in the tables of a store.
+pub struct RunIdentity<'a> {
     pub store: &'a Location,
     pub run: &'a str,
     pub params_hash: &'a str,
@@ -182,7 +187,7 @@ pub struct Known<'a> {
     pub input_hash: &'a str,
 }
 
-impl Known<'_> {
+impl RunIdentity<'_> {
     /// Returns whether a part of the evaluation was done with the same settings on the same motions.
     ///
     /// # Errors
@@ -201,10 +206,14 @@ impl Known<'_> {
     ///
     /// # Errors
     /// [`StoreError`].
-    pub fn commit_checks(&self, rows: &Rows, refused: &[Refused]) -> Result<(), StoreError> {
+    pub fn commit_checks(
+        &self,
+        rows: &EvaluationRows,
+        refused: &[RefusedFile],
+    ) -> Result<(), StoreError> {
         self.commit(CHECKS, |commit, ledger| {
             write(commit, &rows.checks)?;
-            let item = |refused: &Refused| format!("{}/{}", self.run, refused.name);
+            let item = |refused: &RefusedFile| format!("{}/{}", self.run, refused.name);
             let mut failures: Vec<FailureRow> = Vec::new();
             for refused in refused {
                 let failure = Some(refused.failure.digest());
@@ -237,7 +246,7 @@ impl Known<'_> {
     ///
     /// # Errors
     /// [`StoreError`].
-    pub fn commit_numbers(&self, rows: &Rows) -> Result<(), StoreError> {
+    pub fn commit_numbers(&self, rows: &EvaluationRows) -> Result<(), StoreError> {
         self.commit(Evaluate::NAME, |commit, _| {
             write(commit, &rows.metrics)?;
             write(commit, &rows.verdicts)?;

@@ -46,7 +46,7 @@ impl Evaluand {
         let settings = RunSettings::of_run(row, &model.card)?;
         let length = self.window_frames(truth);
         let windows = self.music_windows(split, length, most)?;
-        let request = baselines::Request {
+        let request = baselines::BaselineRequest {
             store,
             model: &model,
             settings: &settings,
@@ -76,8 +76,9 @@ impl Evaluand {
         length: usize,
         most: usize,
     ) -> Result<Vec<MusicWindow>, StoreError> {
-        let of_split = self.motions.iter().filter(|motion| motion.split == split);
-        let ids: BTreeSet<&str> = of_split.map(|motion| motion.phrase_id.as_str()).collect();
+        let motions_in_split = self.motions.iter().filter(|motion| motion.split == split);
+        let ids: BTreeSet<&str> =
+            motions_in_split.map(|motion| motion.phrase_id.as_str()).collect();
         let mut order: Vec<&str> = ids.into_iter().collect();
         order.sort_by_cached_key(|id| digest(id.as_bytes()));
         order.truncate(most);

@@ -9,8 +9,7 @@ pub const ALL: &str = "all";
 pub const SPLITS: [MusicSplit; 4] =
     [MusicSplit::HeldOut, MusicSplit::Validation, MusicSplit::TrainedOn, MusicSplit::Unknown];
 
-/// Returns the split that tells most of those that are there: what was held out, else what nobody knows of, else what
-/// checkpoints were chosen by, else what was learned from.
+/// Returns the most telling of the given splits: held out, else unknown, else validation, else trained on.
 pub fn telling(splits: impl IntoIterator<Item = MusicSplit>) -> Option<MusicSplit> {
     splits.into_iter().min_by_key(|split| match split {
         MusicSplit::HeldOut => 0,

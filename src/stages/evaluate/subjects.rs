@@ -8,11 +8,11 @@ use ndarray::Array2;
 
 use super::measure::kept_frames;
 use super::splits::{ALL, MusicSplit};
-use crate::evaluation::Measured;
+use crate::evaluation::WindowMeasures;
 use crate::evaluation::coupling::Coupling;
 use crate::evaluation::metrics::{
-    Danced, MotionContext, Music, MusicContext, MusicWindow, N_WRONG_TEMPI, Number, PhaseOrigin,
-    channel_numbers, motion_numbers, music_numbers, phase_numbers, shifted_numbers,
+    MotionContext, MotionWindow, Music, MusicContext, MusicWindow, N_WRONG_TEMPI, Number,
+    PhaseOrigin, channel_numbers, motion_numbers, music_numbers, phase_numbers, shifted_numbers,
     soundness_numbers,
 };
 use crate::evaluation::reference_statistics::ReferenceStatistics;
@@ -20,7 +20,7 @@ use crate::evaluation::reference_statistics::ReferenceStatistics;
 /// Other songs whose music a motion is held against.
 const MAX_OTHER_SONGS: usize = 8;
 
-/// Whose numbers they are.
+/// The motions or baseline that numbers were measured on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Subject {
     Generated,
@@ -66,31 +66,31 @@ pub struct Finding {
 
 /// A window of motion with what is needed to measure a set of them.
 #[derive(Clone, Debug)]
-pub struct Item {
+pub struct MeasuredWindow {
     /// Number of the song; windows of one song are no independent ones.
     pub song: usize,
     /// Number of the phrase that it was danced to.
     pub phrase: usize,
     pub first_frame: usize,
     pub split: MusicSplit,
-    pub measured: Arc<Measured>,
+    pub measured: Arc<WindowMeasures>,
     /// The same window as it was decoded; none where that is not known.
-    pub decoded: Option<Arc<Measured>>,
+    pub decoded: Option<Arc<WindowMeasures>>,
     pub music: Option<Arc<Music>>,
 }
 
-impl Item {
+impl MeasuredWindow {
     fn music(&self) -> Option<MusicWindow<'_>> {
         self.music.as_ref()?.window(self.first_frame, self.measured.n_frames)
     }
 
     /// Returns the window with its music.
-    pub fn as_danced(&self) -> Danced<'_> {
+    pub fn as_danced(&self) -> MotionWindow<'_> {
         self.danced(&self.measured)
     }
 
-    fn danced<'a>(&'a self, measured: &'a Measured) -> Danced<'a> {
-        Danced {
+    fn danced<'a>(&'a self, measured: &'a WindowMeasures) -> MotionWindow<'a> {
+        MotionWindow {
             song: self.song,
             phrase: self.phrase,
             first_frame: self.first_frame,
@@ -102,7 +102,7 @@ impl Item {
 
 /// How sets of windows are measured.
 #[derive(Clone, Copy)]
-pub struct Meter<'a> {
+pub struct MeasureSettings<'a> {
     pub reference: Option<&'a ReferenceStatistics>,
     pub coupling: Option<&'a Coupling>,
     /// Windows that a Fréchet distance is made of, the same for all subjects.
@@ -110,10 +110,16 @@ pub struct Meter<'a> {
     pub threads: NonZeroUsize,
 }
 
-impl Meter<'_> {
+impl MeasureSettings<'_> {
     /// Measures a set of windows.
-    pub fn numbers(&self, split: &str, items: &[&Item], phase: PhaseOrigin) -> Vec<Number> {
-        let danced: Vec<Danced> = items.iter().map(|item| item.danced(&item.measured)).collect();
+    pub fn numbers(
+        &self,
+        split: &str,
+        items: &[&MeasuredWindow],
+        phase: PhaseOrigin,
+    ) -> Vec<Number> {
+        let danced: Vec<MotionWindow> =
+            items.iter().map(|item| item.danced(&item.measured)).collect();
         // Wrong tempi take most of the time; of all splits together nothing rests on them.
         let n_wrong_tempi = if split == ALL { 0 } else { N_WRONG_TEMPI };
         let mut numbers = music_numbers(&danced, &self.music_context(n_wrong_tempi));
@@ -125,8 +131,8 @@ impl Meter<'_> {
     }
 
     /// Measures how sound windows were as they were decoded; nothing where that is not known.
-    pub fn decoded(&self, items: &[&Item], phase: PhaseOrigin) -> Vec<Number> {
-        let danced: Vec<Danced> = items
+    pub fn decoded(&self, items: &[&MeasuredWindow], phase: PhaseOrigin) -> Vec<Number> {
+        let danced: Vec<MotionWindow> = items
             .iter()
             .filter_map(|item| item.decoded.as_ref().map(|measured| item.danced(measured)))
             .collect();
@@ -144,7 +150,7 @@ impl Meter<'_> {
     /// Measures windows with the music of other songs.
     ///
     /// The coupling is that with up to eight other songs; all else is with the next song. Nothing for a single song.
-    pub fn shuffled(&self, items: &[&Item]) -> Vec<Number> {
+    pub fn shuffled(&self, items: &[&MeasuredWindow]) -> Vec<Number> {
         let mut songs: BTreeMap<usize, &Arc<Music>> = BTreeMap::new();
         for item in items {
             if let Some(music) = &item.music {
@@ -159,23 +165,24 @@ impl Meter<'_> {
         if numbers.len() < 2 {
             return Vec::new();
         }
-        let other = |item: &Item, step: usize| -> Option<&Music> {
+        let other = |item: &MeasuredWindow, step: usize| -> Option<&Music> {
             let place = numbers.iter().position(|song| *song == item.song)?;
             songs.get(&numbers[(place + step) % numbers.len()]).map(|music| &***music)
         };
-        fn danced_to<'a>(item: &'a Item, music: Option<&'a Music>) -> Danced<'a> {
+        fn danced_to<'a>(item: &'a MeasuredWindow, music: Option<&'a Music>) -> MotionWindow<'a> {
             let n = item.measured.n_frames;
             let music = music.filter(|_| item.music.is_some()).and_then(|music| {
                 // Music that is shorter begins again.
                 let n_starts = (music.bars.len() + 1).checked_sub(n).filter(|n| *n > 0)?;
                 music.window(item.first_frame % n_starts, n)
             });
-            Danced { music, ..item.danced(&item.measured) }
+            MotionWindow { music, ..item.danced(&item.measured) }
         }
-        let next: Vec<Danced> = items.iter().map(|item| danced_to(item, other(item, 1))).collect();
+        let next: Vec<MotionWindow> =
+            items.iter().map(|item| danced_to(item, other(item, 1))).collect();
         let mut found = music_numbers(&next, &self.music_context(0));
         let steps = 1..=MAX_OTHER_SONGS.min(numbers.len() - 1);
-        let all: Vec<Danced> = items
+        let all: Vec<MotionWindow> = items
             .iter()
             .flat_map(|item| steps.clone().map(move |step| danced_to(item, other(item, step))))
             .collect();
@@ -187,8 +194,9 @@ impl Meter<'_> {
     }
 
     /// Measures windows with their bars shifted by beats; nothing where no coupling is known.
-    pub fn shifted(&self, items: &[&Item]) -> Vec<Number> {
-        let danced: Vec<Danced> = items.iter().map(|item| item.danced(&item.measured)).collect();
+    pub fn shifted(&self, items: &[&MeasuredWindow]) -> Vec<Number> {
+        let danced: Vec<MotionWindow> =
+            items.iter().map(|item| item.danced(&item.measured)).collect();
         self.coupling.map_or_else(Vec::new, |coupling| shifted_numbers(&danced, coupling))
     }
 
@@ -197,7 +205,7 @@ impl Meter<'_> {
     }
 }
 
-/// What is added to the variants of numbers of motion as it was decoded.
+/// The suffix of variants of numbers of motion as it was decoded.
 pub const DECODED: &str = "raw";
 
 /// Compares the values of channels with those of the training split.

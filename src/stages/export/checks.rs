@@ -7,7 +7,7 @@ use anyhow::Context as _;
 use ndarray::{Array3, ArrayView3, Axis, s};
 
 use super::Params;
-use super::files::Files;
+use super::files::ExportedFiles;
 use crate::autodiff::{Parameters, Stream};
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
 use crate::generation::{
@@ -17,7 +17,7 @@ use crate::model::{MotionDecoder, Parameter, ParameterList, UNet1D, condition};
 use crate::motion::MOTION_DIM;
 use crate::onnx::{Device, Model, Runtime, Storage, values_of};
 use crate::stages::Progress;
-use crate::stages::trained::Trained;
+use crate::stages::trained::TrainedRun;
 use crate::store::tables::OnnxCheckRow;
 use crate::store::{TimestampUs, write_file};
 use crate::training::Dataset;
@@ -40,15 +40,15 @@ const DERIVED_TOLERANCE: f64 = 1e-2;
 /// Rounded weights: the rms that a whole sample may move, in units of the data's spread.
 const ROUNDING_TOLERANCE: f64 = 0.05;
 
-/// What is checked.
+/// The trained networks and exported files to compare.
 pub struct Checking<'a> {
     pub dataset: &'a Dataset,
     pub params: &'a Params,
-    pub trained: &'a Trained,
-    pub files: &'a Files,
+    pub trained: &'a TrainedRun,
+    pub files: &'a ExportedFiles,
 }
 
-/// What came of it.
+/// The results of the checks.
 pub struct CheckResults {
     pub rows: Vec<OnnxCheckRow>,
     pub runtime: String,
@@ -99,7 +99,7 @@ impl Checking<'_> {
         let decoder = path(file_names::DECODER);
         let onnx = OnnxEngine::open(runtime, (&unet, false), &decoder, &network.unet, plan)?;
         // What the files hold, which rounding has changed.
-        let of_files = (
+        let stored_weights = (
             self.read_back(
                 file_names::UNET,
                 file_names::UNET_WEIGHTS,
@@ -113,7 +113,7 @@ impl Checking<'_> {
         );
         let threads = machine.threads;
         let eager_of = |weights| eager(self.trained, weights, threads);
-        let of_files = eager_of(of_files)?;
+        let stored_weights = eager_of(stored_weights)?;
         let music = self.music()?;
         let schedule = Schedule::new(&network.diffusion)?;
         let window = network.window_frames;
@@ -123,7 +123,7 @@ impl Checking<'_> {
         progress.start("check", "checks", cases.len() as u64 + 3 + u64::from(is_rounded));
         let mut rows = Vec::new();
         for case in &cases {
-            rows.push(self.forward(&onnx, &of_files, &music, case, schedule.len())?);
+            rows.push(self.forward(&onnx, &stored_weights, &music, case, schedule.len())?);
             progress.advance(1);
         }
         let case = Case { n_samples: 2, n_frames: window };
@@ -134,19 +134,20 @@ impl Checking<'_> {
             clip: true,
         };
         let asked = |guidance| Sampling { config: &config, schedule: &schedule, guidance };
-        let (row, latent) = self.sampled("sample", &onnx, &of_files, &music, &case, asked(1.0))?;
+        let (row, latent) =
+            self.sampled("sample", &onnx, &stored_weights, &music, &case, asked(1.0))?;
         rows.push(row);
         progress.advance(1);
-        rows.push(self.decoded(&onnx, &of_files, latent.view())?);
+        rows.push(self.decoded(&onnx, &stored_weights, latent.view())?);
         progress.advance(1);
         let guided = asked(GUIDANCE);
-        rows.push(self.sampled("guided_sample", &onnx, &of_files, &music, &case, guided)?.0);
+        rows.push(self.sampled("guided_sample", &onnx, &stored_weights, &music, &case, guided)?.0);
         progress.advance(1);
         if is_rounded {
-            let Trained { unet, decoder, .. } = self.trained;
+            let TrainedRun { unet, decoder, .. } = self.trained;
             let trained = eager_of((unet.parameters.clone(), decoder.parameters.clone()))?;
             let (row, _) =
-                self.sampled(ROUNDING, &trained, &of_files, &music, &case, asked(1.0))?;
+                self.sampled(ROUNDING, &trained, &stored_weights, &music, &case, asked(1.0))?;
             rows.push(OnnxCheckRow { onnx_s: None, ..row });
             progress.advance(1);
         }
@@ -317,7 +318,7 @@ impl Checking<'_> {
 
 /// Makes the engine of our own interpreter for a run's networks, with weights of UNet and decoder.
 pub fn eager(
-    trained: &Trained,
+    trained: &TrainedRun,
     (unet, decoder): (Parameters<f32>, Parameters<f32>),
     n_threads: NonZeroUsize,
 ) -> anyhow::Result<EagerEngine> {

@@ -14,26 +14,26 @@ use crate::generation::{
 };
 use crate::model::ParameterId;
 use crate::motion::rates::MotionRange;
-use crate::onnx::{Encoded, Form, Model, ModelFile, OnnxError, check, decoder, unet};
+use crate::onnx::{EncodedModel, Form, Model, ModelFile, OnnxError, check, decoder, unet};
 use crate::stages::model_files::sha256;
-use crate::stages::trained::Trained;
+use crate::stages::trained::TrainedRun;
 use crate::units::FPS;
 
 /// A model that is not yet anywhere.
-pub struct Files {
+pub struct ExportedFiles {
     pub card: ModelCard,
     pub card_text: Bytes,
     /// Name and content, in the order in which they are written.
     pub bytes: Vec<(ModelFileName, Bytes)>,
 }
 
-impl Files {
+impl ExportedFiles {
     /// Writes the networks of a run down, and checks them against the rules of the format.
     ///
     /// # Errors
     /// A network that cannot be written, or one that breaks a rule.
     pub fn make(
-        trained: &Trained,
+        trained: &TrainedRun,
         params: &Params,
         (range, sampling): (Option<MotionRange>, Option<SamplingDefaults>),
         learned_from: Option<LearnedFrom>,
@@ -42,15 +42,15 @@ impl Files {
         let scales = &trained.state.scales;
         let storage = params.precision;
         let schedule = Schedule::new(&config.diffusion)?;
-        let of_unet = |id: ParameterId| trained.unet.parameters.unpacked(id);
-        let of_decoder = |id: ParameterId| trained.decoder.parameters.unpacked(id);
+        let unet_weights = |id: ParameterId| trained.unet.parameters.unpacked(id);
+        let decoder_weights = |id: ParameterId| trained.decoder.parameters.unpacked(id);
         let weights_sha256 = Networks {
             unet: weights_sha256(&trained.unet.parameters),
             decoder: weights_sha256(&trained.decoder.parameters),
         };
         let graphs = [
-            unet(&config.unet, &of_unet, &scales.features, Form::default(), storage)?,
-            decoder(&config.decoder, &of_decoder, storage)?,
+            unet(&config.unet, &unet_weights, &scales.features, Form::default(), storage)?,
+            decoder(&config.decoder, &decoder_weights, storage)?,
         ];
         let mut card = ModelCard {
             format: MODEL_FORMAT,
@@ -98,7 +98,7 @@ impl Files {
             let description = format!("{} of {}, by {}", graph.name, card.name, card.program);
             let file = ModelFile { graph, metadata, description };
             let embedded = params.embed_mb.saturating_mul(1_000_000);
-            let Encoded { model, weights } = file.encode(weights_name.name(), embedded);
+            let EncodedModel { model, weights } = file.encode(weights_name.name(), embedded);
             let read = Model::read(model.clone(), weights.as_ref(), name.name())?;
             check(&read, name.name())
                 .map_err(|e: OnnxError| anyhow::anyhow!("{e}; please report this"))?;

@@ -10,19 +10,20 @@ use std::path::PathBuf;
 use anyhow::{bail, ensure};
 
 use self::checks::{CheckResults, Checking, eager};
-use self::files::Files;
-use self::report::{Planned, Report};
+use self::files::ExportedFiles;
+use self::report::{ExportDryRun, ExportSummary};
 use super::learned;
 use super::model_files::{POINTER, current_folder, folder_of, is_model_name, pointer_to, sha256};
-use super::train::session::{Looker, MachineParams, check_run_name, read_phrases};
-use super::trained::{Stand, Trained};
+use super::train::session::{MachineParams, ProgressWatch, check_run_name, read_phrases};
+use super::trained::{TrainedRun, WeightsChoice};
 use super::{ClientParams, Contract, Progress, Stage, Summary, lease};
 use crate::generation::file_names;
 use crate::motion::rates::MotionRange;
 use crate::onnx::{Runtime, Storage};
 use crate::store::tables::OnnxCheckRow;
 use crate::store::{
-    Commit, Item, Ledger, Listed, Location, Row as _, StoreError, TimestampUs, checkpoint, digest,
+    Commit, Item, Ledger, ListedObject, Location, Row as _, StoreError, TimestampUs, checkpoint,
+    digest,
 };
 use crate::training::{Dataset, Split};
 
@@ -45,8 +46,8 @@ pub struct Params {
     #[arg(long, value_name = "NAME")]
     pub model: String,
     /// Which weights of the run.
-    #[arg(long, value_enum, default_value_t = Stand::Latest)]
-    pub weights: Stand,
+    #[arg(long, value_enum, default_value_t = WeightsChoice::Latest)]
+    pub weights: WeightsChoice,
     /// How weights are stored; computing is always in fp32.
     #[arg(long, value_enum, default_value_t = Storage::Fp32)]
     pub precision: Storage,
@@ -88,9 +89,9 @@ impl Stage for Export {
         check_run_name(&params.run)?;
         check_model_name(&params.model)?;
         let store = Location::open(&params.store, &params.client.options())?;
-        let mut trained = Trained::read(&store, &params.run, params.weights)?;
+        let mut trained = TrainedRun::read(&store, &params.run, params.weights)?;
         let machine = &params.machine;
-        let watch = Looker(progress);
+        let watch = ProgressWatch(progress);
         let (most, is_dry_run) = (Some(MAX_TRAIN_PHRASES), params.dry_run);
         let phrases =
             read_phrases(&store, Self::NAME, machine, most, progress, &watch, is_dry_run)?;
@@ -114,15 +115,15 @@ impl Stage for Export {
             .filter(|_| !params.no_fusion)
             .map(|sampling| sampling.fusion_variances);
         let measured = (motion_range(&phrases.dataset)?, sampling);
-        let files = Files::make(&trained, &params, measured, learned_from)?;
+        let files = ExportedFiles::make(&trained, &params, measured, learned_from)?;
         if params.dry_run {
-            return Ok(Box::new(Planned::new(&params, &files, &store)));
+            return Ok(Box::new(ExportDryRun::new(&params, &files, &store)));
         }
         let (folder, what) = (folder_of(&params.model), format!("model {}", params.model));
         let (lease, _) = lease::take(&store, &folder, &what, &|text| progress.note(text))?;
         match store.read_if_there(&card_path(&store, &params.model)?)? {
             Some(there) if there == files.card_text => {
-                return Ok(Box::new(Report::up_to_date(&params, &store, &files)));
+                return Ok(Box::new(ExportSummary::up_to_date(&params, &store, &files)));
             }
             Some(_) if !params.force => bail!(
                 "store {store} has a model \"{}\" of other weights or settings; give another --model name, \
@@ -158,7 +159,7 @@ impl Stage for Export {
         }
         lease.check()?;
         publish(&store, &params.model, &files)?;
-        Ok(Box::new(Report::written(&params, &store, &files, results)))
+        Ok(Box::new(ExportSummary::written(&params, &store, &files, results)))
     }
 }
 
@@ -186,7 +187,7 @@ fn card_path(store: &Location, model: &str) -> Result<String, StoreError> {
 
 /// Puts the files in place. A model that is there is replaced by a folder of its own and, once that is whole, by one
 /// pointer: at any moment there is the old model or the new one. Its card comes last, without which there is none.
-fn publish(store: &Location, model: &str, files: &Files) -> Result<(), StoreError> {
+fn publish(store: &Location, model: &str, files: &ExportedFiles) -> Result<(), StoreError> {
     let folder = folder_of(model);
     let before = current_folder(store, &folder)?;
     let is_there = store.read_if_there(&format!("{before}/{}", file_names::CARD))?.is_some();
@@ -194,7 +195,7 @@ fn publish(store: &Location, model: &str, files: &Files) -> Result<(), StoreErro
     let into = if is_there { format!("{folder}/{version}") } else { folder.clone() };
     let is_within =
         |path: &str, folder: &str| path.strip_prefix(folder).is_some_and(|p| p.starts_with('/'));
-    // What an export that was killed left behind.
+    // Files that an export that was killed left behind.
     for listed in store.list(&into)?.into_iter().filter(|_| into != before || !is_there) {
         store.remove(&listed.path)?;
     }
@@ -207,8 +208,8 @@ fn publish(store: &Location, model: &str, files: &Files) -> Result<(), StoreErro
     }
     let pointer_path = format!("{folder}/{POINTER}");
     store.replace(&pointer_path, pointer)?;
-    // The model before this one stays where it has a folder, for those who are reading it.
-    for Listed { path, .. } in store.list(&folder)? {
+    // The model before this one stays where it has a folder, for programs that are reading it.
+    for ListedObject { path, .. } in store.list(&folder)? {
         let is_kept = path == pointer_path
             || is_within(&path, &into)
             || (before != folder && is_within(&path, &before));
@@ -223,7 +224,7 @@ fn publish(store: &Location, model: &str, files: &Files) -> Result<(), StoreErro
 fn record(
     store: &Location,
     params: &Params,
-    files: &Files,
+    files: &ExportedFiles,
     results: &CheckResults,
 ) -> Result<(), StoreError> {
     let ledger = Ledger::read(store, Export::NAME)?;
@@ -249,7 +250,7 @@ mod tests {
     const NAMES: [&str; 2] = [file_names::UNET, file_names::DECODER];
 
     /// Files of a model that all say `version`.
-    fn files(version: usize) -> Files {
+    fn files(version: usize) -> ExportedFiles {
         let card = pretrained::file(file_names::CARD).expect("the model that ships");
         let card = ModelCard::read(&card, "card").expect("a card");
         let text = |name: &str| format!("{name} of {version}").into();
@@ -258,7 +259,7 @@ mod tests {
             (file, text(name))
         };
         let bytes = NAMES.iter().map(named).collect();
-        Files { card, card_text: text(file_names::CARD), bytes }
+        ExportedFiles { card, card_text: text(file_names::CARD), bytes }
     }
 
     /// Returns which version a reader finds; none where a file is gone.

@@ -6,7 +6,7 @@ use serde_json::json;
 
 use super::Params;
 use super::checks::{CheckResults, ROUNDING};
-use super::files::Files;
+use super::files::ExportedFiles;
 use crate::generation::ModelCard;
 use crate::stages::Summary;
 use crate::stages::model_files::folder_of;
@@ -14,18 +14,18 @@ use crate::store::Location;
 use crate::store::tables::OnnxCheckRow;
 
 /// The account of an export.
-pub struct Report {
+pub struct ExportSummary {
     card: ModelCard,
     place: String,
     checks: Vec<OnnxCheckRow>,
     is_up_to_date: bool,
 }
 
-impl Report {
+impl ExportSummary {
     pub fn written(
         params: &Params,
         store: &Location,
-        files: &Files,
+        files: &ExportedFiles,
         results: CheckResults,
     ) -> Self {
         Self {
@@ -36,13 +36,13 @@ impl Report {
     }
 
     /// A model that is there already, made of the same weights in the same way.
-    pub fn up_to_date(params: &Params, store: &Location, files: &Files) -> Self {
+    pub fn up_to_date(params: &Params, store: &Location, files: &ExportedFiles) -> Self {
         let place = store.url_of(&folder_of(&params.model));
         Self { card: files.card.clone(), place, checks: Vec::new(), is_up_to_date: true }
     }
 }
 
-impl Summary for Report {
+impl Summary for ExportSummary {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
         let Self { card, place, checks, is_up_to_date } = self;
         if !checks.is_empty() {
@@ -117,19 +117,19 @@ fn of_card(card: &ModelCard, place: &str) -> serde_json::Value {
     })
 }
 
-/// What `--dry-run` says.
-pub struct Planned {
+/// The summary of a dry run.
+pub struct ExportDryRun {
     place: String,
     card: ModelCard,
 }
 
-impl Planned {
-    pub fn new(params: &Params, files: &Files, store: &Location) -> Self {
+impl ExportDryRun {
+    pub fn new(params: &Params, files: &ExportedFiles, store: &Location) -> Self {
         Self { place: store.url_of(&folder_of(&params.model)), card: files.card.clone() }
     }
 }
 
-impl Summary for Planned {
+impl Summary for ExportDryRun {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
         let sizes: Vec<String> = self
             .card

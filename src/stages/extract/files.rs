@@ -6,9 +6,9 @@ use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
-use super::one::{Extracted, Origin, extract, needed_bytes};
+use super::one::{ExtractedFeatures, Origin, extract, needed_bytes};
 use super::pool::{self, Budget, lock};
-use super::{Done, Job};
+use super::{ExtractJob, ExtractTally};
 use crate::audio::FEATURE_DIM;
 use crate::audio::header::read_header_from;
 use crate::motion::npz::NpzWriter;
@@ -25,7 +25,7 @@ const IN_MEMORY_BYTES: u64 = 16 << 20;
 
 /// Where features go.
 #[derive(Debug)]
-enum Output {
+enum FeaturesOutput {
     /// One `NAME.npz` per file in a folder.
     Folder(PathBuf),
     Npz(PathBuf),
@@ -33,7 +33,7 @@ enum Output {
     Parquet(PathBuf),
 }
 
-impl Output {
+impl FeaturesOutput {
     fn of(path: &Path, n_files: usize) -> anyhow::Result<Self> {
         // Standard output, pipes and devices have no extension to go by.
         let is_stream =
@@ -59,7 +59,7 @@ impl Output {
     }
 }
 
-struct Task {
+struct FileTask {
     index: usize,
     name: String,
     path: PathBuf,
@@ -71,24 +71,32 @@ struct Task {
 ///
 /// # Errors
 /// When the output cannot be written, or two files would have one name in it.
-pub fn run(job: &Job<'_>, audio: &[PathBuf], output: &Path) -> anyhow::Result<Done> {
-    let output = Output::of(output, audio.len())?;
+pub fn run(job: &ExtractJob<'_>, audio: &[PathBuf], output: &Path) -> anyhow::Result<ExtractTally> {
+    let output = FeaturesOutput::of(output, audio.len())?;
     let tasks = tasks(audio)?;
     let total_s: f64 = tasks.iter().map(|task| task.duration_s).sum();
     if job.dry_run {
-        return Ok(Done { n_todo: tasks.len() as u64, todo_s: total_s, ..Done::default() });
+        return Ok(ExtractTally {
+            n_todo: tasks.len() as u64,
+            todo_s: total_s,
+            ..ExtractTally::default()
+        });
     }
     let table = match &output {
-        Output::Parquet(path) => Some(Mutex::new(Table::new(path)?)),
-        Output::Folder(folder) => {
+        FeaturesOutput::Parquet(path) => Some(Mutex::new(FeaturesTable::new(path)?)),
+        FeaturesOutput::Folder(folder) => {
             std::fs::create_dir_all(folder)
                 .with_context(|| format!("while making the folder {}", folder.display()))?;
             None
         }
-        Output::Npz(_) => None,
+        FeaturesOutput::Npz(_) => None,
     };
     job.progress.start_audio("extract", total_s.ceil() as u64);
-    let done = Mutex::new(Done { n_todo: tasks.len() as u64, todo_s: total_s, ..Done::default() });
+    let done = Mutex::new(ExtractTally {
+        n_todo: tasks.len() as u64,
+        todo_s: total_s,
+        ..ExtractTally::default()
+    });
     let budget = Budget::new(job.memory_bytes);
     let mut queue = tasks.into_iter();
     pool::run(
@@ -107,11 +115,11 @@ pub fn run(job: &Job<'_>, audio: &[PathBuf], output: &Path) -> anyhow::Result<Do
                 let outcome = extract_file(&task, job);
                 if let Ok(extracted) = &outcome {
                     match &output {
-                        Output::Folder(folder) => {
+                        FeaturesOutput::Folder(folder) => {
                             write_npz(&folder.join(format!("{}.npz", task.name)), extracted)?;
                         }
-                        Output::Npz(path) => write_npz(path, extracted)?,
-                        Output::Parquet(_) => {}
+                        FeaturesOutput::Npz(path) => write_npz(path, extracted)?,
+                        FeaturesOutput::Parquet(_) => {}
                     }
                 }
                 outcome
@@ -132,7 +140,7 @@ pub fn run(job: &Job<'_>, audio: &[PathBuf], output: &Path) -> anyhow::Result<Do
     Ok(done.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner))
 }
 
-fn tasks(audio: &[PathBuf]) -> anyhow::Result<Vec<Task>> {
+fn tasks(audio: &[PathBuf]) -> anyhow::Result<Vec<FileTask>> {
     let mut names: BTreeMap<String, &Path> = BTreeMap::new();
     let mut tasks = Vec::with_capacity(audio.len());
     for (index, path) in audio.iter().enumerate() {
@@ -149,12 +157,12 @@ fn tasks(audio: &[PathBuf]) -> anyhow::Result<Vec<Task>> {
         // Only for the order of things; what is wrong with a file is said when it is decoded.
         let header = File::open(path).ok().and_then(|f| read_header_from(f, extension).ok());
         let duration_s = header.map_or(0.0, |header| header.duration_s);
-        tasks.push(Task { index, name, path: path.clone(), size_bytes, duration_s });
+        tasks.push(FileTask { index, name, path: path.clone(), size_bytes, duration_s });
     }
     Ok(tasks)
 }
 
-fn extract_file(task: &Task, job: &Job<'_>) -> Result<Extracted, Failure> {
+fn extract_file(task: &FileTask, job: &ExtractJob<'_>) -> Result<ExtractedFeatures, Failure> {
     let path = task.path.display().to_string();
     let io = |e| StoreError::Io { action: "read", place: path.clone(), source: e };
     if task.path.is_dir() {
@@ -172,7 +180,7 @@ fn extract_file(task: &Task, job: &Job<'_>) -> Result<Extracted, Failure> {
 }
 
 /// Writes the reference's keys, and what else a reader may want of the file.
-fn write_npz(path: &Path, extracted: &Extracted) -> anyhow::Result<()> {
+fn write_npz(path: &Path, extracted: &ExtractedFeatures) -> anyhow::Result<()> {
     let write = || -> std::io::Result<()> {
         let mut file = temporary_beside(path)?;
         let mut npz = NpzWriter::new(BufWriter::new(file.as_file_mut()));
@@ -194,15 +202,15 @@ fn write_npz(path: &Path, extracted: &Extracted) -> anyhow::Result<()> {
 }
 
 /// A Parquet file of all files' frames, in the order of the command line.
-struct Table {
+struct FeaturesTable {
     path: PathBuf,
     writer: PartWriter,
     /// Files that were done before one that comes earlier.
-    waiting: BTreeMap<usize, (String, Option<Extracted>)>,
+    waiting: BTreeMap<usize, (String, Option<ExtractedFeatures>)>,
     n_written: usize,
 }
 
-impl Table {
+impl FeaturesTable {
     fn new(path: &Path) -> anyhow::Result<Self> {
         let file =
             temporary_beside(path).with_context(|| format!("while writing {}", path.display()))?;
@@ -210,7 +218,12 @@ impl Table {
         Ok(Self { path: path.to_owned(), writer, waiting: BTreeMap::new(), n_written: 0 })
     }
 
-    fn add(&mut self, index: usize, name: &str, done: Option<Extracted>) -> Result<(), StoreError> {
+    fn add(
+        &mut self,
+        index: usize,
+        name: &str,
+        done: Option<ExtractedFeatures>,
+    ) -> Result<(), StoreError> {
         self.waiting.insert(index, (name.to_owned(), done));
         while let Some((name, done)) = self.waiting.remove(&self.n_written) {
             if let Some(extracted) = done {

@@ -15,7 +15,7 @@ use super::{ClientParams, Contract, Progress, Stage, Summary, all_threads};
 use crate::audio::Tuning;
 use crate::store::{Location, Shard, digest};
 
-pub use one::{Extracted, Rules};
+pub use one::{ExtractRules, ExtractedFeatures};
 pub(in crate::stages) use one::{Origin, extract, needed_bytes};
 
 /// Raised when extract writes something else for the same input and parameters.
@@ -67,9 +67,9 @@ pub struct Params {
     pub force: bool,
 }
 
-/// What both ways of running share.
-struct Job<'a> {
-    rules: Rules,
+/// Settings that extraction from a store and from files share.
+struct ExtractJob<'a> {
+    rules: ExtractRules,
     n_workers: NonZeroUsize,
     memory_bytes: u64,
     dry_run: bool,
@@ -94,8 +94,8 @@ impl Stage for Extract {
             Err(anyhow::anyhow!("{flag} {value} is not above 0; give a positive number"))
         };
         let timeout_s = positive("--timeout", params.timeout)?;
-        let job = Job {
-            rules: Rules {
+        let job = ExtractJob {
+            rules: ExtractRules {
                 tuning: params.tuning,
                 max_duration_s: positive("--max-duration", params.max_duration)?,
                 timeout: Duration::try_from_secs_f64(timeout_s).unwrap_or(Duration::MAX),
@@ -109,24 +109,24 @@ impl Stage for Extract {
         let (place, done) = match (&params.store, output) {
             (_, Some(output)) => {
                 let done = files::run(&job, &params.audio, output)?;
-                (Place::Files(output.display().to_string()), done)
+                (ExtractPlace::Files(output.display().to_string()), done)
             }
             (Some(store), None) => {
                 let options = params.client.options();
                 let store = Location::open(store, &options)?;
-                let target = phrases::Target {
+                let target = phrases::StoreTarget {
                     store: &store,
                     options,
                     shard: Shard::parse(&params.shard, |name| std::env::var(name).ok())?,
                     params_hash: &params_hash(params.tuning),
                     force: params.force,
                 };
-                (Place::Store(store.to_string()), phrases::run(&job, &target)?)
+                (ExtractPlace::Store(store.to_string()), phrases::run(&job, &target)?)
             }
             (None, None) => anyhow::bail!("nothing to do: give --store, or --audio with --output"),
         };
         let took_s = started.elapsed().as_secs_f64();
-        Ok(Box::new(Report { place, done, dry_run: params.dry_run, took_s }))
+        Ok(Box::new(ExtractSummary { place, done, dry_run: params.dry_run, took_s }))
     }
 }
 
@@ -137,9 +137,9 @@ fn params_hash(tuning: Option<Tuning>) -> String {
     digest(text.to_string().as_bytes())
 }
 
-/// What became of the files.
+/// Counts of the files that were extracted, unchanged or failed.
 #[derive(Debug, Default)]
-struct Done {
+struct ExtractTally {
     n_todo: u64,
     todo_s: f64,
     n_unchanged: u64,
@@ -158,8 +158,8 @@ struct Done {
     is_stopped: bool,
 }
 
-impl Done {
-    fn add(&mut self, name: &str, outcome: &Result<Extracted, Failure>) {
+impl ExtractTally {
+    fn add(&mut self, name: &str, outcome: &Result<ExtractedFeatures, Failure>) {
         match outcome {
             Ok(extracted) => {
                 self.n_done += 1;
@@ -179,7 +179,7 @@ impl Done {
     }
 }
 
-fn told(name: &str, extracted: &Extracted) -> String {
+fn told(name: &str, extracted: &ExtractedFeatures) -> String {
     let tempo = match extracted.tempo_bpm {
         Some(bpm) => format!("{bpm:.1} bpm, {} beats", extracted.beats.len()),
         None => "no tempo".to_owned(),
@@ -191,26 +191,26 @@ fn told(name: &str, extracted: &Extracted) -> String {
     format!("{name}: {duration_s:.1} s, {n_frames} frames, {tempo}{tuning}")
 }
 
-enum Place {
+enum ExtractPlace {
     Store(String),
     Files(String),
 }
 
-struct Report {
-    place: Place,
-    done: Done,
+struct ExtractSummary {
+    place: ExtractPlace,
+    done: ExtractTally,
     dry_run: bool,
     took_s: f64,
 }
 
-impl Summary for Report {
+impl Summary for ExtractSummary {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        let Report { place, done, took_s, .. } = self;
-        let (Place::Store(name) | Place::Files(name)) = &*place;
-        let items = if matches!(place, Place::Store(_)) { "phrases" } else { "files" };
+        let ExtractSummary { place, done, took_s, .. } = self;
+        let (ExtractPlace::Store(name) | ExtractPlace::Files(name)) = &*place;
+        let items = if matches!(place, ExtractPlace::Store(_)) { "phrases" } else { "files" };
         writeln!(out, "extract → {name}")?;
         if self.dry_run {
-            let Done { n_todo, todo_s, n_unchanged, .. } = done;
+            let ExtractTally { n_todo, todo_s, n_unchanged, .. } = done;
             writeln!(
                 out,
                 "  would extract {n_todo} {items} ({todo_s:.1} s of audio), leave {n_unchanged} as \
@@ -251,15 +251,15 @@ impl Summary for Report {
         if done.n_without > 0 {
             writeln!(out, "  {} phrases have neither audio nor features", done.n_without)?;
         }
-        if done.told.len() <= N_SHOWN && matches!(place, Place::Files(_)) {
+        if done.told.len() <= N_SHOWN && matches!(place, ExtractPlace::Files(_)) {
             done.told.sort();
             for line in &done.told {
                 writeln!(out, "  {line}")?;
             }
         }
         let store = match place {
-            Place::Store(store) => Some(store.as_str()),
-            Place::Files(_) => None,
+            ExtractPlace::Store(store) => Some(store.as_str()),
+            ExtractPlace::Files(_) => None,
         };
         write_failures(out, done.failed.iter().map(|(name, why)| (name, why)), store)
     }
@@ -273,8 +273,8 @@ impl Summary for Report {
     }
 
     fn figures(&mut self) -> serde_json::Value {
-        let Report { place, done, .. } = self;
-        let (Place::Store(name) | Place::Files(name)) = &*place;
+        let ExtractSummary { place, done, .. } = self;
+        let (ExtractPlace::Store(name) | ExtractPlace::Files(name)) = &*place;
         serde_json::json!({
             "to": name,
             "dry_run": self.dry_run,

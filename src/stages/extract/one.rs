@@ -15,9 +15,9 @@ use crate::stages::feature_file::read_features;
 use crate::store::{Content, SourceFile, StoreError, digest, digest_of};
 use crate::units::{frames_to_s, s_to_frames};
 
-/// How every phrase is done.
+/// Settings of the extraction, the same for every phrase.
 #[derive(Clone, Copy, Debug)]
-pub struct Rules {
+pub struct ExtractRules {
     /// Fixes the tuning that would be estimated.
     pub tuning: Option<Tuning>,
     /// Longest audio, in seconds.
@@ -26,7 +26,7 @@ pub struct Rules {
     pub timeout: Duration,
 }
 
-/// What the features of a phrase are made from.
+/// The source of a phrase's features.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Origin {
     Audio,
@@ -52,7 +52,7 @@ impl Origin {
 
 /// A phrase's features.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Extracted {
+pub struct ExtractedFeatures {
     pub origin: Origin,
     /// [T, 163].
     pub frames: Array2<f32>,
@@ -62,13 +62,13 @@ pub struct Extracted {
     pub beats: Vec<(usize, f64)>,
     /// Time of every beat that motion follows, s, and its number in the bar if known.
     pub pulse: Vec<(f64, Option<i64>)>,
-    /// What only audio tells.
-    pub audio: Option<Heard>,
+    /// None for features that were read from a file.
+    pub audio: Option<AudioFacts>,
 }
 
-/// What only audio tells.
+/// Facts that are known of audio only, not of a feature file.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Heard {
+pub struct AudioFacts {
     pub n_samples: u64,
     pub tuning: Tuning,
     /// `estimated` or `given`.
@@ -77,7 +77,7 @@ pub struct Heard {
     pub loss: Loss,
 }
 
-impl Extracted {
+impl ExtractedFeatures {
     /// Returns how many seconds of the audio are missing at an end before the stated one, or could
     /// not be decoded.
     pub fn lost_s(&self) -> f64 {
@@ -125,8 +125,8 @@ pub fn extract(
     file: &SourceFile,
     content: Result<Content, StoreError>,
     is_as_recorded: impl FnOnce(&str) -> bool,
-    rules: &Rules,
-) -> Result<Extracted, Failure> {
+    rules: &ExtractRules,
+) -> Result<ExtractedFeatures, Failure> {
     let path = file.path.as_str();
     let mut content = content.map_err(|e| {
         let cause = std::error::Error::source(&e).map(|e| format!(" ({e})")).unwrap_or_default();
@@ -171,7 +171,11 @@ fn hash_of(path: &str, content: &mut Content) -> Result<String, Failure> {
     }
 }
 
-fn from_audio(path: &str, content: Content, rules: &Rules) -> Result<Extracted, Failure> {
+fn from_audio(
+    path: &str,
+    content: Content,
+    rules: &ExtractRules,
+) -> Result<ExtractedFeatures, Failure> {
     let extension = path.rsplit_once('.').map_or("", |(_, extension)| extension);
     let started = Instant::now();
     let options = Options {
@@ -193,12 +197,12 @@ fn from_audio(path: &str, content: Content, rules: &Rules) -> Result<Extracted, 
         recording.map_err(|e| Failure::of(path, e.kind(), &e))?;
     let features = raw.normalize();
     let beats = features.rhythm.beat_frames.iter().map(|&frame| (frame, frames_to_s(frame)));
-    Ok(Extracted {
+    Ok(ExtractedFeatures {
         origin: Origin::Audio,
         tempo_bpm: Some(features.rhythm.tempo_bpm).filter(|&bpm| bpm > 0.0),
         beats: beats.collect(),
         pulse: meter.numbered().collect(),
-        audio: Some(Heard {
+        audio: Some(AudioFacts {
             n_samples: features.n_samples,
             tuning: features.tuning,
             tuning_source: if rules.tuning.is_some() { "given" } else { "estimated" },
@@ -209,7 +213,7 @@ fn from_audio(path: &str, content: Content, rules: &Rules) -> Result<Extracted, 
     })
 }
 
-fn from_feature_file(path: &str, content: Content) -> Result<Extracted, Failure> {
+fn from_feature_file(path: &str, content: Content) -> Result<ExtractedFeatures, Failure> {
     let bytes = match content {
         Content::Bytes(bytes) => bytes,
         Content::File(mut open) => {
@@ -234,7 +238,7 @@ fn from_feature_file(path: &str, content: Content) -> Result<Extracted, Failure>
     let frame = |time_s: f64| (s_to_frames(time_s).round() as usize).min(last);
     let beats = file.beat_times_s.iter().map(|&time_s| (frame(time_s), time_s)).collect();
     let pulse = file.beat_times_s.iter().map(|&time_s| (time_s, None)).collect();
-    Ok(Extracted {
+    Ok(ExtractedFeatures {
         origin: Origin::FeatureFile,
         frames,
         tempo_bpm: file.tempo_bpm,

@@ -1,24 +1,24 @@
 //! With a store: the phrases that have no current features get them, batch by batch.
 //!
 //! As in ingest, a batch is a range of the phrases' stable hash, cut by the table of phrases alone:
-//! whoever does it, whenever, writes the same bytes under the same name. Files of a batch are done
+//! every process, at any time, writes the same bytes under the same name. Files of a batch are done
 //! side by side, the longest first, and the batch is committed when its last file is done.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Mutex;
 
-use super::one::{Extracted, Origin, extract, needed_bytes};
+use super::one::{ExtractedFeatures, Origin, extract, needed_bytes};
 use super::pool::{self, Budget, lock};
-use super::{Done, Extract, Job};
+use super::{Extract, ExtractJob, ExtractTally};
 use crate::stages::Stage as _;
 use crate::stages::beats::{self, BeatSource};
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::ingest::content_hash_of_audio;
 use crate::store::tables::{self, BeatRow, ExtractionRow, FailureRow, PhraseRow};
 use crate::store::{
-    ClientOptions, Commit, Content, InOrder, Item, Ledger, Location, Row as _, Shard, Source,
-    SourceFile, StoreError, StoreSnapshot, TimestampUs, batch_of, checkpoint,
+    ClientOptions, Commit, Content, Item, Ledger, Location, OrderedContents, Row as _, Shard,
+    Source, SourceFile, StoreError, StoreSnapshot, TimestampUs, batch_of, checkpoint,
 };
 use crate::units::frames_to_s;
 
@@ -30,7 +30,7 @@ const MAX_BATCH_S: f64 = 1800.0;
 const MAX_BATCH_PHRASES: usize = 512;
 
 /// The store and what is asked of it.
-pub struct Target<'a> {
+pub struct StoreTarget<'a> {
     pub store: &'a Location,
     pub options: ClientOptions,
     pub shard: Shard,
@@ -38,8 +38,8 @@ pub struct Target<'a> {
     pub force: bool,
 }
 
-/// A phrase to be done.
-struct Task {
+/// A phrase to extract features of.
+struct PhraseTask {
     batch: usize,
     row: PhraseRow,
     origin: Origin,
@@ -49,7 +49,7 @@ struct Task {
     has_listed_beats: bool,
 }
 
-impl Task {
+impl PhraseTask {
     /// Returns what tells whether the phrase has to be done again beside its content: with release 0.1, beats
     /// were written for all phrases.
     fn fingerprint(&self) -> String {
@@ -62,19 +62,19 @@ impl Task {
     }
 }
 
-type Outcome = Result<Extracted, Failure>;
+type PhraseOutcome = Result<ExtractedFeatures, Failure>;
 
 /// A batch under way.
-struct Batch {
+struct PhraseBatch {
     n_missing: usize,
-    outcomes: BTreeMap<String, (Task, Outcome)>,
+    outcomes: BTreeMap<String, (PhraseTask, PhraseOutcome)>,
 }
 
 /// Extracts the features of every phrase of `target` that lacks them.
 ///
 /// # Errors
 /// When the store cannot be read or written; what was committed stays.
-pub fn run(job: &Job<'_>, target: &Target<'_>) -> anyhow::Result<Done> {
+pub fn run(job: &ExtractJob<'_>, target: &StoreTarget<'_>) -> anyhow::Result<ExtractTally> {
     let snapshot = StoreSnapshot::take(target.store)?;
     let rows: Vec<PhraseRow> = snapshot.table(PhraseRow::schema())?.rows()?;
     if rows.is_empty() {
@@ -90,7 +90,8 @@ pub fn run(job: &Job<'_>, target: &Target<'_>) -> anyhow::Result<Done> {
     let n_phrases = rows.iter().filter(|row| !row.is_constructed()).count() as u64;
     let listed = with_listed_beats(&snapshot, &rows)?;
     let mut tasks = plan(rows, &listed);
-    let mut done = Done { n_without: n_phrases - tasks.len() as u64, ..Done::default() };
+    let mut done =
+        ExtractTally { n_without: n_phrases - tasks.len() as u64, ..ExtractTally::default() };
     tasks.retain(|task| target.shard.takes(&task.row.phrase_id));
     let n_mine = tasks.len();
     tasks.retain(|task| target.force || !is_settled(task, &ledger, target.params_hash));
@@ -104,7 +105,7 @@ pub fn run(job: &Job<'_>, target: &Target<'_>) -> anyhow::Result<Done> {
     target.store.sweep();
     snapshot.checkpoint();
     job.progress.start_audio("extract", done.todo_s.ceil() as u64);
-    let writer = Writer { target, ledger: &ledger };
+    let writer = BatchWriter { target, ledger: &ledger };
     let done = Mutex::new(done);
     work_off(job, target, tasks, &writer, &done)?;
     if !lock(&done).is_stopped {
@@ -134,7 +135,7 @@ fn with_listed_beats(
 }
 
 /// Returns the phrases that can have features, with their batches.
-fn plan(rows: Vec<PhraseRow>, listed: &BTreeSet<String>) -> Vec<Task> {
+fn plan(rows: Vec<PhraseRow>, listed: &BTreeSet<String>) -> Vec<PhraseTask> {
     let with_input = |row: PhraseRow| {
         let input = match (&row.audio_url, &row.features_url) {
             (Some(url), _) => Some((Origin::Audio, url.clone(), row.audio_bytes)),
@@ -144,9 +145,9 @@ fn plan(rows: Vec<PhraseRow>, listed: &BTreeSet<String>) -> Vec<Task> {
         let (origin, url, size_bytes) = input?;
         let size_bytes = size_bytes.and_then(|n| u64::try_from(n).ok()).unwrap_or(0);
         let has_listed_beats = listed.contains(&row.phrase_id);
-        Some(Task { batch: 0, row, origin, url, size_bytes, has_listed_beats })
+        Some(PhraseTask { batch: 0, row, origin, url, size_bytes, has_listed_beats })
     };
-    let mut tasks: Vec<Task> = rows.into_iter().filter_map(with_input).collect();
+    let mut tasks: Vec<PhraseTask> = rows.into_iter().filter_map(with_input).collect();
     let total_s: f64 = tasks.iter().map(|task| task.row.duration_s).sum();
     let by_length = (total_s / MAX_BATCH_S).ceil() as u64;
     let by_count = tasks.len().div_ceil(MAX_BATCH_PHRASES) as u64;
@@ -155,7 +156,7 @@ fn plan(rows: Vec<PhraseRow>, listed: &BTreeSet<String>) -> Vec<Task> {
     for task in &mut tasks {
         task.batch = batch_of(&task.row.phrase_id, n_batches) as usize;
     }
-    let size = |task: &Task| (task.row.duration_s * 1e3) as u64;
+    let size = |task: &PhraseTask| (task.row.duration_s * 1e3) as u64;
     tasks.sort_by(|a, b| {
         (a.batch, Reverse(size(a)), &a.row.phrase_id).cmp(&(
             b.batch,
@@ -167,7 +168,7 @@ fn plan(rows: Vec<PhraseRow>, listed: &BTreeSet<String>) -> Vec<Task> {
 }
 
 /// Returns whether the store has the phrase's features for this content and these parameters.
-fn is_settled(task: &Task, ledger: &Ledger, params_hash: &str) -> bool {
+fn is_settled(task: &PhraseTask, ledger: &Ledger, params_hash: &str) -> bool {
     let id = &task.row.phrase_id;
     let is_refused = ledger.get(&beside(id)).is_some_and(|known| known.item.failure.is_some());
     !is_refused
@@ -182,7 +183,7 @@ fn is_settled(task: &Task, ledger: &Ledger, params_hash: &str) -> bool {
 /// Returns whether a file with this digest can be the one that ingest saw.
 ///
 /// The table has one digest of all files of a phrase, which is enough to tell where there is one.
-fn is_as_recorded(task: &Task, hash: &str) -> bool {
+fn is_as_recorded(task: &PhraseTask, hash: &str) -> bool {
     let row = &task.row;
     let is_alone =
         row.motion_url.is_none() && row.features_url.is_none() && row.beats_url.is_none();
@@ -191,7 +192,7 @@ fn is_as_recorded(task: &Task, hash: &str) -> bool {
 
 /// Refuses audio that is longer or shorter than ingest read in its header, by more than a frame,
 /// unless what is missing was counted.
-fn as_long_as_recorded(task: &Task, extracted: Extracted) -> Outcome {
+fn as_long_as_recorded(task: &PhraseTask, extracted: ExtractedFeatures) -> PhraseOutcome {
     let (found_s, said_s) = (extracted.duration_s(), task.row.duration_s);
     let is_near = |s: f64| (s - said_s).abs() <= frames_to_s(1);
     if extracted.audio.is_none() || is_near(found_s) || is_near(found_s + extracted.lost_s()) {
@@ -211,26 +212,26 @@ fn beside(id: &str) -> String {
 }
 
 fn work_off(
-    job: &Job<'_>,
-    target: &Target<'_>,
-    tasks: Vec<Task>,
-    writer: &Writer<'_>,
-    done: &Mutex<Done>,
+    job: &ExtractJob<'_>,
+    target: &StoreTarget<'_>,
+    tasks: Vec<PhraseTask>,
+    writer: &BatchWriter<'_>,
+    done: &Mutex<ExtractTally>,
 ) -> anyhow::Result<()> {
-    let mut batches: HashMap<usize, Batch> = HashMap::new();
+    let mut batches: HashMap<usize, PhraseBatch> = HashMap::new();
     for task in &tasks {
-        let empty = || Batch { n_missing: 0, outcomes: BTreeMap::new() };
+        let empty = || PhraseBatch { n_missing: 0, outcomes: BTreeMap::new() };
         batches.entry(task.batch).or_insert_with(empty).n_missing += 1;
     }
     let batches = Mutex::new(batches);
     let budget = Budget::new(job.memory_bytes);
-    let mut inputs = Inputs::open(&tasks, &target.options);
+    let mut inputs = PhraseInputs::open(&tasks, &target.options);
     let mut queue = tasks.into_iter().peekable();
     let mut under_way = None;
     pool::run(
         job.n_workers,
         || {
-            // Who asks for an end gets the batch that is under way, whole.
+            // After an interrupt the batch that is under way is still completed.
             let batch = Some(queue.peek()?.batch);
             if batch != under_way && job.progress.is_interrupted() {
                 lock(done).is_stopped = true;
@@ -241,8 +242,8 @@ fn work_off(
             let input = inputs.next(&task);
             Some((task, input))
         },
-        |(task, input): (Task, Input)| -> anyhow::Result<()> {
-            let Input { file, content, _permit } = input;
+        |(task, input): (PhraseTask, PhraseInput)| -> anyhow::Result<()> {
+            let PhraseInput { file, content, _permit } = input;
             let outcome = {
                 let _share = budget.take(needed_bytes(task.row.duration_s, task.size_bytes));
                 extract(task.origin, &file, content, |hash| is_as_recorded(&task, hash), &job.rules)
@@ -267,26 +268,26 @@ fn work_off(
 }
 
 /// The files of the tasks, read in the tasks' order.
-struct Inputs {
+struct PhraseInputs {
     /// `None` for a source that cannot be opened.
-    sources: HashMap<String, Option<(Source, InOrder)>>,
+    sources: HashMap<String, Option<(Source, OrderedContents)>>,
     options: ClientOptions,
 }
 
-struct Input {
+struct PhraseInput {
     file: SourceFile,
     content: Result<Content, StoreError>,
     /// The read-ahead budget of the file, given back when the phrase is done.
     _permit: Option<Box<dyn Send>>,
 }
 
-impl Inputs {
-    fn open(tasks: &[Task], options: &ClientOptions) -> Self {
-        let mut files: BTreeMap<&str, Vec<&Task>> = BTreeMap::new();
+impl PhraseInputs {
+    fn open(tasks: &[PhraseTask], options: &ClientOptions) -> Self {
+        let mut files: BTreeMap<&str, Vec<&PhraseTask>> = BTreeMap::new();
         for task in tasks {
             files.entry(&task.row.source).or_default().push(task);
         }
-        let open = |url: &str, tasks: Vec<&Task>| {
+        let open = |url: &str, tasks: Vec<&PhraseTask>| {
             // What is read is held against the digest that ingest recorded, wherever it lies.
             let source = Source::open(url, options, None).ok()?.following_links(true);
             let wanted = tasks.iter().filter_map(|task| Self::file(&source, task)).collect();
@@ -298,16 +299,16 @@ impl Inputs {
     }
 
     /// Returns why a task has no input.
-    fn error(&self, task: &Task) -> StoreError {
+    fn error(&self, task: &PhraseTask) -> StoreError {
         let source = Source::open(&task.row.source, &self.options, None);
         source.err().unwrap_or_else(|| StoreError::NotFound { place: task.url.clone(), hint: "" })
     }
 
-    fn file(source: &Source, task: &Task) -> Option<SourceFile> {
+    fn file(source: &Source, task: &PhraseTask) -> Option<SourceFile> {
         source.recorded(&task.url, task.size_bytes, &task.row.content_hash)
     }
 
-    fn next(&mut self, task: &Task) -> Input {
+    fn next(&mut self, task: &PhraseTask) -> PhraseInput {
         let unknown = SourceFile {
             path: task.url.clone(),
             size_bytes: task.size_bytes,
@@ -322,25 +323,25 @@ impl Inputs {
         match found {
             Some((file, (content, permit))) => {
                 let permit = permit.map(|permit| Box::new(permit) as Box<dyn Send>);
-                Input { file, content, _permit: permit }
+                PhraseInput { file, content, _permit: permit }
             }
-            None => Input { file: unknown, content: Err(self.error(task)), _permit: None },
+            None => PhraseInput { file: unknown, content: Err(self.error(task)), _permit: None },
         }
     }
 }
 
 /// Writes finished batches.
-struct Writer<'a> {
-    target: &'a Target<'a>,
+struct BatchWriter<'a> {
+    target: &'a StoreTarget<'a>,
     ledger: &'a Ledger,
 }
 
-impl Writer<'_> {
+impl BatchWriter<'_> {
     fn start(&self) -> Commit<'_> {
         Commit::new(self.target.store, Extract::NAME, self.target.params_hash, ITEMS_FROM)
     }
 
-    fn commit(&self, batch: Batch) -> Result<(), StoreError> {
+    fn commit(&self, batch: PhraseBatch) -> Result<(), StoreError> {
         let mut commit = self.start();
         let (mut extractions, mut beats, mut failures) = (Vec::new(), Vec::new(), Vec::new());
         for (id, (task, outcome)) in batch.outcomes {
@@ -393,7 +394,7 @@ impl Writer<'_> {
 
     /// Returns the name to settle: the phrase's own, or one beside it when a file that cannot be
     /// read just now says nothing against the rows that are there.
-    fn name_for(&self, id: String, outcome: &Outcome, commit: &mut Commit<'_>) -> String {
+    fn name_for(&self, id: String, outcome: &PhraseOutcome, commit: &mut Commit<'_>) -> String {
         let beside = beside(&id);
         let has_rows = self.ledger.get(&id).is_some_and(|known| known.item.succeeded());
         let is_out_of_reach =
@@ -421,7 +422,7 @@ impl Writer<'_> {
     }
 }
 
-fn extraction_row(id: &str, task: &Task, extracted: &Extracted) -> ExtractionRow {
+fn extraction_row(id: &str, task: &PhraseTask, extracted: &ExtractedFeatures) -> ExtractionRow {
     let heard = extracted.audio;
     ExtractionRow {
         phrase_id: id.to_owned(),
@@ -443,7 +444,10 @@ fn extraction_row(id: &str, task: &Task, extracted: &Extracted) -> ExtractionRow
     }
 }
 
-fn beat_rows<'a>(id: &'a str, extracted: &'a Extracted) -> impl Iterator<Item = BeatRow> + 'a {
+fn beat_rows<'a>(
+    id: &'a str,
+    extracted: &'a ExtractedFeatures,
+) -> impl Iterator<Item = BeatRow> + 'a {
     let beats = extracted.pulse.iter().copied();
     beats::rows(id, beats, extracted.frames.nrows(), extracted.origin.beat_source())
 }

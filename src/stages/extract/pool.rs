@@ -12,7 +12,7 @@ pub struct Budget {
 }
 
 /// A share of a [`Budget`], given back when it is dropped.
-pub struct Share<'a> {
+pub struct BudgetShare<'a> {
     budget: &'a Budget,
     bytes: u64,
 }
@@ -22,19 +22,19 @@ impl Budget {
         Self { total_bytes, used_bytes: Mutex::new(0), freed: Condvar::new() }
     }
 
-    /// Waits until `bytes` are free; who asks for more than there is waits to be alone.
-    pub fn take(&self, bytes: u64) -> Share<'_> {
+    /// Waits until `bytes` are free; a request for more than the whole budget waits until all of it is free.
+    pub fn take(&self, bytes: u64) -> BudgetShare<'_> {
         let bytes = bytes.min(self.total_bytes);
         let mut used = lock(&self.used_bytes);
         while *used + bytes > self.total_bytes {
             used = self.freed.wait(used).unwrap_or_else(PoisonError::into_inner);
         }
         *used += bytes;
-        Share { budget: self, bytes }
+        BudgetShare { budget: self, bytes }
     }
 }
 
-impl Drop for Share<'_> {
+impl Drop for BudgetShare<'_> {
     fn drop(&mut self) {
         *lock(&self.budget.used_bytes) -= self.bytes;
         self.budget.freed.notify_all();

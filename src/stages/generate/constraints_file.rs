@@ -1,5 +1,6 @@
 //! The file in which a user says what a motion must do.
 
+use std::fmt;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
@@ -7,7 +8,7 @@ use anyhow::{Context as _, anyhow, bail, ensure};
 use ndarray::Array2;
 use serde::Deserialize;
 
-use crate::generation::{Constraints, Wanted, continuing, facing};
+use crate::generation::{Constraints, WantedValue, continuing, facing};
 use crate::motion::{CHANNEL_NAMES, Channel, ChannelLimits, MOTION_DIM};
 use crate::units::s_to_frames;
 
@@ -78,13 +79,22 @@ struct Continued {
 }
 
 /// A file that was read, with the motion that it continues.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Asked {
+#[derive(Clone, PartialEq)]
+pub struct ConstraintsRequest {
     file: ConstraintsFile,
     before: Option<(Array2<f32>, usize)>,
 }
 
-impl Asked {
+impl fmt::Debug for ConstraintsRequest {
+    /// Writes the text that the digest of a motion's settings contains. It begins with `Asked`, as in stores that were
+    /// written before: another text would make their motions again.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { file, before } = self;
+        f.debug_struct("Asked").field("file", file).field("before", before).finish()
+    }
+}
+
+impl ConstraintsRequest {
     /// Reads a file; what it says in TOML or, where its name ends in `.json`, JSON.
     ///
     /// # Errors
@@ -139,7 +149,7 @@ impl Asked {
     /// Returns what is asked of a track.
     ///
     /// # Errors
-    /// One sentence for what cannot be asked of a track of so many frames.
+    /// One sentence for what cannot be asked of a track of `n_frames`.
     pub fn of_track(&self, n_frames: usize, limits: ChannelLimits) -> anyhow::Result<Constraints> {
         let file = &self.file;
         let mut wanted = Vec::new();
@@ -197,19 +207,19 @@ fn frame_of(time_s: f64) -> anyhow::Result<usize> {
 fn add(
     pose: &Pose,
     frames: std::ops::Range<usize>,
-    wanted: &mut Vec<(usize, Wanted)>,
+    wanted: &mut Vec<(usize, WantedValue)>,
 ) -> anyhow::Result<()> {
     let Pose { position, quaternion, heading_deg, channels } = pose;
     let mut all = Vec::new();
     if let Some(position) = position {
         let values = Channel::Position.range().zip(position);
-        all.extend(values.map(|(channel, &value)| Wanted::Value { channel, value }));
+        all.extend(values.map(|(channel, &value)| WantedValue::Value { channel, value }));
     }
     match (quaternion, heading_deg) {
         (Some(_), Some(_)) => bail!("an orientation is given twice, as quaternion and heading_deg"),
-        (Some(q), None) => all.push(Wanted::Orientation(*q)),
+        (Some(q), None) => all.push(WantedValue::Orientation(*q)),
         (None, Some(heading_deg)) => {
-            all.push(Wanted::Orientation(facing(heading_deg.to_radians())))
+            all.push(WantedValue::Orientation(facing(heading_deg.to_radians())))
         }
         (None, None) => {}
     }
@@ -224,7 +234,7 @@ fn add(
             !Channel::Quaternion.range().contains(&channel),
             "{name} cannot be asked for alone; give quaternion = [w, x, y, z] or heading_deg"
         );
-        all.push(Wanted::Value { channel, value });
+        all.push(WantedValue::Value { channel, value });
     }
     ensure!(
         !all.is_empty(),
@@ -240,8 +250,8 @@ mod tests {
 
     use super::*;
 
-    fn asked(text: &str) -> Asked {
-        Asked::of_text(text, false).expect("constraints")
+    fn asked(text: &str) -> ConstraintsRequest {
+        ConstraintsRequest::of_text(text, false).expect("constraints")
     }
 
     #[test]
@@ -270,8 +280,9 @@ mod tests {
         assert!((frames[[0, 11]] - 0.5_f32.sqrt()).abs() < 1e-6);
         assert!((frames[[30, 9]] - 1.0).abs() < 1e-6);
         let json = r#"{"keyframe": [{"frame": 7, "position_y": 0.25}]}"#;
-        let file = Asked::parse(json, true).expect("JSON");
-        let constraints = Asked { file, before: None }.of_track(8, ChannelLimits::Wide);
+        let file = ConstraintsRequest::parse(json, true).expect("JSON");
+        let constraints =
+            ConstraintsRequest { file, before: None }.of_track(8, ChannelLimits::Wide);
         assert_eq!(
             constraints.expect("constraints").errors(Array2::zeros((8, 25)).view())[0].error,
             0.25
@@ -283,7 +294,7 @@ mod tests {
         let mut before = Array2::zeros((40, MOTION_DIM));
         before.column_mut(9).fill(1.0);
         before.column_mut(2).assign(&ndarray::Array1::range(0.0, 40.0, 1.0));
-        let asked = Asked { before: Some((before, 3)), ..asked("") };
+        let asked = ConstraintsRequest { before: Some((before, 3)), ..asked("") };
         let constraints = asked.of_track(50, ChannelLimits::Wide).expect("constraints");
         assert_eq!(constraints.placement().z_m, 37.0);
     }
@@ -335,7 +346,7 @@ mod tests {
             is_json: bool,
             n_frames in 0_usize..40,
         ) {
-            if let Ok(asked) = Asked::of_text(&text, is_json) {
+            if let Ok(asked) = ConstraintsRequest::of_text(&text, is_json) {
                 let _ = asked.of_track(n_frames, ChannelLimits::Wide);
             }
         }
@@ -373,6 +384,6 @@ mod tests {
             said("[[keyframe]]\ntime_s = -1.0\nposition_y = 1.0"),
             "-1 s is no time in a track; begin at 0"
         );
-        assert!(Asked::parse("[middle]\nposition_y = 1.0", false).is_err());
+        assert!(ConstraintsRequest::parse("[middle]\nposition_y = 1.0", false).is_err());
     }
 }

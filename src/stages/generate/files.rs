@@ -8,14 +8,14 @@ use std::time::Duration;
 use anyhow::{Context as _, bail};
 use ndarray::ArrayView2;
 
-use super::Done;
-use super::maker::{Made, Maker, Music};
-use super::outputs::{self, Format, Output};
+use super::GenerateTally;
+use super::maker::{GeneratedMotion, Maker, PhraseMusic};
+use super::outputs::{self, MotionFormat, MotionOutput};
 use super::receipt::{Receipt, digest_of_song};
 use crate::motion::exchange::{csv_header, write_csv_rows};
 use crate::motion::{Beats, BeatsError};
 use crate::stages::Progress;
-use crate::stages::extract::{Extracted, Origin, Rules, extract};
+use crate::stages::extract::{ExtractRules, ExtractedFeatures, Origin, extract};
 use crate::stages::failure::{Failure, FailureKind};
 use crate::store::{Content, SourceFile, StoreError};
 
@@ -24,19 +24,19 @@ const IN_MEMORY_BYTES: u64 = 64 << 20;
 /// Longest audio.
 const MAX_DURATION_S: f64 = 24.0 * 3600.0;
 
-/// What is asked for.
-pub struct Target<'a> {
+/// The files to generate motion for, and the folder to write to.
+pub struct FolderTarget<'a> {
     pub audio: &'a [PathBuf],
     pub folder: &'a Path,
-    pub formats: &'a [Format],
+    pub formats: &'a [MotionFormat],
     pub stream: Option<&'a str>,
     pub n_samples: usize,
     pub dry_run: bool,
     pub force: bool,
 }
 
-/// A motion to be made.
-struct Task<'a> {
+/// A motion to generate for a file.
+struct FileMotionTask<'a> {
     path: &'a PathBuf,
     stem: String,
     /// Digest of the song.
@@ -47,14 +47,18 @@ struct Task<'a> {
 }
 
 /// A file's features and beats.
-type Heard = Result<(Extracted, Option<Beats>), Failure>;
+type FeaturesAndBeats = Result<(ExtractedFeatures, Option<Beats>), Failure>;
 
 /// Makes motions for files, one file after another.
 ///
 /// # Errors
 /// When the folder cannot be written; files that cannot be danced to are part of what was done.
-pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::Result<Done> {
-    let mut done = Done::default();
+pub fn run(
+    maker: &Maker,
+    target: &FolderTarget,
+    progress: &dyn Progress,
+) -> anyhow::Result<GenerateTally> {
+    let mut done = GenerateTally::default();
     let mut names = std::collections::BTreeMap::new();
     let mut tasks = Vec::new();
     // The first motion is streamed whenever that is asked for, made or not.
@@ -80,7 +84,14 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
                 done.n_unchanged += 1;
             } else {
                 let song = song.clone().unwrap_or_default();
-                tasks.push(Task { path, stem: stem.clone(), song, name, sample, receipt });
+                tasks.push(FileMotionTask {
+                    path,
+                    stem: stem.clone(),
+                    song,
+                    name,
+                    sample,
+                    receipt,
+                });
             }
         }
     }
@@ -92,8 +103,8 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
     std::fs::create_dir_all(target.folder)
         .with_context(|| format!("while making {}", target.folder.display()))?;
     progress.start("generate", "motions", tasks.len() as u64);
-    let mut heard: Option<(&PathBuf, Heard)> = None;
-    for Task { path, stem, song, name, sample, receipt } in tasks {
+    let mut heard: Option<(&PathBuf, FeaturesAndBeats)> = None;
+    for FileMotionTask { path, stem, song, name, sample, receipt } in tasks {
         if progress.is_interrupted() {
             done.is_interrupted = true;
             break;
@@ -105,7 +116,7 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
         let Some((_, music)) = &heard else { continue };
         let outcome = music.as_ref().map_err(Clone::clone).and_then(|(extracted, beats)| {
             let source = path.display().to_string();
-            let music = Music {
+            let music = PhraseMusic {
                 phrase_id: &stem,
                 content_hash: &song,
                 source: &source,
@@ -129,7 +140,7 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
                     Ok((_, Some(beats))) => beats.times_s(),
                     _ => &[],
                 };
-                let output = Output {
+                let output = MotionOutput {
                     name: &name,
                     frames: made.frames.view(),
                     beats_s,
@@ -168,7 +179,7 @@ fn beat_list_of(audio: &Path) -> PathBuf {
 }
 
 /// Extracts the features of a file, and its beats: those of a beats file beside it, else the tracked ones.
-pub(in crate::stages) fn listen(path: &Path) -> Heard {
+pub(in crate::stages) fn listen(path: &Path) -> FeaturesAndBeats {
     let name = path.display().to_string();
     let io = |e: io::Error| StoreError::Io { action: "read", place: name.clone(), source: e };
     if path.is_dir() {
@@ -181,7 +192,8 @@ pub(in crate::stages) fn listen(path: &Path) -> Heard {
     } else {
         File::open(path).map(Content::File).map_err(io)
     };
-    let rules = Rules { tuning: None, max_duration_s: MAX_DURATION_S, timeout: Duration::MAX };
+    let rules =
+        ExtractRules { tuning: None, max_duration_s: MAX_DURATION_S, timeout: Duration::MAX };
     let file = SourceFile { path: name.clone(), size_bytes, fingerprint: String::new() };
     let extracted = extract(Origin::Audio, &file, content, |_| true, &rules)?;
     let beside = beat_list_of(path);
@@ -198,7 +210,7 @@ pub(in crate::stages) fn listen(path: &Path) -> Heard {
     Ok((extracted, beats))
 }
 
-fn told(name: &str, made: &Made) -> String {
+fn told(name: &str, made: &GeneratedMotion) -> String {
     let row = made.rows.iter().find(|row| row.selected);
     let score = row.and_then(|row| row.score).map_or("none".to_owned(), |x| format!("{x:.3}"));
     let checks = row
@@ -211,8 +223,8 @@ fn told(name: &str, made: &Made) -> String {
     )
 }
 
-/// What a page tells of a motion.
-fn facts(made: &Made) -> Vec<(String, String)> {
+/// The facts on a motion that a page shows.
+fn facts(made: &GeneratedMotion) -> Vec<(String, String)> {
     let Some(row) = made.rows.iter().find(|row| row.selected) else { return Vec::new() };
     let mut facts = vec![
         ("model", row.model.clone()),

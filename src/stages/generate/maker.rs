@@ -7,7 +7,7 @@ use ndarray::{Array2, ArrayView2, Axis, concatenate};
 use super::params::Settings;
 use crate::evaluation::{Score, derivative_error, score};
 use crate::generation::{
-    Constrained, Constraints, EngineError, Generator, ModelCard, Primed, Track,
+    Constraints, EngineError, Generator, ModelCard, PrimingMotion, Track, WeightedConstraints,
 };
 use crate::model::condition;
 use crate::motion::postprocess::{Displacement, process, process_holding};
@@ -18,12 +18,12 @@ use crate::store::tables::GenerationRow;
 use crate::store::{TimestampUs, digest};
 use crate::units::frames_to_s;
 
-/// What is danced to.
-pub struct Music<'a> {
+/// The music of a phrase or file, to which motion is generated.
+pub struct PhraseMusic<'a> {
     pub phrase_id: &'a str,
     /// Digest of what the phrase's files hold, as `generations` has it.
     pub content_hash: &'a str,
-    /// What messages and failures name.
+    /// The name in messages and failures.
     pub source: &'a str,
     /// \[T, 163\]
     pub features: ArrayView2<'a, f32>,
@@ -34,7 +34,7 @@ pub struct Music<'a> {
 
 /// A motion that was kept, and what is known of all its candidates.
 #[derive(Debug)]
-pub struct Made {
+pub struct GeneratedMotion {
     /// \[T, 25\]
     pub frames: Array2<f32>,
     /// The same motion as it was decoded, before post-processing, \[T, 25\].
@@ -45,7 +45,7 @@ pub struct Made {
     pub seconds: f64,
 }
 
-/// What makes motion.
+/// Generates motions: samples candidates, scores them, and keeps the best.
 pub struct Maker<'a> {
     pub generator: Generator<'a>,
     pub card: &'a ModelCard,
@@ -71,9 +71,9 @@ pub fn seed_of(seed: u64, phrase_id: &str, sample: usize, candidate: usize) -> u
         .expect("a digest has hexadecimal digits")
 }
 
-/// What a network hears of a track, and the bar phase that its motion is sampled with.
+/// The conditions of a network for a track, and the bar phase that its motion is sampled with.
 #[derive(Clone, Copy)]
-struct Heard<'a> {
+struct TrackConditions<'a> {
     /// \[T, condition_dim\]
     condition: ArrayView2<'a, f32>,
     phase: Option<&'a [f64]>,
@@ -86,19 +86,19 @@ impl Maker<'_> {
     /// A [`Failure`] that names the phrase's music.
     pub fn make(
         &self,
-        music: &Music,
+        music: &PhraseMusic,
         sample: usize,
         watch: &mut dyn FnMut(ArrayView2<f32>) -> std::io::Result<()>,
-    ) -> Result<Made, Failure> {
+    ) -> Result<GeneratedMotion, Failure> {
         guarded(music.source, || self.candidates(music, sample, watch))
     }
 
     fn candidates(
         &self,
-        music: &Music,
+        music: &PhraseMusic,
         sample: usize,
         watch: &mut dyn FnMut(ArrayView2<f32>) -> std::io::Result<()>,
-    ) -> Result<Made, Failure> {
+    ) -> Result<GeneratedMotion, Failure> {
         let started = Instant::now();
         let n_frames = music.features.nrows();
         let constraints = self.constraints(music)?;
@@ -111,7 +111,7 @@ impl Maker<'_> {
         let clock = known.map(|(bars, beats)| clock(bars, beats.beats_per_bar()));
         let clock = clock.as_ref().map(|clock| clock.view());
         let heard = condition(&self.card.unet, music.features, clock);
-        let heard = Heard {
+        let heard = TrackConditions {
             condition: heard.view(),
             phase: bars.filter(|_| self.card.unet.clock && clock.is_some()),
         };
@@ -146,11 +146,12 @@ impl Maker<'_> {
             );
             let misses = constraints.as_ref().map(|c| c.errors(frames.view())).unwrap_or_default();
             let worst = |group: Channel, factor: f64| {
-                let of_group = misses.iter().filter(|miss| miss.what.starts_with(group.name()));
-                of_group.map(|miss| miss.error * factor).reduce(f64::max)
+                let misses_of_group =
+                    misses.iter().filter(|miss| miss.what.starts_with(group.name()));
+                misses_of_group.map(|miss| miss.error * factor).reduce(f64::max)
             };
             let generate_s = begun.elapsed().as_secs_f64();
-            let found = Found {
+            let found = CandidateFindings {
                 sample,
                 candidate,
                 seed,
@@ -164,7 +165,7 @@ impl Maker<'_> {
                 generate_s,
             };
             rows.push(self.row(music, n_frames, &found));
-            // The first of equals, so that one candidate more changes nothing else.
+            // Among equal scores the first, so that one candidate more changes nothing else.
             let value = score.total.unwrap_or(f64::NEG_INFINITY);
             if best.as_ref().is_none_or(|known| value > known.value) {
                 best = Some(Candidate { value, candidate, frames, decoded, displacement });
@@ -174,10 +175,10 @@ impl Maker<'_> {
             best.expect("at least one candidate is sampled");
         rows[candidate].selected = true;
         let seconds = started.elapsed().as_secs_f64();
-        Ok(Made { frames, decoded, rows, displacement, seconds })
+        Ok(GeneratedMotion { frames, decoded, rows, displacement, seconds })
     }
 
-    fn constraints(&self, music: &Music) -> Result<Option<Constraints>, Failure> {
+    fn constraints(&self, music: &PhraseMusic) -> Result<Option<Constraints>, Failure> {
         let Some(asked) = &self.settings.constraints else { return Ok(None) };
         let limits = self.settings.postprocess.limits;
         match asked.of_track(music.features.nrows(), limits) {
@@ -187,7 +188,7 @@ impl Maker<'_> {
     }
 
     /// Returns the library's motion for a track, where sampling begins from it.
-    fn priming(&self, music: &Music) -> Result<Option<Priming>, Failure> {
+    fn priming(&self, music: &PhraseMusic) -> Result<Option<Priming>, Failure> {
         let Some(primer) = self.primer else { return Ok(None) };
         let windows = self.generator.windows(music.features.nrows());
         primer.motion_for(music.features, &windows).map(Some).ok_or_else(|| {
@@ -200,8 +201,8 @@ impl Maker<'_> {
     /// Samples and decodes a whole track, bent to its constraints.
     fn sample(
         &self,
-        music: &Music,
-        heard: Heard,
+        music: &PhraseMusic,
+        heard: TrackConditions,
         seed: u64,
         constraints: Option<&Constraints>,
         priming: Option<&Priming>,
@@ -213,22 +214,22 @@ impl Maker<'_> {
             phase: heard.phase,
             seed,
             style: self.settings.style,
-            constraints: constraints.map(|constraints| Constrained { constraints, strength }),
-            primed: priming.zip(self.settings.prime.as_ref()).map(|(priming, prime)| Primed {
-                motion: priming.motion.view(),
-                n_left: prime.n_left,
+            constraints: constraints
+                .map(|constraints| WeightedConstraints { constraints, strength }),
+            primed: priming.zip(self.settings.prime.as_ref()).map(|(priming, prime)| {
+                PrimingMotion { motion: priming.motion.view(), n_left: prime.n_left }
             }),
         };
         let mut parts: Vec<Array2<f32>> = Vec::new();
         self.generator
-            .run(&track, |frames| -> Result<(), Stop> {
-                watch(frames.view()).map_err(Stop::Watcher)?;
+            .run(&track, |frames| -> Result<(), StopReason> {
+                watch(frames.view()).map_err(StopReason::Watcher)?;
                 parts.push(frames);
                 Ok(())
             })
             .map_err(|stop| match stop {
-                Stop::Engine(e) => Failure::new(FailureKind::Engine, music.source, e),
-                Stop::Watcher(e) => Failure::new(
+                StopReason::Engine(e) => Failure::new(FailureKind::Engine, music.source, e),
+                StopReason::Watcher(e) => Failure::new(
                     FailureKind::Unwritable,
                     music.source,
                     format!("frames could not be streamed: {e}"),
@@ -243,7 +244,12 @@ impl Maker<'_> {
         Ok(frames)
     }
 
-    fn row(&self, music: &Music, n_frames: usize, found: &Found) -> GenerationRow {
+    fn row(
+        &self,
+        music: &PhraseMusic,
+        n_frames: usize,
+        found: &CandidateFindings,
+    ) -> GenerationRow {
         let settings = self.settings;
         let n_windows = self.generator.windows(n_frames).len();
         GenerationRow {
@@ -289,8 +295,8 @@ struct Candidate {
     displacement: Option<Displacement>,
 }
 
-/// What was found of a candidate.
-struct Found<'a> {
+/// The score and errors of a candidate.
+struct CandidateFindings<'a> {
     sample: usize,
     candidate: usize,
     seed: u64,
@@ -303,12 +309,12 @@ struct Found<'a> {
 }
 
 /// Why sampling stopped.
-enum Stop {
+enum StopReason {
     Engine(EngineError),
     Watcher(std::io::Error),
 }
 
-impl From<EngineError> for Stop {
+impl From<EngineError> for StopReason {
     fn from(e: EngineError) -> Self {
         Self::Engine(e)
     }

@@ -26,10 +26,10 @@ use crate::generation::{Engine, Generator, ModelCard, Sampling, file_names};
 use crate::store::{Location, Shard};
 use crate::units::frames_to_s;
 
-use maker::{Made, Maker};
+use maker::{GeneratedMotion, Maker};
 use params::Settings;
 pub use params::{Params, SamplerName, Tracks};
-use report::{Place, Report};
+use report::{GeneratePlace, GenerateSummary};
 
 pub(in crate::stages) use files::listen;
 pub(in crate::stages) use maker::{generation_id, seed_of};
@@ -116,7 +116,7 @@ impl Stage for Generate {
         let n_samples = params.samples.get();
         let (place, done) = match (&params.output, &store) {
             (Some(folder), _) => {
-                let target = files::Target {
+                let target = files::FolderTarget {
                     audio: &params.audio,
                     folder,
                     formats: &params.format,
@@ -125,10 +125,10 @@ impl Stage for Generate {
                     dry_run: params.dry_run,
                     force: params.force,
                 };
-                (Place::Folder(folder.clone()), files::run(&maker, &target, progress)?)
+                (GeneratePlace::Folder(folder.clone()), files::run(&maker, &target, progress)?)
             }
             (None, Some(store)) => {
-                let target = tracks::Target {
+                let target = tracks::TrackTarget {
                     store,
                     shard: Shard::parse(&params.shard, |name| std::env::var(name).ok())?,
                     params_hash: &settings.digest(&weights),
@@ -140,7 +140,7 @@ impl Stage for Generate {
                     n_samples,
                     n_workers: NonZeroUsize::new(engine.n_workers()).unwrap_or(NonZeroUsize::MIN),
                 };
-                let place = Place::Store { store: store.to_string(), run: run.clone() };
+                let place = GeneratePlace::Store { store: store.to_string(), run: run.clone() };
                 (place, tracks::run(&maker, &target, progress)?)
             }
             (None, None) => bail!("nothing to do: give --store, or --audio with --output"),
@@ -158,7 +158,7 @@ impl Stage for Generate {
             settings.sampler.n_steps,
             settings.guidance
         );
-        Ok(Box::new(Report {
+        Ok(Box::new(GenerateSummary {
             place,
             done,
             model: name,
@@ -205,9 +205,9 @@ pub(in crate::stages) fn weights_digest(card: &ModelCard) -> String {
     sha256(both.as_bytes())
 }
 
-/// What became of the motions.
+/// Counts of the motions that were generated, unchanged or failed.
 #[derive(Debug, Default)]
-struct Done {
+struct GenerateTally {
     n_todo: u64,
     todo_s: f64,
     n_unchanged: u64,
@@ -228,8 +228,8 @@ struct Done {
     failed: Vec<(String, Failure)>,
 }
 
-impl Done {
-    fn add_made(&mut self, made: &Made) {
+impl GenerateTally {
+    fn add_made(&mut self, made: &GeneratedMotion) {
         self.n_made += 1;
         self.n_frames += made.frames.nrows() as u64;
         self.made_s += frames_to_s(made.frames.nrows());
@@ -243,7 +243,7 @@ impl Done {
         }
     }
 
-    fn add(&mut self, outcomes: &BTreeMap<String, Result<Made, Failure>>) {
+    fn add(&mut self, outcomes: &BTreeMap<String, Result<GeneratedMotion, Failure>>) {
         for (name, outcome) in outcomes {
             match outcome {
                 Ok(made) => self.add_made(made),

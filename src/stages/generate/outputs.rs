@@ -15,7 +15,7 @@ use crate::view::{Audio, View, ViewSample, mime_of, page};
 
 /// What a motion is written as.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, clap::ValueEnum)]
-pub enum Format {
+pub enum MotionFormat {
     /// NumPy, [frames, 25].
     Npy,
     /// One line for each frame.
@@ -34,7 +34,7 @@ pub enum Format {
     Html,
 }
 
-impl Format {
+impl MotionFormat {
     /// What is written unless the user says otherwise.
     pub const DEFAULT: [Self; 4] = [Self::Npy, Self::Glb, Self::Png, Self::Html];
 
@@ -54,7 +54,7 @@ impl Format {
 }
 
 /// A motion and what belongs to it.
-pub struct Output<'a> {
+pub struct MotionOutput<'a> {
     pub name: &'a str,
     pub frames: ArrayView2<'a, f32>,
     pub beats_s: &'a [f64],
@@ -65,8 +65,12 @@ pub struct Output<'a> {
 /// Writes a motion into a folder in some formats; returns the files.
 ///
 /// # Errors
-/// What the disk says, with the file's name; each file is whole or not there.
-pub fn write(output: &Output, formats: &[Format], folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
+/// The error of the file system, with the file's name; each file is whole or not there.
+pub fn write(
+    output: &MotionOutput,
+    formats: &[MotionFormat],
+    folder: &Path,
+) -> anyhow::Result<Vec<PathBuf>> {
     let mut written = Vec::new();
     for &format in formats {
         let path = folder.join(format!("{}.{}", output.name, format.extension()));
@@ -77,28 +81,28 @@ pub fn write(output: &Output, formats: &[Format], folder: &Path) -> anyhow::Resu
     Ok(written)
 }
 
-fn write_as(output: &Output, format: Format, path: &Path) -> anyhow::Result<()> {
+fn write_as(output: &MotionOutput, format: MotionFormat, path: &Path) -> anyhow::Result<()> {
     let frames = output.frames;
     let to_file = |write: &dyn Fn(&mut dyn Write) -> io::Result<()>| -> anyhow::Result<()> {
         write_file(path, |out| write(out))?;
         Ok(())
     };
     match format {
-        Format::Npy => to_file(&|out| write_npy(frames, out)),
-        Format::Csv => to_file(&|out| write_csv(frames, out)),
-        Format::Bvh => to_file(&|out| write_bvh(frames, out)),
-        Format::Glb => {
+        MotionFormat::Npy => to_file(&|out| write_npy(frames, out)),
+        MotionFormat::Csv => to_file(&|out| write_csv(frames, out)),
+        MotionFormat::Bvh => to_file(&|out| write_bvh(frames, out)),
+        MotionFormat::Glb => {
             let audio = output.audio.file_name().map(|name| name.to_string_lossy().into_owned());
             to_file(&|out| write_glb(frames, audio.as_deref(), out))
         }
-        Format::Parquet => {
+        MotionFormat::Parquet => {
             let file = temporary_beside(path)?;
             let mut writer = PartWriter::new(tables::motion(), file)?;
             writer.write_frames(output.name, frames)?;
             replace_file(path, writer.finish(&[])?.file)?;
             Ok(())
         }
-        Format::Png | Format::Svg => {
+        MotionFormat::Png | MotionFormat::Svg => {
             let motion = Trajectory::new(frames.to_owned())?;
             let figure = MotionPlot {
                 title: output.name,
@@ -107,18 +111,19 @@ fn write_as(output: &Output, format: Format, path: &Path) -> anyhow::Result<()> 
                 first_frame: 0,
                 jerk_limit_m_s3: TemporalConfig::default().target_jerk,
             };
-            let format = if format == Format::Png { plot::Format::Png } else { plot::Format::Svg };
+            let format =
+                if format == MotionFormat::Png { plot::Format::Png } else { plot::Format::Svg };
             let bytes = plot::motion(&figure, &MotionPanel::USUAL, MOTION_WIDTH_PX, format)?.bytes;
             to_file(&|out| out.write_all(&bytes))
         }
-        Format::Html => {
+        MotionFormat::Html => {
             let text = page(&self::view(output)?);
             to_file(&|out| out.write_all(text.as_bytes()))
         }
     }
 }
 
-fn view(output: &Output) -> anyhow::Result<View> {
+fn view(output: &MotionOutput) -> anyhow::Result<View> {
     let bytes = std::fs::read(output.audio)
         .with_context(|| format!("while reading {}", output.audio.display()))?;
     let extension = output.audio.extension().and_then(|e| e.to_str()).unwrap_or_default();

@@ -7,8 +7,8 @@ use anyhow::{bail, ensure};
 use clap::{Args as _, FromArgMatches as _};
 use serde::{Deserialize, Serialize};
 
-use super::constraints_file::Asked;
-use super::outputs::Format;
+use super::constraints_file::ConstraintsRequest;
+use super::outputs::MotionFormat;
 use super::settings::{MotionSettings, OUTPUT_VERSION};
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
 use crate::generation::{ModelCard, OVERLAP_FRAMES};
@@ -61,8 +61,8 @@ pub struct Params {
     pub output: Option<PathBuf>,
     /// With --audio: what is written of each motion.
     #[arg(long, value_enum, value_name = "FORMAT", value_delimiter = ',', num_args = 1..,
-          default_values_t = Format::DEFAULT)]
-    pub format: Vec<Format>,
+          default_values_t = MotionFormat::DEFAULT)]
+    pub format: Vec<MotionFormat>,
     /// With --audio: writes the frames of the first motion as CSV, as soon as they are final and before
     /// post-processing; - is the standard output.
     #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-", requires = "audio")]
@@ -251,7 +251,7 @@ pub struct Settings {
     pub overlap_frames: usize,
     pub prime: Option<Prime>,
     pub postprocess: PostProcessConfig,
-    pub constraints: Option<Asked>,
+    pub constraints: Option<ConstraintsRequest>,
     pub constraint_strength: f64,
     pub soft: bool,
     pub no_clock: bool,
@@ -292,7 +292,9 @@ impl Settings {
             "--constraint-strength {strength} is no share; give a number from 0 to 1"
         );
         let constraints = match &params.constraints {
-            Some(path) => Some(Asked::read(path, |path| Ok(read_motion(path)?.into_array()))?),
+            Some(path) => {
+                Some(ConstraintsRequest::read(path, |path| Ok(read_motion(path)?.into_array()))?)
+            }
             None => None,
         };
         Ok(Self {

@@ -9,16 +9,16 @@ use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
 
 use super::maker::Maker;
-use super::outputs::Format;
+use super::outputs::MotionFormat;
 use super::settings::MotionSettings;
 use crate::store::{digest_of, digest_texts, write_file};
 
 /// Raised when generate writes other files for the same motion.
 const FILES_VERSION: &str = "1";
-/// What the names of receipts end with.
+/// The suffix of the names of receipts.
 const SUFFIX: &str = "motiongen.json";
 
-/// What a motion was made from, and the files that it was written into.
+/// The inputs that a motion was made from, and the files that it was written into.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Receipt {
     /// Digest of all that determines the motion.
@@ -55,7 +55,7 @@ impl Receipt {
     }
 
     /// Returns whether a folder has this motion in some formats, each file as it was written.
-    pub fn is_kept(&self, folder: &Path, name: &str, formats: &[Format]) -> bool {
+    pub fn is_kept(&self, folder: &Path, name: &str, formats: &[MotionFormat]) -> bool {
         let Some(known) = Self::read(folder, name).filter(|known| known.key == self.key) else {
             return false;
         };
@@ -68,8 +68,13 @@ impl Receipt {
     /// Writes the receipt of a motion that was written in some formats.
     ///
     /// # Errors
-    /// What the disk says.
-    pub fn keep(mut self, folder: &Path, name: &str, formats: &[Format]) -> anyhow::Result<()> {
+    /// The error of the file system.
+    pub fn keep(
+        mut self,
+        folder: &Path,
+        name: &str,
+        formats: &[MotionFormat],
+    ) -> anyhow::Result<()> {
         if let Some(known) = Self::read(folder, name).filter(|known| known.key == self.key) {
             self.files = known.files;
         }
@@ -94,7 +99,7 @@ fn place(folder: &Path, name: &str) -> PathBuf {
     folder.join(format!("{name}.{SUFFIX}"))
 }
 
-fn file(folder: &Path, name: &str, format: Format) -> PathBuf {
+fn file(folder: &Path, name: &str, format: MotionFormat) -> PathBuf {
     folder.join(format!("{name}.{}", format.extension()))
 }
 

@@ -3,36 +3,36 @@
 use std::io::{self, Write};
 use std::path::PathBuf;
 
-use super::Done;
+use super::GenerateTally;
 use crate::stages::Summary;
 use crate::stages::failure::{N_SHOWN, failures_json, write_failures};
 
 /// Where motions go.
-pub enum Place {
+pub enum GeneratePlace {
     Store { store: String, run: String },
     Folder(PathBuf),
 }
 
 /// The account of a run.
-pub struct Report {
-    pub place: Place,
-    pub done: Done,
+pub struct GenerateSummary {
+    pub place: GeneratePlace,
+    pub done: GenerateTally,
     pub model: String,
     pub made_with: String,
     pub dry_run: bool,
     pub took_s: f64,
 }
 
-impl Summary for Report {
+impl Summary for GenerateSummary {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
         let Self { place, done, made_with, took_s, .. } = self;
         match place {
-            Place::Store { store, .. } => writeln!(out, "generate → {store}")?,
-            Place::Folder(folder) => writeln!(out, "generate → {}", folder.display())?,
+            GeneratePlace::Store { store, .. } => writeln!(out, "generate → {store}")?,
+            GeneratePlace::Folder(folder) => writeln!(out, "generate → {}", folder.display())?,
         }
         writeln!(out, "  {made_with}")?;
         if self.dry_run {
-            let Done { n_todo, todo_s, n_unchanged, .. } = done;
+            let GenerateTally { n_todo, todo_s, n_unchanged, .. } = done;
             let length = if *todo_s > 0.0 { format!(" ({todo_s:.1} s)") } else { String::new() };
             writeln!(
                 out,
@@ -75,14 +75,14 @@ impl Summary for Report {
             }
         }
         let url = match place {
-            Place::Store { store, .. } => Some(store.as_str()),
-            Place::Folder(_) => None,
+            GeneratePlace::Store { store, .. } => Some(store.as_str()),
+            GeneratePlace::Folder(_) => None,
         };
         write_failures(out, done.failed.iter().map(|(name, why)| (name, why)), url)?;
         if done.is_interrupted {
             writeln!(out, "  stopped as asked; the same command goes on with what is missing")?;
         }
-        if let Place::Store { store, run } = place {
+        if let GeneratePlace::Store { store, run } = place {
             writeln!(
                 out,
                 "  motiongen query --store {store} \"select phrase_id, score, real_time_factor from \
@@ -103,8 +103,8 @@ impl Summary for Report {
     fn figures(&mut self) -> serde_json::Value {
         let Self { place, done, .. } = self;
         let (to, run) = match place {
-            Place::Store { store, run } => (store.clone(), Some(run.clone())),
-            Place::Folder(folder) => (folder.display().to_string(), None),
+            GeneratePlace::Store { store, run } => (store.clone(), Some(run.clone())),
+            GeneratePlace::Folder(folder) => (folder.display().to_string(), None),
         };
         let files: Vec<String> = done
             .told

@@ -11,7 +11,7 @@ use crate::store::digest;
 /// Raised when generate writes something else for the same model, music and settings.
 pub(super) const OUTPUT_VERSION: u32 = 3;
 
-/// What determines a motion beside its music and its candidate: the column `settings` of `generations`, and
+/// The settings that determine a motion beside its music and its candidate: the column `settings` of `generations`, and
 /// what the digest of a generation is made of.
 ///
 /// As text it is JSON in the order of these fields, the same in every build. `weights` and `seed` have columns

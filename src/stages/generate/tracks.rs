@@ -1,7 +1,7 @@
 //! The phrases of a store, made batch by batch.
 //!
-//! As in extract, a batch is a range of the phrases' stable hash, cut by the table of phrases alone: whoever
-//! does it, whenever, writes the same motions under the same name. Phrases of a batch are made side by side,
+//! As in extract, a batch is a range of the phrases' stable hash, cut by the table of phrases alone: every
+//! process, at any time, writes the same motions under the same name. Phrases of a batch are made side by side,
 //! and the batch is committed when its last one is done.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
@@ -11,9 +11,9 @@ use std::sync::Mutex;
 use anyhow::{bail, ensure};
 use ndarray::Array2;
 
-use super::maker::{Made, Maker, Music, generation_id};
+use super::maker::{GeneratedMotion, Maker, PhraseMusic, generation_id};
 use super::params::Tracks;
-use super::{Done, Generate};
+use super::{Generate, GenerateTally};
 use crate::stages::beats::{self, BeatSource, PhraseBeats};
 use crate::stages::extract::pool::{self, lock};
 use crate::stages::failure::{Failure, FailureKind};
@@ -35,7 +35,7 @@ const MAX_BATCH_PHRASES: usize = 64;
 const MAX_FRAMES_AHEAD: usize = 128 << 10;
 
 /// The store and what is asked of it.
-pub struct Target<'a> {
+pub struct TrackTarget<'a> {
     pub store: &'a Location,
     pub shard: Shard,
     pub params_hash: &'a str,
@@ -49,8 +49,8 @@ pub struct Target<'a> {
     pub n_workers: NonZeroUsize,
 }
 
-/// A phrase to be danced to.
-struct Task {
+/// A phrase to generate motion for.
+struct TrackTask {
     batch: u64,
     row: PhraseRow,
     n_frames: usize,
@@ -61,7 +61,7 @@ struct Task {
     samples: Vec<usize>,
 }
 
-impl Task {
+impl TrackTask {
     /// Returns what tells whether motions have to be made again though the phrase's files are the same. Beats that
     /// are as release 0.1 had them leave its motions alone.
     fn fingerprint(&self) -> String {
@@ -76,14 +76,18 @@ impl Task {
     }
 }
 
-type Outcome = Result<Made, Failure>;
+type TrackOutcome = Result<GeneratedMotion, Failure>;
 
 /// Makes what `target` lacks.
 ///
 /// # Errors
 /// When the store cannot be read or written; what was committed stays.
-pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::Result<Done> {
-    let mut planned = Planned::new(maker, target)?;
+pub fn run(
+    maker: &Maker,
+    target: &TrackTarget,
+    progress: &dyn Progress,
+) -> anyhow::Result<GenerateTally> {
+    let mut planned = TrackPlan::new(maker, target)?;
     if target.dry_run || planned.tasks.is_empty() {
         return Ok(planned.done);
     }
@@ -93,17 +97,17 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
     let (lease, has_waited) = lease::take(target.store, &name, &what, &|text| progress.note(text))?;
     if has_waited {
         // The other process may have made some of the motions.
-        planned = Planned::new(maker, target)?;
+        planned = TrackPlan::new(maker, target)?;
     }
-    let Planned { snapshot, ledger, tasks, mut done } = planned;
+    let TrackPlan { snapshot, ledger, tasks, mut done } = planned;
     target.store.sweep();
     snapshot.checkpoint();
     progress.start_audio("generate", done.todo_s.ceil() as u64);
-    let mut batches: BTreeMap<u64, Vec<Task>> = BTreeMap::new();
+    let mut batches: BTreeMap<u64, Vec<TrackTask>> = BTreeMap::new();
     for task in tasks {
         batches.entry(task.batch).or_default().push(task);
     }
-    let batches: Vec<Vec<Task>> = batches.into_values().collect();
+    let batches: Vec<Vec<TrackTask>> = batches.into_values().collect();
     let mut ahead = MusicAhead::new(&snapshot)?;
     for (i, tasks) in batches.iter().enumerate() {
         ahead.read(&batches[i..])?;
@@ -123,18 +127,18 @@ pub fn run(maker: &Maker, target: &Target, progress: &dyn Progress) -> anyhow::R
 }
 
 /// The store as it was when it was looked at, and what it lacks.
-struct Planned {
+struct TrackPlan {
     snapshot: StoreSnapshot,
     ledger: Ledger,
-    tasks: Vec<Task>,
-    done: Done,
+    tasks: Vec<TrackTask>,
+    done: GenerateTally,
 }
 
-impl Planned {
-    fn new(maker: &Maker, target: &Target) -> anyhow::Result<Self> {
+impl TrackPlan {
+    fn new(maker: &Maker, target: &TrackTarget) -> anyhow::Result<Self> {
         let snapshot = StoreSnapshot::take(target.store)?;
         let ledger = snapshot.ledger(Generate::NAME)?;
-        let mut done = Done::default();
+        let mut done = GenerateTally::default();
         let tasks = plan(maker, target, &snapshot, &ledger, &mut done)?;
         done.n_todo = tasks.iter().map(|task| task.samples.len() as u64).sum();
         done.todo_s =
@@ -162,7 +166,7 @@ impl MusicAhead {
     }
 
     /// Reads the features of the first of `batches` and of those behind it that fit, unless they are at hand.
-    fn read(&mut self, batches: &[Vec<Task>]) -> Result<(), StoreError> {
+    fn read(&mut self, batches: &[Vec<TrackTask>]) -> Result<(), StoreError> {
         if self.n_ahead > 0 {
             return Ok(());
         }
@@ -183,7 +187,7 @@ impl MusicAhead {
     }
 
     /// Drops the features of a batch that was made.
-    fn forget(&mut self, tasks: &[Task]) {
+    fn forget(&mut self, tasks: &[TrackTask]) {
         self.n_ahead = self.n_ahead.saturating_sub(1);
         for task in tasks {
             self.at_hand.remove(&task.row.phrase_id);
@@ -194,11 +198,11 @@ impl MusicAhead {
 /// Returns the phrases that lack motions, in the order in which they are made.
 fn plan(
     maker: &Maker,
-    target: &Target,
+    target: &TrackTarget,
     snapshot: &StoreSnapshot,
     ledger: &Ledger,
-    done: &mut Done,
-) -> anyhow::Result<Vec<Task>> {
+    done: &mut GenerateTally,
+) -> anyhow::Result<Vec<TrackTask>> {
     let store = target.store;
     let rows: Vec<PhraseRow> = snapshot.table(PhraseRow::schema())?.rows()?;
     if rows.is_empty() {
@@ -214,13 +218,13 @@ fn plan(
         extractions.iter().map(|row| (row.phrase_id.as_str(), row.n_frames)).collect();
     let outdated = outdated_features(snapshot, &rows)?;
     let is_wanted = |row: &PhraseRow| {
-        let of_kind = match target.tracks {
+        let is_of_kind = match target.tracks {
             Tracks::All => true,
             Tracks::Constructed => row.is_constructed(),
             Tracks::Songs => !row.is_constructed() && (row.has_audio || row.has_features),
         };
         let is_named = target.phrases.is_empty() || target.phrases.contains(&row.phrase_id);
-        let is_kind = of_kind || (!target.phrases.is_empty() && is_named);
+        let is_kind = is_of_kind || (!target.phrases.is_empty() && is_named);
         is_kind && is_named && target.split.is_none_or(|split| row.split == split)
     };
     let n_frames = |row: &PhraseRow| {
@@ -228,13 +232,13 @@ fn plan(
         let n = extracted.get(row.phrase_id.as_str()).copied().or(own).unwrap_or(0);
         usize::try_from(n).unwrap_or(0)
     };
-    let mut tasks: Vec<Task> = rows
+    let mut tasks: Vec<TrackTask> = rows
         .into_iter()
         .filter(|row| is_wanted(row))
         .map(|row| {
             let (n_frames, beats) = (n_frames(&row), PhraseBeats::default());
             let has_old_features = outdated.contains(&row.phrase_id);
-            Task { batch: 0, n_frames, row, beats, has_old_features, samples: Vec::new() }
+            TrackTask { batch: 0, n_frames, row, beats, has_old_features, samples: Vec::new() }
         })
         .collect();
     let total_s: f64 =
@@ -270,13 +274,13 @@ fn plan(
 /// Makes the phrases of a batch side by side.
 fn make_batch(
     maker: &Maker,
-    target: &Target,
-    tasks: &[Task],
+    target: &TrackTarget,
+    tasks: &[TrackTask],
     ahead: &MusicAhead,
     progress: &dyn Progress,
-) -> anyhow::Result<BTreeMap<String, Outcome>> {
+) -> anyhow::Result<BTreeMap<String, TrackOutcome>> {
     // The longest first, so that no worker is left with it at the end.
-    let mut order: Vec<(&Task, usize)> = tasks
+    let mut order: Vec<(&TrackTask, usize)> = tasks
         .iter()
         .flat_map(|task| task.samples.iter().map(move |&sample| (task, sample)))
         .collect();
@@ -288,12 +292,12 @@ fn make_batch(
     pool::run(
         target.n_workers,
         || queue.next(),
-        |(task, sample): (&Task, usize)| -> anyhow::Result<()> {
+        |(task, sample): (&TrackTask, usize)| -> anyhow::Result<()> {
             let id = &task.row.phrase_id;
             let outcome = match ahead.at_hand.get(id) {
                 Some(_) if task.has_old_features => Err(with_old_features(&task.row, target.store)),
                 Some(features) => {
-                    let music = Music {
+                    let music = PhraseMusic {
                         phrase_id: id,
                         content_hash: &task.row.content_hash,
                         source: url_of(&task.row),
@@ -347,12 +351,12 @@ fn with_old_features(row: &PhraseRow, store: &Location) -> Failure {
 /// Writes a batch: its motions, what is known of them, and what failed.
 fn commit(
     maker: &Maker,
-    target: &Target,
+    target: &TrackTarget,
     ledger: &Ledger,
-    tasks: &[Task],
-    outcomes: BTreeMap<String, Outcome>,
+    tasks: &[TrackTask],
+    outcomes: BTreeMap<String, TrackOutcome>,
 ) -> anyhow::Result<()> {
-    let tasks: HashMap<String, (&Task, usize)> = tasks
+    let tasks: HashMap<String, (&TrackTask, usize)> = tasks
         .iter()
         .flat_map(|task| task.samples.iter().map(move |&sample| (task, sample)))
         .map(|(task, sample)| {

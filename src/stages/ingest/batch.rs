@@ -1,18 +1,18 @@
 //! Batches: phrases that are read, checked and committed together.
 //!
 //! A batch is a range of the phrases' stable hash, so what is in it depends on the source alone:
-//! whoever does it, whenever, after however many kills, writes the same bytes under the same name.
+//! every process, at any time and after any number of kills, writes the same bytes under the same name.
 
 use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
-use super::layout::{Planned, Role};
-use super::phrase::{Files, Phrase, Rules};
-use super::{BEATS_VERSION, CAPTURE_VERSION, Ingest, Refused, Tally, notes_of};
+use super::layout::{PlannedPhrase, Role};
+use super::phrase::{CheckedPhrase, IngestRules, PhraseFiles};
+use super::{BEATS_VERSION, CAPTURE_VERSION, FailedPhrase, Ingest, IngestTally, notes_of};
 use crate::stages::beats::{self, BeatSource};
 use crate::stages::failure::{Failure, FailureKind, guarded};
-use crate::stages::seen::Seen;
+use crate::stages::seen::SeenContent;
 use crate::stages::{Progress, Stage as _};
 use crate::store::tables::{self, BeatRow, FailureRow, PhraseRow};
 use crate::store::{
@@ -24,12 +24,12 @@ use crate::store::{
 const MAX_BATCH_BYTES: u64 = 256 << 20;
 
 /// Everything that the batches of a run share.
-pub struct Job<'a> {
+pub struct IngestJob<'a> {
     pub source: &'a Source,
     pub store: &'a Location,
     pub ledger: &'a Ledger,
-    pub seen: &'a Seen,
-    pub rules: &'a Rules,
+    pub seen: &'a SeenContent,
+    pub rules: &'a IngestRules,
     pub params_hash: &'a str,
     pub progress: &'a dyn Progress,
     /// Phrases of the store that lack the identity of their music, and have it now.
@@ -42,16 +42,16 @@ pub struct Job<'a> {
 ///
 /// `all` is the whole plan (it sets the number of batches), `todo` the phrases to do now.
 pub fn batches<'p>(
-    all: &[Planned],
-    todo: Vec<&'p Planned>,
+    all: &[PlannedPhrase],
+    todo: Vec<&'p PlannedPhrase>,
     batch_phrases: usize,
-) -> Vec<Vec<&'p Planned>> {
+) -> Vec<Vec<&'p PlannedPhrase>> {
     let n_bytes: u64 = all.iter().flat_map(|p| &p.files).map(|(_, file)| file.size_bytes).sum();
     let by_count = all.len().div_ceil(batch_phrases.max(1)) as u64;
     let by_bytes = n_bytes.div_ceil(MAX_BATCH_BYTES);
     // A power of two, so that shards in powers of two hold whole batches.
     let n_batches = by_count.max(by_bytes).max(1).next_power_of_two();
-    let mut batches: Vec<Vec<&Planned>> = vec![Vec::new(); n_batches as usize];
+    let mut batches: Vec<Vec<&PlannedPhrase>> = vec![Vec::new(); n_batches as usize];
     for phrase in todo {
         batches[batch_of(&phrase.id, n_batches) as usize].push(phrase);
     }
@@ -59,15 +59,19 @@ pub fn batches<'p>(
     batches
 }
 
-impl Job<'_> {
+impl IngestJob<'_> {
     /// Does all batches on `n_workers` threads; where the user asks for an end, those that are under way.
     ///
     /// # Errors
     /// The first [`StoreError`] of the store itself; what was committed stays.
-    pub fn run(&self, batches: &[Vec<&Planned>], n_workers: usize) -> Result<Tally, StoreError> {
+    pub fn run(
+        &self,
+        batches: &[Vec<&PlannedPhrase>],
+        n_workers: usize,
+    ) -> Result<IngestTally, StoreError> {
         let next = AtomicUsize::new(0);
         let stop = AtomicBool::new(false);
-        let total: Mutex<Result<Tally, StoreError>> = Mutex::new(Ok(Tally::default()));
+        let total: Mutex<Result<IngestTally, StoreError>> = Mutex::new(Ok(IngestTally::default()));
         std::thread::scope(|scope| {
             for _ in 0..n_workers.clamp(1, batches.len().max(1)) {
                 scope.spawn(|| {
@@ -103,7 +107,7 @@ impl Job<'_> {
     ///
     /// # Errors
     /// [`StoreError`] of the store.
-    pub fn forget_failures(&self, all: &[Planned], shard: Shard) -> Result<(), StoreError> {
+    pub fn forget_failures(&self, all: &[PlannedPhrase], shard: Shard) -> Result<(), StoreError> {
         let origin = self.source.location().url();
         let there: BTreeSet<&str> = all.iter().map(|p| p.id.as_str()).collect();
         let suffix = self.contested("");
@@ -117,12 +121,12 @@ impl Job<'_> {
         if commit.is_empty() { Ok(()) } else { commit.publish().map(|_| ()) }
     }
 
-    fn batch(&self, batch: &[&Planned]) -> Result<Tally, StoreError> {
-        let mut tally = Tally::default();
+    fn batch(&self, batch: &[&PlannedPhrase]) -> Result<IngestTally, StoreError> {
+        let mut tally = IngestTally::default();
         let mut commit =
             Commit::new(self.store, Ingest::NAME, self.params_hash, self.source.location().url());
         let mut seen = self.seen.start(self.store, self.source.location().url());
-        let mut rows = Rows::default();
+        let mut rows = BatchRows::default();
         let readable = batch.iter().filter(|p| p.problem.is_none());
         let files = readable.flat_map(|p| p.files.iter().map(|(_, f)| f.clone())).collect();
         let mut contents = self.source.read_in_order(files);
@@ -143,7 +147,7 @@ impl Job<'_> {
             self.settle(planned, &content_hash, outcome, &mut commit, &mut tally, &mut rows)?;
             self.progress.advance(1);
         }
-        let Rows { phrases, beats, mut failures } = rows;
+        let BatchRows { phrases, beats, mut failures } = rows;
         if !phrases.is_empty() {
             commit.part(PhraseRow::schema().name, PhraseRow::schema)?.write_rows(&phrases)?;
         }
@@ -168,9 +172,9 @@ impl Job<'_> {
     /// touched, or are those of a second source.
     fn see(
         &self,
-        planned: &Planned,
+        planned: &PlannedPhrase,
         content_hash: &str,
-        outcome: &Result<Phrase, Failure>,
+        outcome: &Result<CheckedPhrase, Failure>,
         seen: &mut Commit<'_>,
     ) {
         let Some(known) = self.ledger.get(&planned.id) else { return };
@@ -190,14 +194,14 @@ impl Job<'_> {
     /// not the job.
     fn phrase(
         &self,
-        planned: &Planned,
+        planned: &PlannedPhrase,
         files: Vec<(Role, SourceFile, Result<Content, StoreError>)>,
-    ) -> (String, Result<Phrase, Failure>) {
+    ) -> (String, Result<CheckedPhrase, Failure>) {
         let without_content = |failure: &Failure| digest(failure.message.as_bytes());
         if let Some(problem) = &planned.problem {
             return (without_content(problem), Err((**problem).clone()));
         }
-        let files = match Files::take(files) {
+        let files = match PhraseFiles::take(files) {
             Ok(files) => files,
             Err(failure) => return (without_content(&failure), Err(failure)),
         };
@@ -210,12 +214,12 @@ impl Job<'_> {
     /// Writes an outcome into the commit unless the store has it already.
     fn settle(
         &self,
-        planned: &Planned,
+        planned: &PlannedPhrase,
         content_hash: &str,
-        mut outcome: Result<Phrase, Failure>,
+        mut outcome: Result<CheckedPhrase, Failure>,
         commit: &mut Commit<'_>,
-        tally: &mut Tally,
-        rows: &mut Rows,
+        tally: &mut IngestTally,
+        rows: &mut BatchRows,
     ) -> Result<(), StoreError> {
         let mut id = planned.id.clone();
         let contested = self.contested(&id);
@@ -244,7 +248,7 @@ impl Job<'_> {
                 tally.noted.extend(notes.map(|notes| (id.clone(), notes)));
             }
             Err(failure) => {
-                tally.failed.push(Refused { id: id.clone(), failure: failure.clone() });
+                tally.failed.push(FailedPhrase { id: id.clone(), failure: failure.clone() });
             }
         }
         let fingerprint = fingerprint(planned);
@@ -256,7 +260,7 @@ impl Job<'_> {
         if unchanged {
             return Ok(());
         }
-        if let Ok(Phrase { motion: Some(motion), .. }) = &outcome {
+        if let Ok(CheckedPhrase { motion: Some(motion), .. }) = &outcome {
             let part = commit.part(tables::MOTION, tables::motion)?;
             part.write_frames(&id, motion.view())?;
         }
@@ -278,7 +282,7 @@ impl Job<'_> {
     ///
     /// Its rows were true when they were written, and a disk or a network that fails for an hour says
     /// nothing about them: they stay, and the failure is listed beside them.
-    fn is_out_of_reach(&self, id: &str, outcome: &Result<Phrase, Failure>) -> bool {
+    fn is_out_of_reach(&self, id: &str, outcome: &Result<CheckedPhrase, Failure>) -> bool {
         matches!(outcome, Err(failure) if failure.kind == FailureKind::Unreadable)
             && self.ledger.get(id).is_some_and(|known| known.item.succeeded())
     }
@@ -290,7 +294,11 @@ impl Job<'_> {
     }
 
     /// Refuses a phrase whose name the store has from elsewhere with other content.
-    fn claimed_by_another_source(&self, planned: &Planned, content_hash: &str) -> Option<Failure> {
+    fn claimed_by_another_source(
+        &self,
+        planned: &PlannedPhrase,
+        content_hash: &str,
+    ) -> Option<Failure> {
         let known = self.ledger.get(&planned.id)?;
         // Release 0.1 kept the content hash of every phrase.
         let same = [content_hash, &input_hash(planned, content_hash)];
@@ -311,7 +319,7 @@ impl Job<'_> {
         Some(Failure::new(FailureKind::DuplicateId, path, message))
     }
 
-    fn phrase_row(&self, planned: &Planned, phrase: Phrase) -> PhraseRow {
+    fn phrase_row(&self, planned: &PlannedPhrase, phrase: CheckedPhrase) -> PhraseRow {
         let location = self.source.location();
         let file = |name: &str| planned.files.iter().find(|(role, _)| role.name() == name);
         let url = |name| file(name).map(|(_, f)| location.url_of(&f.path));
@@ -377,7 +385,7 @@ pub fn contested(id: &str, origin: &str) -> String {
 
 /// The rows of a batch but for motion.
 #[derive(Default)]
-struct Rows {
+struct BatchRows {
     phrases: Vec<PhraseRow>,
     beats: Vec<BeatRow>,
     failures: Vec<FailureRow>,
@@ -385,7 +393,7 @@ struct Rows {
 
 /// Returns what a phrase's rows are made from, as its item names it: its content, and the versions of what is
 /// written for a beat list and a motion capture.
-fn input_hash(planned: &Planned, content_hash: &str) -> String {
+fn input_hash(planned: &PlannedPhrase, content_hash: &str) -> String {
     match version_lines(planned) {
         lines if lines.is_empty() => content_hash.to_owned(),
         lines => digest(format!("{content_hash}\n{lines}").as_bytes()),
@@ -393,7 +401,7 @@ fn input_hash(planned: &Planned, content_hash: &str) -> String {
 }
 
 /// Returns lines that only phrases with a beat list or a motion capture have.
-fn version_lines(planned: &Planned) -> String {
+fn version_lines(planned: &PlannedPhrase) -> String {
     let has = |wanted| planned.files.iter().any(|(role, _)| *role == wanted);
     let mut lines = String::new();
     if has(Role::Beats) {
@@ -406,7 +414,7 @@ fn version_lines(planned: &Planned) -> String {
 }
 
 /// Returns what the storage says of a phrase's files, without reading them.
-pub fn fingerprint(planned: &Planned) -> String {
+pub fn fingerprint(planned: &PlannedPhrase) -> String {
     let lines: String = planned
         .files
         .iter()

@@ -26,7 +26,7 @@ pub enum Layout {
     Library,
 }
 
-/// What a file is to its phrase.
+/// The role of a file in its phrase.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Role {
     Audio,
@@ -50,7 +50,7 @@ impl Role {
 
 /// A phrase to ingest, or the reason why it cannot even be tried.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Planned {
+pub struct PlannedPhrase {
     pub id: String,
     /// The phrase's files, sorted by role.
     pub files: Vec<(Role, SourceFile)>,
@@ -59,14 +59,14 @@ pub struct Planned {
 
 /// Everything that a source offers, phrases sorted by id.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Plan {
-    pub phrases: Vec<Planned>,
+pub struct IngestPlan {
+    pub phrases: Vec<PlannedPhrase>,
     /// Files that belong to no phrase.
     pub ignored: Vec<String>,
 }
 
 /// Assigns every file of a listing to a phrase, to the ignored files, or to a failure.
-pub fn plan(listing: Listing, layout: Layout) -> Plan {
+pub fn plan(listing: Listing, layout: Layout) -> IngestPlan {
     let phrases = match layout {
         Layout::Phrases => true,
         Layout::Library => false,
@@ -103,7 +103,7 @@ fn looks_like_phrases(listing: &Listing) -> bool {
 fn phrase_layout(listing: Listing, drafts: &mut Drafts) {
     let lacking = lacking_files(&listing);
     for folder in listing.folders {
-        // What a folder holds that is called like a phrase's file is nobody's.
+        // The contents of a folder whose name is that of a phrase's file belong to no phrase.
         if let Some((id, _)) = phrase_slot(&folder) {
             drafts.fail(id.to_owned(), not_a_file(&folder));
         }
@@ -258,7 +258,7 @@ fn library_layout(listing: Listing, drafts: &mut Drafts) {
     }
 }
 
-/// What becomes a plan, in the order in which it is met.
+/// Phrases of a plan under construction, in the order in which they are found.
 #[derive(Default)]
 struct Drafts {
     /// The id of a phrase, and what is known of it.
@@ -292,15 +292,15 @@ impl Drafts {
         self.fail(id.unwrap_or(problem.path), failure);
     }
 
-    fn finish(mut self) -> Plan {
+    fn finish(mut self) -> IngestPlan {
         // Of several problems of a phrase the first counts, so that the sort has to be stable.
         self.entries.sort_by(|a, b| a.0.cmp(&b.0));
         let is_first = |i: usize| i == 0 || self.entries[i].0 != self.entries[i - 1].0;
         let n_phrases = (0..self.entries.len()).filter(|&i| is_first(i)).count();
-        let mut phrases: Vec<Planned> = Vec::with_capacity(n_phrases);
+        let mut phrases: Vec<PlannedPhrase> = Vec::with_capacity(n_phrases);
         for (id, draft) in self.entries {
             if phrases.last().is_none_or(|last| last.id != id) {
-                phrases.push(Planned { id, files: Vec::new(), problem: None });
+                phrases.push(PlannedPhrase { id, files: Vec::new(), problem: None });
             }
             let Some(phrase) = phrases.last_mut() else { continue };
             match draft {
@@ -321,12 +321,12 @@ impl Drafts {
             }
         }
         self.ignored.sort();
-        Plan { phrases, ignored: self.ignored }
+        IngestPlan { phrases, ignored: self.ignored }
     }
 }
 
 /// Returns why the files of a phrase cannot be one phrase.
-fn conflict(phrase: &Planned) -> Option<Failure> {
+fn conflict(phrase: &PlannedPhrase) -> Option<Failure> {
     for pair in phrase.files.windows(2) {
         let [(a_role, a), (b_role, b)] = pair else { continue };
         if a_role.name() == b_role.name() {

@@ -18,14 +18,14 @@ use crate::store::{
 };
 
 use super::failure::{Failure, failures_json, write_failures, write_notes};
-use super::seen::Seen;
+use super::seen::SeenContent;
 pub(in crate::stages) use crate::audio::formats::is_audio_extension as is_audio;
-pub use layout::{Layout, Plan, Planned, Role, plan};
+pub use layout::{IngestPlan, Layout, PlannedPhrase, Role, plan};
 pub(in crate::stages) use motion::{
     CAPTURE_EXTENSIONS, ReadMotion, notes_of, read_bvh, read_motion, read_trajectory,
 };
 pub(in crate::stages) use phrase::read_beats;
-pub use phrase::{Rules, content_hash_of_audio};
+pub use phrase::{IngestRules, content_hash_of_audio};
 
 /// Raised when ingest writes something else for the same input and rules.
 const OUTPUT_VERSION: u32 = 1;
@@ -52,7 +52,7 @@ pub struct Params {
     #[arg(long, value_enum, value_name = "LAYOUT", default_value_t = Layout::Auto)]
     pub layout: Layout,
     #[command(flatten)]
-    pub rules: Rules,
+    pub rules: IngestRules,
     /// Part of the job that this process does: i/n, or auto inside an array job.
     #[arg(long, value_name = "I/N", default_value_t = Shard::WHOLE.to_string())]
     pub shard: String,
@@ -111,7 +111,7 @@ impl Stage for Ingest {
         }
         let snapshot = StoreSnapshot::take(&store)?;
         let ledger = snapshot.ledger(Self::NAME)?;
-        let seen = Seen::read(&store, SEEN)?;
+        let seen = SeenContent::read(&store, SEEN)?;
         let params_hash = params_hash(&params.rules);
 
         // With --force everything is done again anyway, also where old parts cannot be read.
@@ -119,7 +119,7 @@ impl Stage for Ingest {
 
         let mine: Vec<_> = plan.phrases.iter().filter(|p| shard.takes(&p.id)).collect();
         let origin = source.location().url();
-        let is_done = |p: &Planned| {
+        let is_done = |p: &PlannedPhrase| {
             !params.force
                 && !params.verify
                 && !unidentified.contains(&p.id)
@@ -136,11 +136,11 @@ impl Stage for Ingest {
             ignored = plan.ignored.len(),
             "planned"
         );
-        let mut report = Report {
+        let mut report = IngestSummary {
             source: source.location().to_string(),
             store: store.to_string(),
             dry_run: params.dry_run,
-            tally: Tally { n_unchanged: done.len() as u64, ..Tally::default() },
+            tally: IngestTally { n_unchanged: done.len() as u64, ..IngestTally::default() },
             n_todo: todo.len() as u64,
             ignored: plan.ignored,
             took_s: 0.0,
@@ -148,14 +148,14 @@ impl Stage for Ingest {
         if params.dry_run {
             let problems = todo.iter().filter_map(|p| {
                 let failure = *p.problem.clone()?;
-                Some(Refused { id: p.id.clone(), failure })
+                Some(FailedPhrase { id: p.id.clone(), failure })
             });
             report.tally.failed = problems.collect();
         } else {
             snapshot.checkpoint();
             progress.start("ingest", "phrases", todo.len() as u64);
             let batches = batch::batches(&plan.phrases, todo, params.batch_phrases.get());
-            let job = batch::Job {
+            let job = batch::IngestJob {
                 source: &source,
                 store: &store,
                 ledger: &ledger,
@@ -190,7 +190,7 @@ fn open_cache(params: &Params) -> Result<Option<Cache>, StoreError> {
 }
 
 /// Returns the digest of everything but the input that determines ingest's output.
-fn params_hash(rules: &Rules) -> String {
+fn params_hash(rules: &IngestRules) -> String {
     let text = serde_json::json!({ "output_version": OUTPUT_VERSION, "rules": rules }).to_string();
     digest(text.as_bytes())
 }
@@ -199,9 +199,9 @@ fn params_hash(rules: &Rules) -> String {
 ///
 /// Size and time tell a file's versions apart, not the files of two sources.
 fn is_settled(
-    planned: &Planned,
+    planned: &PlannedPhrase,
     ledger: &Ledger,
-    seen: &Seen,
+    seen: &SeenContent,
     params_hash: &str,
     origin: &str,
 ) -> bool {
@@ -223,7 +223,7 @@ fn is_settled(
 /// # Errors
 /// [`StoreError`] when the commits cannot be read.
 fn unidentified(store: &StoreSnapshot) -> Result<BTreeSet<String>, StoreError> {
-    // Rows that cannot be read cannot be mended, and keep nobody from ingesting others.
+    // Rows that cannot be read cannot be mended, and do not keep others from being ingested.
     let (table, _) = store.known_table(PhraseRow::schema())?;
     let lacks = |row: &PhraseRow| {
         let has_music = row.audio_url.is_some() || row.features_url.is_some();
@@ -241,14 +241,14 @@ fn unidentified(store: &StoreSnapshot) -> Result<BTreeSet<String>, StoreError> {
     Ok(found)
 }
 
-/// What became of the phrases.
+/// Counts of the phrases that were ingested, unchanged or failed.
 #[derive(Clone, Debug, Default)]
-struct Tally {
+struct IngestTally {
     n_done: u64,
     n_unchanged: u64,
     n_frames: u64,
     duration_s: f64,
-    failed: Vec<Refused>,
+    failed: Vec<FailedPhrase>,
     /// Whether batches are left because the user asked for an end.
     is_stopped: bool,
     /// Captures of which a reader should know something, and what.
@@ -257,13 +257,13 @@ struct Tally {
 
 /// A phrase that failed, for the summary.
 #[derive(Clone, Debug)]
-struct Refused {
+struct FailedPhrase {
     id: String,
     failure: Failure,
 }
 
-impl Tally {
-    fn add(&mut self, other: Tally) {
+impl IngestTally {
+    fn add(&mut self, other: IngestTally) {
         self.n_done += other.n_done;
         self.n_unchanged += other.n_unchanged;
         self.n_frames += other.n_frames;
@@ -274,19 +274,19 @@ impl Tally {
     }
 }
 
-struct Report {
+struct IngestSummary {
     source: String,
     store: String,
     dry_run: bool,
-    tally: Tally,
+    tally: IngestTally,
     n_todo: u64,
     ignored: Vec<String>,
     took_s: f64,
 }
 
-impl Summary for Report {
+impl Summary for IngestSummary {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        let Report { tally, n_todo, took_s, .. } = self;
+        let IngestSummary { tally, n_todo, took_s, .. } = self;
         let n_failed = tally.failed.len();
         writeln!(out, "ingest {} → {}", self.source, self.store)?;
         if self.dry_run {
@@ -337,7 +337,7 @@ impl Summary for Report {
     }
 
     fn figures(&mut self) -> serde_json::Value {
-        let Report { tally, .. } = self;
+        let IngestSummary { tally, .. } = self;
         serde_json::json!({
             "source": self.source,
             "store": self.store,

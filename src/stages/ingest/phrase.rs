@@ -18,7 +18,7 @@ const MAX_FILE_BYTES: u64 = 1 << 30;
 
 /// What makes a phrase acceptable; a change of these makes every phrase be read again.
 #[derive(Clone, Copy, Debug, PartialEq, clap::Args, serde::Serialize)]
-pub struct Rules {
+pub struct IngestRules {
     /// Which channel values a motion may have: `wide` allows ±20 rad/s of angular velocity, as real
     /// spins need; `reference` allows ±10 rad/s.
     #[arg(long, value_enum, value_name = "LIMITS", default_value_t = ChannelLimits::Wide)]
@@ -35,7 +35,7 @@ pub struct Rules {
 
 /// A phrase that passed every check.
 #[derive(Clone, Debug)]
-pub struct Phrase {
+pub struct CheckedPhrase {
     pub content_hash: String,
     /// Digest of the audio file, without audio of the feature file.
     pub song_hash: Option<String>,
@@ -59,7 +59,7 @@ pub struct Tempo {
     pub beats_per_bar: Option<(u32, &'static str)>,
 }
 
-impl Phrase {
+impl CheckedPhrase {
     /// Returns the length of the audio, else of the motion or the features.
     pub fn duration_s(&self) -> f64 {
         let n_frames = self.motion.as_ref().map(Trajectory::n_frames).or(self.n_feature_frames);
@@ -74,13 +74,13 @@ impl Phrase {
 }
 
 /// A phrase's files as they came from the source, digests first.
-pub struct Files {
+pub struct PhraseFiles {
     content_hash: String,
     song_hash: Option<String>,
     files: Vec<(Role, SourceFile, Content)>,
 }
 
-impl Files {
+impl PhraseFiles {
     /// Takes the contents of a phrase's files and digests them.
     ///
     /// # Errors
@@ -119,8 +119,8 @@ impl Files {
     ///
     /// # Errors
     /// The first [`Failure`] in the order audio, beats, features, motion, then their lengths.
-    pub fn check(self, rules: &Rules) -> Result<Phrase, Failure> {
-        let mut phrase = Phrase {
+    pub fn check(self, rules: &IngestRules) -> Result<CheckedPhrase, Failure> {
+        let mut phrase = CheckedPhrase {
             content_hash: self.content_hash,
             song_hash: self.song_hash,
             motion: None,
@@ -185,7 +185,11 @@ pub fn content_hash_of_audio(hash: &str) -> String {
     digest(hash_line(Role::Audio, hash).as_bytes())
 }
 
-fn check_lengths(phrase: &Phrase, rules: &Rules, motion_path: &str) -> Result<(), Failure> {
+fn check_lengths(
+    phrase: &CheckedPhrase,
+    rules: &IngestRules,
+    motion_path: &str,
+) -> Result<(), Failure> {
     let lengths = [
         ("audio", phrase.audio.as_ref().map(|a| a.duration_s)),
         ("features", phrase.n_feature_frames.map(frames_to_s)),

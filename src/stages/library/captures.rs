@@ -6,7 +6,7 @@ use std::io::Read as _;
 use anyhow::bail;
 use ndarray::Array2;
 
-use super::Known;
+use super::StoreContents;
 use crate::motion::choreography::{PrimitiveError, Repertoire};
 use crate::motion::{Axis, ChannelLimits, Trajectory};
 use crate::stages::failure::{Failure, FailureKind, guarded};
@@ -29,10 +29,10 @@ pub struct Captures {
     pub origin: String,
     /// What the storage says of all of them, without reading them.
     pub fingerprint: String,
-    place: Place,
+    place: CaptureSource,
 }
 
-enum Place {
+enum CaptureSource {
     /// Phrases of the store, with the digests of their files.
     Store { place: StoreSnapshot, ids: BTreeMap<String, String> },
     Folder {
@@ -45,7 +45,7 @@ enum Place {
 
 /// Captures that were read.
 #[derive(Default)]
-pub struct Loaded {
+pub struct LoadedCaptures {
     pub repertoire: Repertoire,
     /// Digest of their content.
     pub content_hash: String,
@@ -58,13 +58,13 @@ pub struct Loaded {
 impl Captures {
     /// Finds the captures of a store: phrases with motion and without audio that library has not
     /// constructed.
-    pub fn of_store(store: &StoreSnapshot, known: &Known) -> Self {
+    pub fn of_store(store: &StoreSnapshot, known: &StoreContents) -> Self {
         let ids = known.captures.clone();
         let lines: String = ids.iter().map(|(id, hash)| format!("{hash} {id}\n")).collect();
         Self {
             origin: super::FROM_STORE.to_owned(),
             fingerprint: digest(lines.as_bytes()),
-            place: Place::Store { place: store.clone(), ids },
+            place: CaptureSource::Store { place: store.clone(), ids },
         }
     }
 
@@ -85,7 +85,7 @@ impl Captures {
         let files: Vec<_> = files.into_iter().filter(|file| is_motion(&file.path)).collect();
         let problems = problems.into_iter();
         let problems = problems.filter(|p| {
-            // Nobody can tell what lies behind a link that is not followed.
+            // What lies behind a link that is not followed is unknown.
             is_motion(&p.path) || p.kind == SourceProblemKind::Symlink
         });
         let problems = problems.map(|p| {
@@ -104,15 +104,15 @@ impl Captures {
         Ok(Self {
             origin: source.location().url().to_owned(),
             fingerprint: digest(lines.as_bytes()),
-            place: Place::Folder { problems: problems.collect(), files, source, up },
+            place: CaptureSource::Folder { problems: problems.collect(), files, source, up },
         })
     }
 
     /// Returns the names of all captures.
     pub fn names(&self) -> BTreeSet<String> {
         match &self.place {
-            Place::Store { ids, .. } => ids.keys().cloned().collect(),
-            Place::Folder { files, problems, .. } => {
+            CaptureSource::Store { ids, .. } => ids.keys().cloned().collect(),
+            CaptureSource::Folder { files, problems, .. } => {
                 let problems = problems.iter().map(|(name, _)| name.clone());
                 files.iter().map(|file| file.path.clone()).chain(problems).collect()
             }
@@ -123,9 +123,9 @@ impl Captures {
     ///
     /// # Errors
     /// When there is no capture at all, or the store cannot be read.
-    pub fn load(self) -> anyhow::Result<Loaded> {
+    pub fn load(self) -> anyhow::Result<LoadedCaptures> {
         match self.place {
-            Place::Store { place, ids } => {
+            CaptureSource::Store { place, ids } => {
                 if ids.is_empty() {
                     bail!(
                         "store {} has no captures: no phrase has motion without audio; ingest \
@@ -139,7 +139,7 @@ impl Captures {
                     frames.insert(id.to_owned(), found);
                     Ok::<_, StoreError>(())
                 })?;
-                let mut reading = Reading::default();
+                let mut reading = CaptureReading::default();
                 for (id, frames) in frames {
                     let added = guarded(&id, || {
                         let motion = Trajectory::new(frames);
@@ -149,7 +149,7 @@ impl Captures {
                 }
                 Ok(reading.finish(self.fingerprint))
             }
-            Place::Folder { source, files, problems, up } => {
+            CaptureSource::Folder { source, files, problems, up } => {
                 if files.is_empty() && problems.is_empty() {
                     bail!(
                         "captures folder {}: no .bvh, .npz, .npy or .vmd file anywhere below it; \
@@ -157,7 +157,7 @@ impl Captures {
                         source.location()
                     );
                 }
-                let mut reading = Reading::default();
+                let mut reading = CaptureReading::default();
                 let mut hashes = reading_line(&files, up);
                 let contents = source.read_in_order(files.clone());
                 for (file, (content, _permit)) in files.iter().zip(contents) {
@@ -184,13 +184,13 @@ impl Captures {
 
 /// The repertoire as it grows.
 #[derive(Default)]
-struct Reading {
+struct CaptureReading {
     repertoire: Repertoire,
     failed: Vec<(String, String, Failure)>,
     noted: Vec<(String, String)>,
 }
 
-impl Reading {
+impl CaptureReading {
     fn add(&mut self, path: &str, motion: Trajectory) -> Result<(), Failure> {
         motion.check(&ChannelLimits::Wide).map_err(|e| Failure::of(path, e.kind(), &e))?;
         let refused = |e: PrimitiveError| {
@@ -209,9 +209,9 @@ impl Reading {
         }
     }
 
-    fn finish(self, content_hash: String) -> Loaded {
+    fn finish(self, content_hash: String) -> LoadedCaptures {
         let Self { repertoire, failed, noted } = self;
-        Loaded { repertoire, content_hash, failed, noted }
+        LoadedCaptures { repertoire, content_hash, failed, noted }
     }
 }
 

@@ -6,36 +6,36 @@ use std::sync::mpsc::sync_channel;
 
 use anyhow::{Context as _, bail};
 
-use super::captures::{Captures, Loaded};
-use super::known::Known;
-use super::layout::Output;
+use super::captures::{Captures, LoadedCaptures};
+use super::known::StoreContents;
+use super::layout::PhraseFolder;
 use super::made::{self, Band, perform};
-use super::report::{Report, Tally};
-use super::songs::{Files, Input, Song, Songs};
-use super::write::{Refusal, Writer, fingerprint, is_settled};
+use super::report::{LibrarySummary, LibraryTally};
+use super::songs::{Song, SongFiles, SongInput, Songs};
+use super::write::{Refusal, SongWriter, fingerprint, is_settled};
 use super::{Params, one, params_hash};
 use crate::stages::Progress;
 use crate::stages::extract::needed_bytes;
 use crate::stages::extract::pool::{self, Budget, lock};
 use crate::stages::failure::{guarded, query_of_failures};
-use crate::stages::seen::Seen;
+use crate::stages::seen::SeenContent;
 use crate::store::{Ledger, Location};
 
 /// Memory that songs under way may take while their audio is decoded.
 const MEMORY_BYTES: u64 = 2_000_000_000;
 
 /// Everything that the songs of a run share.
-pub struct Job<'a> {
+pub struct LibraryJob<'a> {
     pub store: &'a Location,
     pub ledger: Ledger,
-    pub seen: Seen,
-    pub known: Known,
+    pub seen: SeenContent,
+    pub known: StoreContents,
     pub band: Band,
     pub params: &'a Params,
     pub progress: &'a dyn Progress,
 }
 
-impl Job<'_> {
+impl LibraryJob<'_> {
     /// Reads the captures, dances to every song that is not done, and tells `report`.
     ///
     /// # Errors
@@ -45,7 +45,7 @@ impl Job<'_> {
         &self,
         captures: Captures,
         songs: &Songs,
-        report: &mut Report,
+        report: &mut LibrarySummary,
     ) -> anyhow::Result<()> {
         let Params { rules, output, compose_audio, force, dry_run, .. } = self.params;
         let params_hash = params_hash(rules);
@@ -88,12 +88,12 @@ impl Job<'_> {
         let folder = output
             .as_ref()
             .map(|path| {
-                Output::new(path).with_context(|| format!("while making {}", path.display()))
+                PhraseFolder::new(path).with_context(|| format!("while making {}", path.display()))
             })
             .transpose()?;
-        let empty = Loaded::default();
+        let empty = LoadedCaptures::default();
         let loaded = loaded.as_ref().unwrap_or(&empty);
-        let writer = Writer {
+        let writer = SongWriter {
             store: self.store,
             ledger: &self.ledger,
             params_hash: &params_hash,
@@ -152,15 +152,15 @@ impl Job<'_> {
         &self,
         songs: &Songs,
         todo: Vec<Song>,
-        writer: &Writer<'_>,
-        report: &mut Report,
+        writer: &SongWriter<'_>,
+        report: &mut LibrarySummary,
     ) -> anyhow::Result<()> {
         if todo.is_empty() {
             return Ok(());
         }
         self.progress.start("library", "songs", todo.len() as u64);
         let feeding = songs.feeding(todo);
-        let (sender, receiver) = sync_channel::<(Song, Input)>(1);
+        let (sender, receiver) = sync_channel::<(Song, SongInput)>(1);
         let all = Mutex::new(std::mem::take(&mut report.tally));
         let tally = &all;
         let budget = Budget::new(MEMORY_BYTES);
@@ -190,16 +190,16 @@ impl Job<'_> {
     fn song(
         &self,
         song: &Song,
-        input: Input,
-        writer: &Writer<'_>,
+        input: SongInput,
+        writer: &SongWriter<'_>,
         budget: &Budget,
-        tally: &Mutex<Tally>,
+        tally: &Mutex<LibraryTally>,
     ) -> anyhow::Result<()> {
         let danced = guarded(&song.id, || {
             let music = {
                 let _share = budget.take(input.needed_bytes());
                 let input = match &song.files {
-                    Files::Made { piece, seed, .. } => {
+                    SongFiles::Made { piece, seed, .. } => {
                         let performance = perform(song, piece, *seed, &self.band)?;
                         if let Some(folder) = &self.params.compose_audio
                             && let Err(e) = made::write(folder, song, &performance)
@@ -207,7 +207,7 @@ impl Job<'_> {
                             let e = anyhow::Error::new(e).context("while writing --compose-audio");
                             return Ok(Err(Refusal::Store(e)));
                         }
-                        Input::Performed(performance)
+                        SongInput::Performed(performance)
                     }
                     _ => input,
                 };
@@ -235,10 +235,10 @@ impl Job<'_> {
     fn forget(
         &self,
         songs: &Songs,
-        writer: &Writer<'_>,
+        writer: &SongWriter<'_>,
         captures_origin: &str,
         mut capture_names: BTreeSet<String>,
-        report: &mut Report,
+        report: &mut LibrarySummary,
     ) -> anyhow::Result<()> {
         let mut names: BTreeSet<String> = songs.songs.iter().map(|s| s.id.clone()).collect();
         let slugs: BTreeSet<&str> = songs.songs.iter().map(|s| s.slug.as_str()).collect();
@@ -253,7 +253,7 @@ impl Job<'_> {
 }
 
 /// Tells of a split that has songs of which none could be danced to.
-fn warn_of_empty_splits(songs: &[Song], report: &Report) {
+fn warn_of_empty_splits(songs: &[Song], report: &LibrarySummary) {
     let failed: BTreeSet<&str> =
         report.tally.failed.iter().map(|(name, _)| name.as_str()).collect();
     for (n, split) in report.splits {
@@ -264,17 +264,17 @@ fn warn_of_empty_splits(songs: &[Song], report: &Report) {
     }
 }
 
-impl Input {
+impl SongInput {
     /// Returns an estimate of the memory that reading takes.
     fn needed_bytes(&self) -> u64 {
         match self {
-            Input::Features(_) => 0,
-            Input::Unplayed { duration_s } => {
+            SongInput::Features(_) => 0,
+            SongInput::Unplayed { duration_s } => {
                 needed_bytes(*duration_s, 0) + made::needed_bytes(*duration_s)
             }
-            Input::Performed(_) => 0,
+            SongInput::Performed(_) => 0,
             // Its length is not known before it is decoded: room for what is held of the longest.
-            Input::Files { .. } => needed_bytes(360.0, 0),
+            SongInput::Files { .. } => needed_bytes(360.0, 0),
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
-use super::songs::{Files, Song, slug, slug_of};
+use super::songs::{Song, SongFiles, slug, slug_of};
 use super::split::TRAIN;
 use crate::stages::Stage as _;
 use crate::stages::beats::{self, BeatSource};
@@ -11,14 +11,14 @@ use crate::stages::failure::{Failure, FailureKind};
 use crate::store::tables::{ExtractionRow, PhraseRow};
 use crate::store::{Location, Row, StoreError, StoreSnapshot, outdated_features};
 
-/// What a store knows.
+/// The songs, captures and phrases of a store.
 #[derive(Debug, Default)]
-pub struct Known {
+pub struct StoreContents {
     /// Phrases with audio and features.
     pub songs: BTreeMap<String, Song>,
     /// Phrases with audio, but without features.
     pub n_without_features: usize,
-    /// Phrases with motion and without audio that nobody constructed, and their digests.
+    /// Phrases with motion and without audio that were not constructed, and their digests.
     pub captures: BTreeMap<String, String>,
     /// Constructed phrases with the URLs of their songs, by the part of their name that stands for the
     /// song.
@@ -30,7 +30,7 @@ pub struct Known {
     pub others: HashMap<String, String>,
 }
 
-impl Known {
+impl StoreContents {
     /// Reads the tables of a store; an empty one knows nothing.
     ///
     /// # Errors
@@ -44,8 +44,8 @@ impl Known {
                 if row.song_hash.is_none() {
                     known.unidentified.insert(slug.clone());
                 }
-                let of_song = known.constructed.entry(slug);
-                of_song.or_default().insert(row.phrase_id, row.source);
+                let phrases_of_song = known.constructed.entry(slug);
+                phrases_of_song.or_default().insert(row.phrase_id, row.source);
                 return;
             }
             known.others.insert(row.phrase_id.clone(), row.source.clone());
@@ -88,7 +88,7 @@ impl Known {
                 fingerprint: format!("store {} {params_hash}", row.content_hash),
                 split: TRAIN,
                 problem,
-                files: Files::Store {
+                files: SongFiles::Store {
                     n_frames,
                     song_hash: row.song_hash.clone(),
                     beats: known_beats.in_bars(&row),

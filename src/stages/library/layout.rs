@@ -4,7 +4,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
-use super::one::{Constructed, Music};
+use super::one::{ConstructedPhrase, SongMusic};
 use super::songs::Song;
 use crate::motion::npy;
 use crate::motion::npz::NpzWriter;
@@ -29,13 +29,13 @@ or the store of `motiongen library` itself where that matters.
 ";
 
 /// A folder of phrases in the making.
-pub struct Output {
+pub struct PhraseFolder {
     folder: PathBuf,
     /// Lines of the table of splits.
     splits: Mutex<Vec<String>>,
 }
 
-impl Output {
+impl PhraseFolder {
     /// Starts a folder.
     ///
     /// # Errors
@@ -48,9 +48,14 @@ impl Output {
     /// Writes a phrase, each file whole or not at all.
     ///
     /// # Errors
-    /// What the file system says.
-    pub fn write(&self, song: &Song, music: &Music, phrase: &Constructed) -> io::Result<()> {
-        let Constructed { id, motion, features, beats, later_beats, .. } = phrase;
+    /// The error of the file system.
+    pub fn write(
+        &self,
+        song: &Song,
+        music: &SongMusic,
+        phrase: &ConstructedPhrase,
+    ) -> io::Result<()> {
+        let ConstructedPhrase { id, motion, features, beats, later_beats, .. } = phrase;
         let values: Vec<f32> = motion.iter().copied().collect();
         let trajectory = npy::write(&[motion.nrows(), motion.ncols()], &values);
         write_file(&self.folder.join(format!("motion/{id}/trajectory.npy")), |out| {
@@ -83,7 +88,7 @@ impl Output {
     /// Writes what is about the whole folder.
     ///
     /// # Errors
-    /// What the file system says.
+    /// The error of the file system.
     pub fn finish(self) -> io::Result<()> {
         write_file(&self.folder.join("README.txt"), |out| out.write_all(README.as_bytes()))?;
         let mut lines = self.splits.into_inner().unwrap_or_else(PoisonError::into_inner);

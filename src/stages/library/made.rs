@@ -9,10 +9,10 @@ use anyhow::bail;
 use xxhash_rust::xxh3::{xxh3_64, xxh3_64_with_seed};
 
 use super::one::small_bytes;
-use super::songs::{Files, Song, slug};
+use super::songs::{Song, SongFiles, slug};
 use super::split::TRAIN;
 use crate::motion::Beats;
-use crate::music::abc::{self, Found, Tune};
+use crate::music::abc::{self, Tune, TuneEntry};
 #[cfg(feature = "soundfont")]
 use crate::music::soundfont::Instruments;
 use crate::music::{self, Score, compose, synth, wav};
@@ -56,7 +56,7 @@ pub fn composed(n: u32, seed: u64, band: &Band) -> impl Iterator<Item = Song> {
             split: TRAIN,
             is_unidentified: false,
             problem: None,
-            files: Files::Made {
+            files: SongFiles::Made {
                 piece: Piece::Composed { seed, index },
                 seed: xxh3_64(url.as_bytes()),
                 duration_s: compose::MAX_SONG_S,
@@ -92,7 +92,7 @@ pub fn tunes(source: &Source, seed: u64, band: &Band) -> anyhow::Result<Vec<Song
             Err(failure) => songs.push(song_of_tune(
                 (file.path.clone(), url),
                 "",
-                Files::Missing,
+                SongFiles::Missing,
                 Some(failure),
             )),
         }
@@ -106,7 +106,7 @@ pub fn tunes(source: &Source, seed: u64, band: &Band) -> anyhow::Result<Vec<Song
 fn tunes_of(
     file: &SourceFile,
     content: Result<Content, StoreError>,
-) -> Result<Vec<Found>, Failure> {
+) -> Result<Vec<TuneEntry>, Failure> {
     let path = file.path.as_str();
     if file.size_bytes > MAX_FILE_BYTES {
         let message = format!(
@@ -124,21 +124,21 @@ fn tunes_of(
 }
 
 /// Returns tune number `i` of a file as a song.
-fn tune_song(file: &SourceFile, url: &str, i: usize, found: Found, seed: u64) -> Song {
+fn tune_song(file: &SourceFile, url: &str, i: usize, found: TuneEntry, seed: u64) -> Song {
     let id = format!("{}-{:04}", file.path, i + 1);
     let url = format!("{url}#{}", i + 1);
-    let Found { line, text, tune } = found;
+    let TuneEntry { line, text, tune } = found;
     match tune {
         Ok(tune) => {
             let seed = xxh3_64_with_seed(text.as_bytes(), seed);
             let duration_s = music::arrange(&tune, seed).end_s();
-            let files = Files::Made { piece: Piece::Tune(Arc::new(tune)), seed, duration_s };
+            let files = SongFiles::Made { piece: Piece::Tune(Arc::new(tune)), seed, duration_s };
             song_of_tune((id, url), &text, files, None)
         }
         Err(e) => {
             let message = format!("{id} (from line {line}): the tune {e}");
             let failure = Failure::new(FailureKind::AbcFormat, &file.path, message);
-            song_of_tune((id, url), &text, Files::Missing, Some(failure))
+            song_of_tune((id, url), &text, SongFiles::Missing, Some(failure))
         }
     }
 }
@@ -146,7 +146,7 @@ fn tune_song(file: &SourceFile, url: &str, i: usize, found: Found, seed: u64) ->
 fn song_of_tune(
     (id, url): (String, String),
     text: &str,
-    files: Files,
+    files: SongFiles,
     problem: Option<Failure>,
 ) -> Song {
     let fingerprint = format!("tune {}", digest(text.as_bytes()));
@@ -154,7 +154,7 @@ fn song_of_tune(
     Song { id, slug, url, fingerprint, split, is_unidentified: false, problem, files }
 }
 
-/// Who plays.
+/// The instruments that play, of a soundfont or the synthesizer.
 #[derive(Clone, Default)]
 pub struct Band {
     #[cfg(feature = "soundfont")]
@@ -184,9 +184,9 @@ impl Band {
     }
 
     /// Returns what tells songs of this band from those of another.
-    fn fingerprint(&self, of: &str) -> String {
+    fn fingerprint(&self, notes: &str) -> String {
         let hash = self.hash.as_ref().map(|hash| format!(" {hash}")).unwrap_or_default();
-        format!("{of} {}{hash}", music::VERSION)
+        format!("{notes} {}{hash}", music::VERSION)
     }
 
     fn play(&self, score: &Score, seed: u64) -> Result<Vec<f32>, String> {
@@ -236,7 +236,7 @@ pub fn beats_text(beats: &Beats) -> String {
 /// Writes a song for people to hear: `NAME.wav` and `NAME.beats.txt`.
 ///
 /// # Errors
-/// What the file system says.
+/// The error of the file system.
 pub fn write(folder: &Path, song: &Song, performance: &Performance) -> std::io::Result<()> {
     std::fs::create_dir_all(folder)?;
     let file = |ending: &str| folder.join(format!("{}.{ending}", song.slug));

@@ -18,17 +18,17 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use super::failure::{Failure, FailureKind};
-use super::seen::Seen;
+use super::seen::SeenContent;
 use super::{ClientParams, Contract, LinkParams, Progress, Stage, Summary, all_threads};
 use crate::motion::Axis;
 use crate::store::{Location, Source, StoreError, StoreSnapshot, checkpoint, digest};
 use captures::Captures;
-use job::Job;
-use known::Known;
+use job::LibraryJob;
+use known::StoreContents;
 use made::Band;
-use report::{Place, Report, Tally};
-use songs::{Files, Song, Songs};
-use split::Share;
+use report::{LibraryPlace, LibrarySummary, LibraryTally};
+use songs::{Song, SongFiles, Songs};
+use split::SongShare;
 
 /// Raised when library writes something else for the same inputs and parameters.
 const OUTPUT_VERSION: u32 = 2;
@@ -76,14 +76,14 @@ pub struct Params {
     #[arg(long, value_name = "DIR")]
     pub output: Option<PathBuf>,
     #[command(flatten)]
-    pub rules: Rules,
+    pub rules: LibraryRules,
     /// Songs for validation: a number, or a fraction of all (at least one). Fewer than three songs all
     /// train.
-    #[arg(long, value_name = "N|FRACTION", default_value_t = Share::Fraction(0.1))]
-    pub validation_songs: Share,
+    #[arg(long, value_name = "N|FRACTION", default_value_t = SongShare::Fraction(0.1))]
+    pub validation_songs: SongShare,
     /// Songs for the test: a number, or a fraction of all (at least one).
-    #[arg(long, value_name = "N|FRACTION", default_value_t = Share::Fraction(0.1))]
-    pub test_songs: Share,
+    #[arg(long, value_name = "N|FRACTION", default_value_t = SongShare::Fraction(0.1))]
+    pub test_songs: SongShare,
     /// Songs under way at once.
     #[arg(long, value_name = "N", default_value_t = all_threads())]
     pub workers: NonZeroUsize,
@@ -101,7 +101,7 @@ pub struct Params {
 
 /// What determines the phrases beside songs and captures.
 #[derive(Clone, Copy, Debug, clap::Args, serde::Serialize)]
-pub struct Rules {
+pub struct LibraryRules {
     /// Dances per song, each another choice of steps and turns.
     #[arg(long, value_name = "N", default_value_t = NonZeroU32::new(8).expect("8 is not 0"))]
     pub takes: NonZeroU32,
@@ -132,9 +132,9 @@ impl Stage for Library {
         let options = params.client.options();
         let store = Location::open(&params.store, &options)?;
         let snapshot = StoreSnapshot::take(&store)?;
-        let mut known = Known::read(&snapshot)?;
+        let mut known = StoreContents::read(&snapshot)?;
         let ledger = snapshot.ledger(Self::NAME)?;
-        let seen = Seen::read(&store, SEEN)?;
+        let seen = SeenContent::read(&store, SEEN)?;
         let open = |url: &str| {
             Source::open(url, &options, None)
                 .map(|source| source.following_links(params.links.follow_links))
@@ -159,13 +159,14 @@ impl Stage for Library {
             songs.songs.extend(made::tunes(&open(url)?, params.rules.seed, &band)?);
         }
         prepare(&mut songs, &params)?;
-        let job = Job { store: &store, ledger, seen, known, band, params: &params, progress };
-        let mut report = Report {
-            place: Place { store: store.to_string(), output: params.output.clone() },
+        let job =
+            LibraryJob { store: &store, ledger, seen, known, band, params: &params, progress };
+        let mut report = LibrarySummary {
+            place: LibraryPlace { store: store.to_string(), output: params.output.clone() },
             dry_run: params.dry_run,
             splits: splits(&songs.songs),
             n_without_features: songs.n_without_features,
-            tally: Tally::default(),
+            tally: LibraryTally::default(),
             took_s: 0.0,
         };
         job.run(captures, &songs, &mut report)?;
@@ -183,7 +184,7 @@ fn prepare(songs: &mut Songs, params: &Params) -> anyhow::Result<()> {
     songs.refuse_namesakes();
     let length = params.rules.phrase_frames.get();
     for song in songs.songs.iter_mut().filter(|song| song.problem.is_none()) {
-        if let Files::Store { n_frames, .. } = &song.files
+        if let SongFiles::Store { n_frames, .. } = &song.files
             && *n_frames < length
         {
             song.problem = Some(one::too_short(song, *n_frames, length));
@@ -196,11 +197,11 @@ fn prepare(songs: &mut Songs, params: &Params) -> anyhow::Result<()> {
     // Music of our own is for training: a verdict rests on real songs.
     let real = songs.songs.iter().filter(takes_place).filter(|song| !song.is_made());
     let names: Vec<String> = real.map(|song| song.id.clone()).collect();
-    let of =
+    let split_of_song =
         split::assign(names.iter().map(String::as_str), params.validation_songs, params.test_songs)
             .map_err(anyhow::Error::msg)?;
     for song in &mut songs.songs {
-        song.split = of.get(song.id.as_str()).copied().unwrap_or(split::TRAIN);
+        song.split = split_of_song.get(song.id.as_str()).copied().unwrap_or(split::TRAIN);
     }
     if names.is_empty() {
         tracing::warn!("no song is real, so none is for validation and for the test");
@@ -225,7 +226,7 @@ fn unreadable(path: &str, error: &StoreError) -> Failure {
 }
 
 /// Returns the digest of everything but the inputs that determines library's output.
-fn params_hash(rules: &Rules) -> String {
+fn params_hash(rules: &LibraryRules) -> String {
     let text = serde_json::json!({ "output_version": OUTPUT_VERSION, "rules": rules });
     digest(text.to_string().as_bytes())
 }

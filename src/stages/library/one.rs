@@ -7,8 +7,8 @@ use ndarray::{Array2, ArrayView1, s};
 use xxhash_rust::xxh3::xxh3_64_with_seed;
 
 use super::made::{Performance, beats_text};
-use super::songs::{Files, Input, Song};
-use super::{Rules, unreadable};
+use super::songs::{Song, SongFiles, SongInput};
+use super::{LibraryRules, unreadable};
 use crate::audio::BLOCKS;
 use crate::motion::choreography::{self, BeatGrid, Repertoire, SongError, choreograph, n_phrases};
 use crate::motion::{Beats, BeatsPerBarSource};
@@ -25,7 +25,7 @@ const TIMEOUT: Duration = Duration::from_secs(900);
 const MAX_DURATION_S: f64 = 24.0 * 3600.0;
 
 /// A song as it is danced to.
-pub struct Music {
+pub struct SongMusic {
     /// [T, 163], relative to the whole song.
     pub features: Array2<f32>,
     pub beats: Beats,
@@ -37,7 +37,7 @@ pub struct Music {
 }
 
 /// A phrase as it goes into the tables.
-pub struct Constructed {
+pub struct ConstructedPhrase {
     pub id: String,
     /// Where in the song it begins.
     pub first_frame: usize,
@@ -51,7 +51,7 @@ pub struct Constructed {
     pub later_beats: Vec<(f64, u32)>,
 }
 
-impl Music {
+impl SongMusic {
     /// Returns where the number of beats in a bar came from, as `phrases` spells it.
     pub fn beats_per_bar_source(&self) -> &'static str {
         if self.beat_source == BeatSource::Composed {
@@ -78,21 +78,21 @@ impl Music {
 ///
 /// # Errors
 /// A [`Failure`] that names the file.
-pub fn read(song: &Song, input: Input) -> Result<Music, Failure> {
+pub fn read(song: &Song, input: SongInput) -> Result<SongMusic, Failure> {
     match (&song.files, input) {
         (
-            Files::Store { beats, n_beats, beat_source, song_hash, .. },
-            Input::Features(features),
+            SongFiles::Store { beats, n_beats, beat_source, song_hash, .. },
+            SongInput::Features(features),
         ) => {
             let (features, input_hash) = (features?, digest(song.fingerprint.as_bytes()));
             let none = || no_beats(song, *n_beats, features.nrows());
             let beats = beats.clone().ok_or_else(none)?;
             let (beat_source, song_hash) = (*beat_source, song_hash.clone());
-            Ok(Music { features, beats, beat_source, input_hash, song_hash })
+            Ok(SongMusic { features, beats, beat_source, input_hash, song_hash })
         }
         (
-            Files::Folder { audio, beat_list },
-            Input::Files { audio: content, beat_list: list, .. },
+            SongFiles::Folder { audio, beat_list },
+            SongInput::Files { audio: content, beat_list: list, .. },
         ) => {
             let mut lines = String::new();
             let list = match (beat_list, list) {
@@ -106,7 +106,7 @@ pub fn read(song: &Song, input: Input) -> Result<Music, Failure> {
             let list = list.map(|beats| (beats, BeatSource::BeatsFile));
             listen(song, audio, content, list, lines)
         }
-        (Files::Made { .. }, Input::Performed(Performance { wav, beats, .. })) => {
+        (SongFiles::Made { .. }, SongInput::Performed(Performance { wav, beats, .. })) => {
             let size_bytes = wav.len() as u64;
             let (path, fingerprint) = (format!("{}.wav", song.id), String::new());
             let audio = SourceFile { path, size_bytes, fingerprint };
@@ -125,8 +125,9 @@ fn listen(
     content: Result<Content, StoreError>,
     known: Option<(Beats, BeatSource)>,
     mut lines: String,
-) -> Result<Music, Failure> {
-    let rules = extract::Rules { tuning: None, max_duration_s: MAX_DURATION_S, timeout: TIMEOUT };
+) -> Result<SongMusic, Failure> {
+    let rules =
+        extract::ExtractRules { tuning: None, max_duration_s: MAX_DURATION_S, timeout: TIMEOUT };
     let mut song_hash = None;
     let see = |hash: &str| {
         song_hash = Some(hash.to_owned());
@@ -138,11 +139,17 @@ fn listen(
     let (features, input_hash) = (found.frames, digest(lines.as_bytes()));
     match known {
         Some((beats, beat_source)) => {
-            Ok(Music { features, beats, beat_source, input_hash, song_hash })
+            Ok(SongMusic { features, beats, beat_source, input_hash, song_hash })
         }
         None => {
             let beats = counted.ok_or_else(|| no_beats(song, n_beats, features.nrows()))?;
-            Ok(Music { features, beats, beat_source: BeatSource::Tracker, input_hash, song_hash })
+            Ok(SongMusic {
+                features,
+                beats,
+                beat_source: BeatSource::Tracker,
+                input_hash,
+                song_hash,
+            })
         }
     }
 }
@@ -189,7 +196,7 @@ pub fn too_short(song: &Song, n_frames: usize, phrase_frames: usize) -> Failure 
 }
 
 /// Returns the name of a phrase: names of one song sort by take, then by place.
-pub fn phrase_id(song: &Song, rules: &Rules, take: u32, index: usize) -> String {
+pub fn phrase_id(song: &Song, rules: &LibraryRules, take: u32, index: usize) -> String {
     let digits = (rules.takes.get() - 1).to_string().len().max(2);
     format!("{}.t{take:0digits$}.{index:04}", song.slug)
 }
@@ -203,10 +210,10 @@ pub fn phrase_id(song: &Song, rules: &Rules, take: u32, index: usize) -> String 
 /// A [`Failure`] of the song before the first phrase, or what `visit` says.
 pub fn dance<E: From<Failure>>(
     song: &Song,
-    music: &Music,
+    music: &SongMusic,
     repertoire: &Repertoire,
-    rules: &Rules,
-    mut visit: impl FnMut(Constructed) -> Result<(), E>,
+    rules: &LibraryRules,
+    mut visit: impl FnMut(ConstructedPhrase) -> Result<(), E>,
 ) -> Result<usize, E> {
     let n_frames = music.features.nrows();
     let (length, hop) = (rules.phrase_frames.get(), rules.hop_frames.get());
@@ -224,7 +231,7 @@ pub fn dance<E: From<Failure>>(
         for index in 0..per_take {
             let first = index * hop;
             let (beats, later_beats) = beats_of(&grid, first, length);
-            visit(Constructed {
+            visit(ConstructedPhrase {
                 id: phrase_id(song, rules, take, index),
                 first_frame: first,
                 motion: choreography::phrase(danced.frames.view(), first, length),

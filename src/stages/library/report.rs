@@ -5,13 +5,13 @@ use std::io::{self, Write};
 use std::path::PathBuf;
 
 use super::songs::Song;
-use super::write::Written;
+use super::write::SongOutcome;
 use crate::stages::Summary;
 use crate::stages::failure::{Failure, failures_json, write_failures, write_notes};
 
-/// What became of songs and captures.
+/// Counts of songs, captures and phrases that were constructed, unchanged or failed.
 #[derive(Debug, Default)]
-pub struct Tally {
+pub struct LibraryTally {
     pub n_todo: usize,
     pub n_done: usize,
     /// Songs whose phrases the store has.
@@ -29,37 +29,37 @@ pub struct Tally {
     pub noted: Vec<(String, String)>,
 }
 
-impl Tally {
-    pub fn add(&mut self, song: &Song, written: Written) {
+impl LibraryTally {
+    pub fn add(&mut self, song: &Song, written: SongOutcome) {
         match written {
-            Written::Phrases(n) => {
+            SongOutcome::Phrases(n) => {
                 self.n_done += 1;
                 *self.phrases.entry(song.split).or_default() += n;
             }
-            Written::Unchanged => self.n_unchanged += 1,
+            SongOutcome::Unchanged => self.n_unchanged += 1,
         }
     }
 }
 
-pub struct Place {
+pub struct LibraryPlace {
     pub store: String,
     pub output: Option<PathBuf>,
 }
 
-pub struct Report {
-    pub place: Place,
+pub struct LibrarySummary {
+    pub place: LibraryPlace,
     pub dry_run: bool,
     /// Songs of every split.
     pub splits: [(usize, &'static str); 3],
     pub n_without_features: usize,
-    pub tally: Tally,
+    pub tally: LibraryTally,
     pub took_s: f64,
 }
 
-impl Summary for Report {
+impl Summary for LibrarySummary {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        let Report { place, tally, took_s, .. } = self;
-        let Place { store, output } = place;
+        let LibrarySummary { place, tally, took_s, .. } = self;
+        let LibraryPlace { store, output } = place;
         let n_failed = tally.failed.len();
         writeln!(out, "library → {store}")?;
         let splits: Vec<String> =
@@ -123,7 +123,7 @@ impl Summary for Report {
     }
 
     fn figures(&mut self) -> serde_json::Value {
-        let Report { place, tally, .. } = self;
+        let LibrarySummary { place, tally, .. } = self;
         serde_json::json!({
             "store": place.store,
             "output": place.output,

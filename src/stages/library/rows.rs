@@ -1,6 +1,6 @@
 //! A constructed phrase as rows of `phrases` and `beats`.
 
-use super::one::{Constructed, Music};
+use super::one::{ConstructedPhrase, SongMusic};
 use super::songs::Song;
 use crate::stages::beats;
 use crate::store::digest;
@@ -8,7 +8,7 @@ use crate::store::tables::{BeatRow, CONSTRUCTED, PhraseRow};
 use crate::units::frames_to_s;
 
 /// Returns the row of a phrase; it has no files of its own.
-pub fn phrase_row(song: &Song, music: &Music, phrase: &Constructed) -> PhraseRow {
+pub fn phrase_row(song: &Song, music: &SongMusic, phrase: &ConstructedPhrase) -> PhraseRow {
     let n_frames = phrase.motion.nrows();
     PhraseRow {
         phrase_id: phrase.id.clone(),
@@ -49,17 +49,24 @@ pub fn phrase_row(song: &Song, music: &Music, phrase: &Constructed) -> PhraseRow
 }
 
 /// Digest over one line `role digest` for features and motion, as for the files of a phrase.
-fn content_hash(phrase: &Constructed) -> String {
-    let of = |values: &ndarray::Array2<f32>| {
+fn content_hash(phrase: &ConstructedPhrase) -> String {
+    let digest_of_values = |values: &ndarray::Array2<f32>| {
         let bytes: Vec<u8> = values.iter().flat_map(|x| x.to_le_bytes()).collect();
         digest(&bytes)
     };
-    let lines = format!("features {}\nmotion {}\n", of(&phrase.features), of(&phrase.motion));
+    let lines = format!(
+        "features {}\nmotion {}\n",
+        digest_of_values(&phrase.features),
+        digest_of_values(&phrase.motion)
+    );
     digest(lines.as_bytes())
 }
 
 /// Returns the rows of a phrase's beats.
-pub fn beat_rows<'a>(music: &Music, phrase: &'a Constructed) -> impl Iterator<Item = BeatRow> + 'a {
+pub fn beat_rows<'a>(
+    music: &SongMusic,
+    phrase: &'a ConstructedPhrase,
+) -> impl Iterator<Item = BeatRow> + 'a {
     let numbered = phrase.beats.iter().map(|&(time_s, number)| (time_s, Some(i64::from(number))));
     beats::rows(&phrase.id, numbered, phrase.motion.nrows(), music.beat_source)
 }

@@ -6,7 +6,7 @@ use std::sync::mpsc::SyncSender;
 use anyhow::bail;
 use ndarray::Array2;
 
-use super::Known;
+use super::StoreContents;
 use super::made::{Performance, Piece};
 use crate::motion::Beats;
 use crate::stages::beats::BeatSource;
@@ -22,23 +22,23 @@ const MAX_SLUG_BYTES: usize = 180;
 pub struct Song {
     /// Its name: the phrase of the store, or the path below the folder.
     pub id: String,
-    /// What stands for it in the names of its phrases.
+    /// The part of its phrases' names that stands for it.
     pub slug: String,
     /// The audio file, as `source` of its phrases.
     pub url: String,
-    /// What is known of its files without reading them.
+    /// The fingerprint of its files, known without reading them.
     pub fingerprint: String,
     pub split: &'static str,
     /// Whether the store has phrases of it that do not tell which music they are to, and now could.
     pub is_unidentified: bool,
-    /// What keeps it from being danced to, where that is known already.
+    /// The reason why it cannot be danced to, where that is known already.
     pub problem: Option<Failure>,
-    pub files: Files,
+    pub files: SongFiles,
 }
 
 /// Where a song's data lie.
 #[derive(Clone, Debug)]
-pub enum Files {
+pub enum SongFiles {
     /// Features and beats in the store.
     Store {
         n_frames: usize,
@@ -65,8 +65,8 @@ pub enum Files {
     },
 }
 
-/// What was read of a song.
-pub enum Input {
+/// The data of a song as it was read.
+pub enum SongInput {
     Features(Result<Array2<f32>, Failure>),
     Files {
         audio: Result<Content, StoreError>,
@@ -88,11 +88,11 @@ pub struct Songs {
     pub songs: Vec<Song>,
     /// Phrases with audio, but without features.
     pub n_without_features: usize,
-    place: Place,
+    place: SongSource,
 }
 
 #[derive(Clone)]
-enum Place {
+enum SongSource {
     Store(StoreSnapshot),
     Folder(Source),
 }
@@ -104,7 +104,7 @@ impl Songs {
     /// When there is none and one is needed.
     pub fn of_store(
         snapshot: &StoreSnapshot,
-        known: &mut Known,
+        known: &mut StoreContents,
         is_needed: bool,
     ) -> anyhow::Result<Self> {
         let store = snapshot.store();
@@ -126,7 +126,7 @@ impl Songs {
             origin: super::FROM_STORE.to_owned(),
             songs: songs.into_values().collect(),
             n_without_features: known.n_without_features,
-            place: Place::Store(snapshot.clone()),
+            place: SongSource::Store(snapshot.clone()),
         })
     }
 
@@ -134,7 +134,7 @@ impl Songs {
     ///
     /// # Errors
     /// When the folder cannot be listed or has no audio.
-    pub fn of_folder(source: Source, known: &Known) -> anyhow::Result<Self> {
+    pub fn of_folder(source: Source, known: &StoreContents) -> anyhow::Result<Self> {
         let plan = plan(source.list()?, Layout::Library);
         if plan.phrases.is_empty() {
             bail!(
@@ -165,12 +165,12 @@ impl Songs {
                 fingerprint: format!("files {} {list_fingerprint}", audio.fingerprint),
                 split: super::split::TRAIN,
                 problem,
-                files: Files::Folder { audio, beat_list },
+                files: SongFiles::Folder { audio, beat_list },
                 id: planned.id,
             });
         }
         let origin = source.location().url().to_owned();
-        Ok(Self { origin, songs, n_without_features: 0, place: Place::Folder(source) })
+        Ok(Self { origin, songs, n_without_features: 0, place: SongSource::Folder(source) })
     }
 
     /// Gives songs a problem whose phrases would be called like those of another one.
@@ -190,40 +190,40 @@ impl Songs {
     }
 
     /// Splits off what reads the songs `todo`.
-    pub fn feeding(&self, todo: Vec<Song>) -> Feeding {
+    pub fn feeding(&self, todo: Vec<Song>) -> SongFeed {
         let (made, read) = todo.into_iter().partition(Song::is_made);
-        Feeding { place: self.place.clone(), read, made }
+        SongFeed { place: self.place.clone(), read, made }
     }
 }
 
 impl Song {
     /// Returns whether the song is played here, and not read.
     pub fn is_made(&self) -> bool {
-        matches!(self.files, Files::Made { .. })
+        matches!(self.files, SongFiles::Made { .. })
     }
 }
 
 /// Songs on their way to the workers.
-pub struct Feeding {
-    place: Place,
+pub struct SongFeed {
+    place: SongSource,
     read: Vec<Song>,
     made: Vec<Song>,
 }
 
-impl Feeding {
-    /// Sends every song with its input until nobody receives any more.
+impl SongFeed {
+    /// Sends every song with its input until the receiver is dropped.
     ///
     /// # Errors
     /// [`StoreError`] when the table of features cannot be read.
-    pub fn run(self, sender: &SyncSender<(Song, Input)>) -> Result<(), StoreError> {
+    pub fn run(self, sender: &SyncSender<(Song, SongInput)>) -> Result<(), StoreError> {
         match &self.place {
             _ if self.read.is_empty() => {}
-            Place::Folder(source) => send_files(source, self.read, sender),
-            Place::Store(store) => send_features(store, self.read, sender)?,
+            SongSource::Folder(source) => send_files(source, self.read, sender),
+            SongSource::Store(store) => send_features(store, self.read, sender)?,
         }
         for song in self.made {
-            let Files::Made { duration_s, .. } = song.files else { continue };
-            if sender.send((song, Input::Unplayed { duration_s })).is_err() {
+            let SongFiles::Made { duration_s, .. } = song.files else { continue };
+            if sender.send((song, SongInput::Unplayed { duration_s })).is_err() {
                 break;
             }
         }
@@ -231,14 +231,14 @@ impl Feeding {
     }
 }
 
-fn send_files(source: &Source, songs: Vec<Song>, sender: &SyncSender<(Song, Input)>) {
+fn send_files(source: &Source, songs: Vec<Song>, sender: &SyncSender<(Song, SongInput)>) {
     let files = songs.iter().flat_map(|song| match &song.files {
-        Files::Folder { audio, beat_list } => vec![Some(audio.clone()), beat_list.clone()],
-        Files::Store { .. } | Files::Made { .. } | Files::Missing => Vec::new(),
+        SongFiles::Folder { audio, beat_list } => vec![Some(audio.clone()), beat_list.clone()],
+        SongFiles::Store { .. } | SongFiles::Made { .. } | SongFiles::Missing => Vec::new(),
     });
     let mut reader = source.read_in_order(files.flatten().collect());
     for song in songs {
-        let Files::Folder { beat_list, .. } = &song.files else { continue };
+        let SongFiles::Folder { beat_list, .. } = &song.files else { continue };
         let mut permits: Vec<Box<dyn Send>> = Vec::new();
         let mut next = || {
             let gone = || StoreError::NotFound { place: song.url.clone(), hint: "" };
@@ -248,7 +248,7 @@ fn send_files(source: &Source, songs: Vec<Song>, sender: &SyncSender<(Song, Inpu
         };
         let audio = next();
         let beat_list = beat_list.as_ref().map(|_| next());
-        let input = Input::Files { audio, beat_list, _permits: permits };
+        let input = SongInput::Files { audio, beat_list, _permits: permits };
         if sender.send((song, input)).is_err() {
             break;
         }
@@ -258,22 +258,22 @@ fn send_files(source: &Source, songs: Vec<Song>, sender: &SyncSender<(Song, Inpu
 fn send_features(
     store: &StoreSnapshot,
     songs: Vec<Song>,
-    sender: &SyncSender<(Song, Input)>,
+    sender: &SyncSender<(Song, SongInput)>,
 ) -> Result<(), StoreError> {
     let mut missing: BTreeMap<String, Song> =
         songs.into_iter().map(|song| (song.id.clone(), song)).collect();
     let wanted = missing.keys().cloned().collect();
     store.table(tables::features())?.visit_items(&wanted, |id, frames| {
         if let Some(song) = missing.remove(id) {
-            // Nobody listens any more when the job has failed; it says so itself.
-            sender.send((song, Input::Features(Ok(frames)))).ok();
+            // The receiver is dropped when the job has failed; the job reports that itself.
+            sender.send((song, SongInput::Features(Ok(frames)))).ok();
         }
         Ok::<_, StoreError>(())
     })?;
     for (id, song) in missing {
         let message = format!("{id}: its features are gone from the store; run extract again");
         let failure = Failure::new(FailureKind::Unreadable, &id, message);
-        if sender.send((song, Input::Features(Err(failure)))).is_err() {
+        if sender.send((song, SongInput::Features(Err(failure)))).is_err() {
             break;
         }
     }

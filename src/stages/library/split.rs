@@ -15,42 +15,42 @@ const MIN_SPLIT_SONGS: usize = 3;
 
 /// How many songs: a number, or a fraction of all.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Share {
+pub enum SongShare {
     Songs(usize),
     Fraction(f64),
 }
 
-impl Share {
+impl SongShare {
     /// Returns how many of `n` songs that is; of a fraction above 0, at least one.
     fn of(self, n: usize) -> usize {
         match self {
-            Share::Songs(songs) => songs,
-            Share::Fraction(0.0) => 0,
-            Share::Fraction(fraction) => ((fraction * n as f64).round() as usize).max(1),
+            SongShare::Songs(songs) => songs,
+            SongShare::Fraction(0.0) => 0,
+            SongShare::Fraction(fraction) => ((fraction * n as f64).round() as usize).max(1),
         }
     }
 }
 
-impl FromStr for Share {
+impl FromStr for SongShare {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
         if let Ok(songs) = text.parse() {
-            return Ok(Share::Songs(songs));
+            return Ok(SongShare::Songs(songs));
         }
         match text.parse() {
-            Ok(fraction) if (0.0..1.0).contains(&fraction) => Ok(Share::Fraction(fraction)),
+            Ok(fraction) if (0.0..1.0).contains(&fraction) => Ok(SongShare::Fraction(fraction)),
             _ => Err("give a number of songs such as 2, or a fraction such as 0.1".to_owned()),
         }
     }
 }
 
-impl fmt::Display for Share {
+impl fmt::Display for SongShare {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Share::Songs(songs) => write!(f, "{songs}"),
+            SongShare::Songs(songs) => write!(f, "{songs}"),
             // With its point, so that it is read back as a fraction.
-            Share::Fraction(fraction) => write!(f, "{fraction:?}"),
+            SongShare::Fraction(fraction) => write!(f, "{fraction:?}"),
         }
     }
 }
@@ -62,8 +62,8 @@ impl fmt::Display for Share {
 /// A sentence where no song would be left to train.
 pub fn assign<'a>(
     songs: impl Iterator<Item = &'a str>,
-    validation: Share,
-    test: Share,
+    validation: SongShare,
+    test: SongShare,
 ) -> Result<BTreeMap<&'a str, &'static str>, String> {
     let mut ordered: Vec<(String, &str)> =
         songs.map(|song| (digest(song.as_bytes()), song)).collect();
@@ -94,7 +94,7 @@ mod tests {
         (0..n).map(|i| format!("album/song {i}.ogg")).collect()
     }
 
-    fn counts(n: usize, validation: Share, test: Share) -> [usize; 3] {
+    fn counts(n: usize, validation: SongShare, test: SongShare) -> [usize; 3] {
         let names = names(n);
         let split = assign(names.iter().map(String::as_str), validation, test).unwrap();
         assert_eq!(split.len(), n);
@@ -103,7 +103,7 @@ mod tests {
 
     #[test]
     fn tenths_are_rounded_and_at_least_one() {
-        let tenth = Share::Fraction(0.1);
+        let tenth = SongShare::Fraction(0.1);
         for (n, expected) in [
             (0, [0, 0, 0]),
             (1, [1, 0, 0]),
@@ -115,14 +115,14 @@ mod tests {
         ] {
             assert_eq!(counts(n, tenth, tenth), expected, "{n}");
         }
-        assert_eq!(counts(9, Share::Songs(3), Share::Songs(0)), [6, 3, 0]);
-        assert_eq!(counts(9, Share::Fraction(0.0), Share::Fraction(0.5)), [4, 0, 5]);
+        assert_eq!(counts(9, SongShare::Songs(3), SongShare::Songs(0)), [6, 3, 0]);
+        assert_eq!(counts(9, SongShare::Fraction(0.0), SongShare::Fraction(0.5)), [4, 0, 5]);
     }
 
     #[test]
     fn the_order_of_the_listing_does_not_matter() {
         let names = names(40);
-        let tenth = Share::Fraction(0.1);
+        let tenth = SongShare::Fraction(0.1);
         let forwards = assign(names.iter().map(String::as_str), tenth, tenth);
         let backwards = assign(names.iter().rev().map(String::as_str), tenth, tenth);
         assert_eq!(forwards, backwards);
@@ -131,7 +131,8 @@ mod tests {
     #[test]
     fn somebody_has_to_train() {
         let names = names(4);
-        let found = assign(names.iter().map(String::as_str), Share::Songs(3), Share::Fraction(0.1));
+        let found =
+            assign(names.iter().map(String::as_str), SongShare::Songs(3), SongShare::Fraction(0.1));
         assert_eq!(
             found,
             Err("3 songs for validation and 1 for the test leave none of 4 to train on; lower \
@@ -142,14 +143,16 @@ mod tests {
 
     #[test]
     fn shares_are_read_and_written() {
-        for (text, share) in
-            [("3", Share::Songs(3)), ("0.25", Share::Fraction(0.25)), ("0.0", Share::Fraction(0.0))]
-        {
+        for (text, share) in [
+            ("3", SongShare::Songs(3)),
+            ("0.25", SongShare::Fraction(0.25)),
+            ("0.0", SongShare::Fraction(0.0)),
+        ] {
             assert_eq!(text.parse(), Ok(share));
             assert_eq!(share.to_string(), text);
         }
         for text in ["-1", "1.5", "1.0", "some", "", "nan"] {
-            assert!(text.parse::<Share>().is_err(), "{text}");
+            assert!(text.parse::<SongShare>().is_err(), "{text}");
         }
     }
 }

@@ -2,28 +2,28 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
-use super::layout::Output;
-use super::one::{self, Music, dance};
+use super::layout::PhraseFolder;
+use super::one::{self, SongMusic, dance};
 use super::rows::{beat_rows, phrase_row};
 use super::songs::Song;
-use super::{Library, Rules};
+use super::{Library, LibraryRules};
 use crate::motion::choreography::Repertoire;
 use crate::stages::Stage as _;
 use crate::stages::failure::{Failure, FailureKind};
-use crate::stages::seen::Seen;
+use crate::stages::seen::SeenContent;
 use crate::store::tables::{self, BeatRow, FailureRow, PhraseRow};
 use crate::store::{
-    Commit, Item, Ledger, Location, Row as _, Settled, StoreError, TimestampUs, digest,
+    Commit, Item, Ledger, Location, Row as _, SettledItem, StoreError, TimestampUs, digest,
 };
 
 /// Writes songs and failures.
-pub struct Writer<'a> {
+pub struct SongWriter<'a> {
     pub store: &'a Location,
     pub ledger: &'a Ledger,
     pub params_hash: &'a str,
     /// Where the songs come from, as commits name it.
     pub origin: &'a str,
-    pub rules: &'a Rules,
+    pub rules: &'a LibraryRules,
     pub repertoire: &'a Repertoire,
     /// Digest of the captures' content.
     pub captures_hash: &'a str,
@@ -33,15 +33,15 @@ pub struct Writer<'a> {
     pub constructed: &'a BTreeMap<String, BTreeMap<String, String>>,
     /// All other phrases of the store, and their sources.
     pub others: &'a HashMap<String, String>,
-    pub output: Option<&'a Output>,
+    pub output: Option<&'a PhraseFolder>,
     pub force: bool,
-    pub seen: &'a Seen,
+    pub seen: &'a SeenContent,
 }
 
-/// What became of a song.
+/// The outcome of a song.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Written {
-    /// So many new phrases.
+pub enum SongOutcome {
+    /// The number of new phrases.
     Phrases(usize),
     /// The store has its phrases already.
     Unchanged,
@@ -76,9 +76,9 @@ pub fn fingerprint(song: &Song, captures_fingerprint: &str) -> String {
 /// A song is committed whole, so its first phrase stands for all.
 pub fn is_settled(
     song: &Song,
-    (ledger, seen): (&Ledger, &Seen),
+    (ledger, seen): (&Ledger, &SeenContent),
     (origin, params_hash): (&str, &str),
-    rules: &Rules,
+    rules: &LibraryRules,
     fingerprint: &str,
 ) -> bool {
     let is_refused = ledger.get(&song.id).is_some_and(|known| known.item.failure.is_some());
@@ -93,7 +93,7 @@ pub fn is_settled(
         })
 }
 
-impl Writer<'_> {
+impl SongWriter<'_> {
     fn start(&self, origin: &str) -> Commit<'_> {
         Commit::new(self.store, Library::NAME, self.params_hash, origin)
     }
@@ -102,7 +102,7 @@ impl Writer<'_> {
     ///
     /// # Errors
     /// [`Refusal`]; nothing of the song is in the store then that was not there before.
-    pub fn song(&self, song: &Song, music: &Music) -> Result<Written, Refusal> {
+    pub fn song(&self, song: &Song, music: &SongMusic) -> Result<SongOutcome, Refusal> {
         let input_hash = self.input_hash(song, music);
         let first = self.ledger.get(&one::phrase_id(song, self.rules, 0, 0));
         let is_there = !self.force
@@ -118,7 +118,7 @@ impl Writer<'_> {
             self.settle(self.start(self.origin), self.recovered(song).into_iter().collect())?;
             self.see(song, first)?;
             if self.output.is_none() {
-                return Ok(Written::Unchanged);
+                return Ok(SongOutcome::Unchanged);
             }
         }
         let mut commit = self.start(self.origin);
@@ -146,7 +146,7 @@ impl Writer<'_> {
             Ok::<(), Refusal>(())
         })?;
         if is_there {
-            return Ok(Written::Unchanged);
+            return Ok(SongOutcome::Unchanged);
         }
         let made: BTreeSet<&str> = items.iter().map(|item| item.id.as_str()).collect();
         let old = self.former(song, &made);
@@ -157,12 +157,12 @@ impl Writer<'_> {
             commit.part(BeatRow::schema().name, BeatRow::schema)?.write_rows(&beats)?;
         }
         self.settle(commit, items)?;
-        Ok(Written::Phrases(n_phrases))
+        Ok(SongOutcome::Phrases(n_phrases))
     }
 
     /// Keeps the fingerprint of a song whose phrases the store has, and which is met under another: it or a capture
     /// was touched.
-    fn see(&self, song: &Song, first: Option<&Settled>) -> Result<(), StoreError> {
+    fn see(&self, song: &Song, first: Option<&SettledItem>) -> Result<(), StoreError> {
         let fingerprint = fingerprint(song, self.captures_fingerprint);
         let Some(known) = first.filter(|known| known.item.fingerprint != fingerprint) else {
             return Ok(());
@@ -297,7 +297,7 @@ impl Writer<'_> {
     }
 
     /// Returns the digest of everything but the parameters that determines a song's phrases.
-    fn input_hash(&self, song: &Song, music: &Music) -> String {
+    fn input_hash(&self, song: &Song, music: &SongMusic) -> String {
         let lines = [song.url.as_str(), song.split, &music.input_hash, self.captures_hash];
         digest(lines.join("\n").as_bytes())
     }
@@ -307,11 +307,11 @@ impl Writer<'_> {
         // The same song may be named by a folder now and by the store before.
         let former = self.constructed.get(&song.slug).and_then(|phrases| phrases.get(id));
         let is_same = former.is_some_and(|url| *url == song.url);
-        let of_another = || {
+        let other_origin = || {
             let known = self.ledger.get(id).filter(|known| known.item.succeeded())?;
             (known.origin != self.origin && !is_same && !self.force).then_some(&known.origin)
         };
-        let Some(from) = self.others.get(id).or_else(of_another) else { return Ok(()) };
+        let Some(from) = self.others.get(id).or_else(other_origin) else { return Ok(()) };
         let message = format!(
             "{}: its phrase {id} is in the store already, from {from}; rename the song or use another \
              store",

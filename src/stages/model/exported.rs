@@ -20,7 +20,7 @@ use crate::units::frames_to_s;
 const TIMED: [(Sampler, usize); 2] = [(Sampler::Ddim { eta: 0.0 }, 20), (Sampler::DpmSolver, 10)];
 
 /// The account of a model.
-pub struct Account {
+pub struct ModelSummary {
     card: ModelCard,
     place: String,
     engine: &'static str,
@@ -82,7 +82,7 @@ pub fn look(
         timed.push((sampler.name(), config.n_steps, frames, best));
     }
     let (place, card) = (store.url_of(&crate::stages::model_files::folder_of(name)), card.clone());
-    Ok(Box::new(Account { card, place, engine: engine.name(), load_s, timed }))
+    Ok(Box::new(ModelSummary { card, place, engine: engine.name(), load_s, timed }))
 }
 
 /// Counts the music that a model learned from.
@@ -104,7 +104,7 @@ fn summary_of(learned: &LearnedFrom) -> String {
     )
 }
 
-impl Summary for Account {
+impl Summary for ModelSummary {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
         let Self { card, place, engine, load_s, timed } = self;
         let provenance = &card.provenance;

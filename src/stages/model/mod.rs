@@ -9,7 +9,8 @@ use anyhow::ensure;
 use super::model_files::{EngineChoice, EngineParams};
 use super::{ClientParams, Contract, Progress, Stage, Summary};
 use crate::model::{
-    DecoderConfig, Kept, Layer, MotionDecoder, Outline, Preset, UNet1D, UNetConfig, UNetInputs,
+    ActivationCounts, DecoderConfig, Layer, MotionDecoder, Outline, Preset, UNet1D, UNetConfig,
+    UNetInputs,
 };
 use crate::store::Location;
 
@@ -82,20 +83,20 @@ impl Stage for Model {
             Network::Unet => format!("UNet1D, preset {}", params.preset.name()),
             Network::Decoder => "MotionDecoder".to_owned(),
         };
-        Ok(Box::new(Account { name, params, one, kept, checkpointed }))
+        Ok(Box::new(NetworkSummary { name, params, one, kept, checkpointed }))
     }
 }
 
-/// What following a network through gives.
-struct Followed {
+/// Layers, operations and memory of a network, from following shapes through it.
+struct NetworkOutline {
     layers: Vec<Layer>,
     flops: u64,
-    kept: Kept,
+    kept: ActivationCounts,
     n_parameters: usize,
 }
 
 /// Follows shapes through the network for a batch.
-fn follow(params: &Params, batch: usize, use_checkpoint: bool) -> anyhow::Result<Followed> {
+fn follow(params: &Params, batch: usize, use_checkpoint: bool) -> anyhow::Result<NetworkOutline> {
     let frames = params.frames;
     let (layers, flops, kept, n_parameters);
     match params.network {
@@ -122,16 +123,16 @@ fn follow(params: &Params, batch: usize, use_checkpoint: bool) -> anyhow::Result
             n_parameters = list.n_elements();
         }
     }
-    Ok(Followed { layers, flops, kept, n_parameters })
+    Ok(NetworkOutline { layers, flops, kept, n_parameters })
 }
 
 /// The account of a network.
-struct Account {
+struct NetworkSummary {
     name: String,
     params: Params,
-    one: Followed,
-    kept: Kept,
-    checkpointed: Kept,
+    one: NetworkOutline,
+    kept: ActivationCounts,
+    checkpointed: ActivationCounts,
 }
 
 /// Bytes of a number.
@@ -154,7 +155,7 @@ fn megabytes(numbers: usize) -> String {
     format!("{:.1} MB", numbers as f64 * F32 / 1e6)
 }
 
-impl Summary for Account {
+impl Summary for NetworkSummary {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
         let Params { frames, batch_size, .. } = self.params;
         let width = self.one.layers.iter().map(|layer| layer.name.len()).max().unwrap_or(0);

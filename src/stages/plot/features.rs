@@ -98,8 +98,8 @@ pub fn run(params: &Params) -> anyhow::Result<Box<dyn Summary>> {
     write_picture(what, output, &picture, params.dry_run)
 }
 
-/// What is drawn.
-struct Subject {
+/// The features to draw.
+struct PlottedFeatures {
     title: String,
     /// [T, 163].
     frames: Array2<f32>,
@@ -108,12 +108,12 @@ struct Subject {
 }
 
 /// Extracts the features of an audio file.
-fn from_audio(path: &Path, tuning: Option<Tuning>) -> anyhow::Result<Subject> {
+fn from_audio(path: &Path, tuning: Option<Tuning>) -> anyhow::Result<PlottedFeatures> {
     let place = path.display().to_string();
     if path.is_dir() {
         bail!("{place}: is a folder; name a file in it");
     }
-    // Who waits for one picture decides how long.
+    // The user who waits for one picture decides how long.
     let options = Options {
         tuning,
         max_duration_s: f64::INFINITY,
@@ -127,7 +127,7 @@ fn from_audio(path: &Path, tuning: Option<Tuning>) -> anyhow::Result<Subject> {
     });
     let Recording { raw, meter, .. } = recording.map_err(|failure| anyhow!(failure.message))?;
     let features = raw.normalize();
-    Ok(Subject {
+    Ok(PlottedFeatures {
         title: path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned(),
         frames: features.frames,
         tempo_bpm: meter.tempo_bpm(),
@@ -136,7 +136,11 @@ fn from_audio(path: &Path, tuning: Option<Tuning>) -> anyhow::Result<Subject> {
 }
 
 /// Reads the features of a phrase.
-fn from_store(store: &Location, phrase: &str, tuning: Option<Tuning>) -> anyhow::Result<Subject> {
+fn from_store(
+    store: &Location,
+    phrase: &str,
+    tuning: Option<Tuning>,
+) -> anyhow::Result<PlottedFeatures> {
     let rows = ItemTables::take(store, phrase)?;
     let Some(frames) = rows.frames(tables::features())? else {
         return Err(missing(store, phrase, &rows)?);
@@ -157,7 +161,7 @@ fn from_store(store: &Location, phrase: &str, tuning: Option<Tuning>) -> anyhow:
         Some(BeatSource::Tracker) => beats.tempo_bpm(),
         _ => extraction.and_then(|e| e.tempo_bpm),
     };
-    Ok(Subject {
+    Ok(PlottedFeatures {
         title: phrase.to_owned(),
         frames,
         tempo_bpm,

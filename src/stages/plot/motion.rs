@@ -7,7 +7,7 @@ use ndarray::s;
 
 use crate::motion::Trajectory;
 use crate::plot::{self, MOTION_WIDTH_PX, MotionPanel, MotionPlot};
-use crate::stages::motion_source::{MotionParams, Room};
+use crate::stages::motion_source::{MotionCapacity, MotionParams};
 use crate::stages::{ClientParams, Summary};
 use crate::training::TemporalConfig;
 use crate::units::frames_to_s;
@@ -50,7 +50,7 @@ pub fn run(params: &Params) -> anyhow::Result<Box<dyn Summary>> {
     let output = &params.output;
     let format = format_of(output)?;
     params.excerpt.check()?;
-    let subject = params.source.read(Room::One, &params.client.options())?;
+    let subject = params.source.read(MotionCapacity::One, &params.client.options())?;
     let shown = subject.shown.first().ok_or_else(|| anyhow!("there is no motion to draw"))?;
     let frames = params.excerpt.frames(shown.motion.n_frames(), &subject.title)?;
     let motion = Trajectory::new(shown.motion.view().slice(s![frames.clone(), ..]).to_owned())?;

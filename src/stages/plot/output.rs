@@ -36,7 +36,7 @@ pub fn format_of(output: &Path) -> anyhow::Result<Format> {
 /// Writes a picture of `what`, whole or not at all; in a dry run not at all.
 ///
 /// # Errors
-/// What the file system says.
+/// The error of the file system.
 pub fn write_picture(
     what: String,
     output: &Path,
@@ -48,11 +48,11 @@ pub fn write_picture(
             .with_context(|| format!("while writing {}", output.display()))?;
     }
     let (width_px, height_px) = (picture.width_px, picture.height_px);
-    Ok(Box::new(Drawn { what, output: output.to_owned(), width_px, height_px, dry_run }))
+    Ok(Box::new(PlotSummary { what, output: output.to_owned(), width_px, height_px, dry_run }))
 }
 
-/// What was drawn.
-struct Drawn {
+/// The summary of a plot.
+struct PlotSummary {
     what: String,
     output: PathBuf,
     width_px: u32,
@@ -60,9 +60,9 @@ struct Drawn {
     dry_run: bool,
 }
 
-impl Summary for Drawn {
+impl Summary for PlotSummary {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        let Drawn { what, output, width_px, height_px, dry_run } = self;
+        let PlotSummary { what, output, width_px, height_px, dry_run } = self;
         let would = if *dry_run { "would draw " } else { "" };
         writeln!(out, "{would}{what} → {} ({width_px} × {height_px} px)", output.display())
     }
@@ -72,7 +72,7 @@ impl Summary for Drawn {
     }
 
     fn figures(&mut self) -> serde_json::Value {
-        let Drawn { what, output, width_px, height_px, dry_run } = self;
+        let PlotSummary { what, output, width_px, height_px, dry_run } = self;
         serde_json::json!({
             "to": output,
             "dry_run": dry_run,

@@ -196,23 +196,28 @@ fn names(names: impl Iterator<Item = &'static str>) -> String {
 /// Collects what was logged of a stage.
 fn curves(stage: TrainingStage, panels: &[TrainingPanel], rows: &[TrainingLogRow]) -> StageCurves {
     let rows: Vec<&TrainingLogRow> = rows.iter().filter(|row| row.stage == stage.name()).collect();
-    let of_kind = |kind: RowKind| rows.iter().copied().filter(move |row| row.kind == kind.name());
-    let best = of_kind(RowKind::Validation)
+    let rows_of_kind =
+        |kind: RowKind| rows.iter().copied().filter(move |row| row.kind == kind.name());
+    let best = rows_of_kind(RowKind::Validation)
         .filter_map(|row| Some((steps_done(row), row.loss.filter(|loss| loss.is_finite())?)))
-        // The first of equals, as training keeps it.
+        // Among equal losses the first, as training keeps it.
         .min_by(|a, b| a.1.total_cmp(&b.1));
     let panels = panels.iter().map(|&panel| {
         let value = |row: &TrainingLogRow| value(row, panel);
         PanelCurves {
-            steps: points(of_kind(RowKind::Step), value),
+            steps: points(rows_of_kind(RowKind::Step), value),
             decoder_steps: match panel {
-                TrainingPanel::LearningRate => points(of_kind(RowKind::Step), |row| row.lr_decoder),
+                TrainingPanel::LearningRate => {
+                    points(rows_of_kind(RowKind::Step), |row| row.lr_decoder)
+                }
                 _ => Vec::new(),
             },
-            epochs: at_middles(points(of_kind(RowKind::Epoch), value)),
-            validation: points(of_kind(RowKind::Validation), value),
+            epochs: at_middles(points(rows_of_kind(RowKind::Epoch), value)),
+            validation: points(rows_of_kind(RowKind::Validation), value),
             live_validation: match panel {
-                TrainingPanel::Loss => points(of_kind(RowKind::Validation), |row| row.loss_live),
+                TrainingPanel::Loss => {
+                    points(rows_of_kind(RowKind::Validation), |row| row.loss_live)
+                }
                 _ => Vec::new(),
             },
             ..PanelCurves::new(panel)
@@ -221,12 +226,12 @@ fn curves(stage: TrainingStage, panels: &[TrainingPanel], rows: &[TrainingLogRow
     StageCurves {
         stage,
         n_steps: rows.iter().map(|row| steps_done(row)).max().unwrap_or(0),
-        n_epochs: of_kind(RowKind::Epoch)
+        n_epochs: rows_of_kind(RowKind::Epoch)
             .map(|row| u64::try_from(row.epoch).unwrap_or(0))
             .max()
             .unwrap_or(0),
         elapsed_s: rows.iter().map(|row| row.elapsed_s).fold(0.0, f64::max),
-        n_skipped: of_kind(RowKind::Step).filter(|row| row.skipped).count() as u64,
+        n_skipped: rows_of_kind(RowKind::Step).filter(|row| row.skipped).count() as u64,
         best,
         panels: panels.collect(),
     }

@@ -19,13 +19,13 @@ use crate::model::UNet1D;
 use crate::motion::Normalizer;
 use crate::store::{Lease, Location};
 use crate::training::{
-    Augmentation, Checkpoints, DecoderLearner, Denoiser, DiffusionLearner, Drive, End, Journal,
-    Kind, Learner, Loader, Plan, State, TrainConfig, TrainingError, Windows,
+    Augmentation, CheckpointKind, Checkpoints, DecoderLearner, Denoiser, DiffusionLearner, Drive,
+    Journal, Learner, Loader, Plan, State, TrainConfig, TrainingEnd, TrainingError, Windows,
 };
 use session::{
-    Looker, MachineParams, check_run_name, claim, claim_path, lease_of, read_phrases, scales,
+    MachineParams, ProgressWatch, check_run_name, claim, claim_path, lease_of, read_phrases, scales,
 };
-pub use summary::{Account, DryRun, StageAccount};
+pub use summary::{StageSummary, TrainDryRun, TrainSummary};
 
 /// Share of a time budget that the decoder gets.
 const DECODER_SHARE: f64 = 0.1;
@@ -112,7 +112,7 @@ impl Stage for Train {
         config.network.check()?;
         check_numbers(&params, &config)?;
         let store = Location::open(&params.store, &params.client.options())?;
-        let watch = Looker(progress);
+        let watch = ProgressWatch(progress);
         let lease = match params.dry_run {
             true => None,
             false => Some(lease_of(&store, &params.run, &watch)?),
@@ -121,7 +121,7 @@ impl Stage for Train {
         let mut run = Run { params: &params, config: &config, store: &store, watch: &watch, lease };
         let first = run.checkpoints(DiffusionLearner::STAGE);
         ensure!(
-            !params.resume || !first.steps(Kind::Step)?.is_empty(),
+            !params.resume || !first.steps(CheckpointKind::Step)?.is_empty(),
             "run {} has no checkpoint to resume from in {store}; leave --resume out to start it",
             params.run
         );
@@ -190,7 +190,7 @@ struct Run<'a> {
     params: &'a Params,
     config: &'a TrainConfig,
     store: &'a Location,
-    watch: &'a Looker<'a>,
+    watch: &'a ProgressWatch<'a>,
     lease: Option<&'a Lease>,
 }
 
@@ -236,7 +236,7 @@ impl<'a> Run<'a> {
             0,
         );
         let (_, list) = UNet1D::new(&self.config.network.unet);
-        Ok(Box::new(DryRun {
+        Ok(Box::new(TrainDryRun {
             run: self.params.run.clone(),
             what: format!("train a UNet of {} parameters", list.n_elements()),
             n_train: windows.n_train(),
@@ -259,7 +259,7 @@ impl<'a> Run<'a> {
             let windows = Windows::new(dataset, scales, augmentation, n_frames, params.seed);
             Arc::new(windows.heard_by(&config.network.unet))
         };
-        let mut account = Account::new(&params.run, self.store, phrases.left_out.clone());
+        let mut account = TrainSummary::new(&params.run, self.store, phrases.left_out.clone());
 
         let augmented = windows(config.diffusion.augmentation.clone());
         let mut learner =
@@ -272,7 +272,7 @@ impl<'a> Run<'a> {
         let patience = params.machine.patience();
         claim(self.store, &params.run, Train::NAME, config, patience, self.watch)?;
         let end = self.stage(&mut learner, &augmented, &mut account)?;
-        if end == End::Interrupted {
+        if end == TrainingEnd::Interrupted {
             return Ok(Box::new(account.interrupted(&resume_command(params))));
         }
         account.beside(learner.baselines()?);
@@ -296,7 +296,7 @@ impl<'a> Run<'a> {
         )
         .on(&threads);
         let end = self.stage(&mut learner, &augmented, &mut account)?;
-        if end == End::Interrupted {
+        if end == TrainingEnd::Interrupted {
             return Ok(Box::new(account.interrupted(&resume_command(params))));
         }
         Ok(Box::new(account))
@@ -307,8 +307,8 @@ impl<'a> Run<'a> {
         &self,
         learner: &mut L,
         windows: &Arc<Windows>,
-        account: &mut Account,
-    ) -> anyhow::Result<End> {
+        account: &mut TrainSummary,
+    ) -> anyhow::Result<TrainingEnd> {
         let checkpoints = self.checkpoints(L::STAGE);
         let plan = self.plan::<L>(windows);
         let state = State::new(
@@ -334,7 +334,7 @@ impl<'a> Run<'a> {
         let end = drive.run(learner, |first| {
             Loader::start(windows, plan.batch_size as usize, first, machine.loader_threads)
         })?;
-        account.add(StageAccount::of(L::STAGE, &drive.state.progress, started_at, end));
+        account.add(StageSummary::of(L::STAGE, &drive.state.progress, started_at, end));
         Ok(end)
     }
 
@@ -376,14 +376,14 @@ pub fn restore<L: Learner, C>(
     checkpoints: &Checkpoints,
     fresh: State<C>,
     run: &str,
-    watch: &Looker,
+    watch: &ProgressWatch,
 ) -> anyhow::Result<State<C>>
 where
     C: serde::Serialize + serde::de::DeserializeOwned,
 {
     use crate::training::Watch as _;
-    for step in checkpoints.steps(Kind::Step)?.into_iter().rev() {
-        let read = checkpoints.read(Kind::Step, step, |archive, place| {
+    for step in checkpoints.steps(CheckpointKind::Step)?.into_iter().rev() {
+        let read = checkpoints.read(CheckpointKind::Step, step, |archive, place| {
             let state = State::<C>::of(archive, place)?;
             let differences = crate::training::differences(&fresh.config, &state.config);
             if !differences.is_empty() {
@@ -411,7 +411,7 @@ where
                     "checkpoint {place} is damaged ({source}); taking an older one"
                 ));
                 // What is there is not written again, so it must go.
-                checkpoints.remove(Kind::Step, step)?;
+                checkpoints.remove(CheckpointKind::Step, step)?;
             }
             Err(error) => bail!(error),
         }

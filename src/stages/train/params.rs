@@ -7,8 +7,8 @@ use crate::model::{DecoderConfig, Preset, UNetConfig};
 use crate::motion::ChannelLimits;
 use crate::motion::style::STYLE_DIM;
 use crate::training::{
-    Augmentation, ChannelWeights, Course, DecoderTraining, DiffusionTraining, EmaConfig,
-    EstimateLosses, LearningRate, NetworkConfig, Objective, OptimizerConfig, TrainConfig,
+    Augmentation, ChannelWeights, DecoderTraining, DiffusionTraining, EmaConfig, EstimateLosses,
+    LearningRate, LearningRateSchedule, NetworkConfig, Objective, OptimizerConfig, TrainConfig,
 };
 
 /// Sizes of the networks; each wins over the preset.
@@ -184,8 +184,8 @@ pub struct OptimizerParams {
     #[arg(long, value_name = "X", help_heading = "Optimizer")]
     pub learning_rate: Option<f64>,
     /// Course of the learning rate after the warm-up.
-    #[arg(long, value_enum, default_value_t = Course::Cosine, help_heading = "Optimizer")]
-    pub lr_schedule: Course,
+    #[arg(long, value_enum, default_value_t = LearningRateSchedule::Cosine, help_heading = "Optimizer")]
+    pub lr_schedule: LearningRateSchedule,
     /// Steps of the warm-up; in a short training a tenth of all.
     #[arg(long, value_name = "N", default_value_t = 1000, help_heading = "Optimizer")]
     pub warmup_steps: u64,
@@ -215,7 +215,7 @@ pub struct OptimizerParams {
 
 /// What is rarely changed.
 #[derive(Clone, Debug, clap::Args)]
-pub struct RareParams {
+pub struct AdvancedParams {
     /// Decays of AdamW's averages of the gradient and its square.
     #[arg(long, value_name = "X", num_args = 2, value_delimiter = ',',
           default_values_t = OptimizerConfig::default().betas, help_heading = "Optimizer")]
@@ -250,7 +250,7 @@ pub struct ConfigParams {
     #[command(flatten)]
     pub optimizer: OptimizerParams,
     #[command(flatten)]
-    pub rare: RareParams,
+    pub rare: AdvancedParams,
 }
 
 impl NetworkParams {

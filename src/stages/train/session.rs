@@ -1,4 +1,4 @@
-//! What training and fine-tuning share: the run's name and claim, its phrases, and whoever looks on.
+//! What training and fine-tuning share: the run's name and claim, its phrases, and progress.
 
 use std::collections::BTreeSet;
 use std::num::NonZeroUsize;
@@ -13,10 +13,11 @@ use crate::autodiff::Threads;
 use crate::stages::{Progress, all_threads, lease};
 use crate::store::tables::FailureRow;
 use crate::store::{
-    Commit, Item, Lease, Ledger, Location, Patience, Put, Row as _, StoreError, TimestampUs, digest,
+    Commit, Item, Lease, Ledger, Location, Patience, PutOutcome, Row as _, StoreError, TimestampUs,
+    digest,
 };
 use crate::training::{
-    Dataset, LeftOut, Reading, Scales, TrainingError, Watch, differences, fit_scales,
+    Dataset, DatasetOptions, ExcludedPhrase, Scales, TrainingError, Watch, differences, fit_scales,
 };
 
 /// Longest name of a run.
@@ -75,11 +76,11 @@ pub fn check_run_name(run: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Takes the right to write a run; whoever asks for it meanwhile waits or is refused.
+/// Takes the lease to write a run; other processes that ask for it meanwhile wait or are refused.
 ///
 /// # Errors
 /// [`StoreError::Held`] when another process writes it.
-pub fn lease_of(store: &Location, run: &str, watch: &Looker) -> Result<Lease, StoreError> {
+pub fn lease_of(store: &Location, run: &str, watch: &ProgressWatch) -> Result<Lease, StoreError> {
     let note = |text: &str| watch.note(text);
     lease::take(store, &format!("runs/{run}"), &format!("run {run}"), &note).map(|(lease, _)| lease)
 }
@@ -99,13 +100,13 @@ pub fn claim<C: Serialize + DeserializeOwned>(
     command: &str,
     config: &C,
     patience: Patience,
-    watch: &Looker,
+    watch: &ProgressWatch,
 ) -> anyhow::Result<()> {
     let path = claim_path(run, command);
     let text = serde_json::to_vec_pretty(config)?;
     let notice = |error: &StoreError, pause| watch.notice(error, pause);
     let put = patience.wait_out(notice, || store.put_new(&path, text.clone().into()))?;
-    if put == Put::AlreadyThere {
+    if put == PutOutcome::AlreadyThere {
         let known = patience.wait_out(notice, || store.read(&path))?;
         let known: C = serde_json::from_slice(&known).map_err(|e| TrainingError::Checkpoint {
             place: store.url_of(&path),
@@ -123,9 +124,9 @@ pub fn claim<C: Serialize + DeserializeOwned>(
 }
 
 /// Phrases that are ready to learn from.
-pub struct Phrases {
+pub struct TrainingPhrases {
     pub dataset: Arc<Dataset>,
-    pub left_out: Vec<LeftOut>,
+    pub left_out: Vec<ExcludedPhrase>,
 }
 
 /// Reads the phrases of a store and records those that are left out, unless nothing may be written.
@@ -138,10 +139,10 @@ pub fn read_phrases(
     machine: &MachineParams,
     max_train_phrases: Option<usize>,
     progress: &dyn Progress,
-    watch: &Looker,
+    watch: &ProgressWatch,
     is_dry_run: bool,
-) -> anyhow::Result<Phrases> {
-    let reading = Reading {
+) -> anyhow::Result<TrainingPhrases> {
+    let reading = DatasetOptions {
         in_memory: machine.in_memory,
         n_threads: machine.threads,
         patience: machine.patience(),
@@ -175,14 +176,18 @@ pub fn read_phrases(
         );
     }
     dataset.check_splits(&store.to_string())?;
-    Ok(Phrases { dataset: Arc::new(dataset), left_out })
+    Ok(TrainingPhrases { dataset: Arc::new(dataset), left_out })
 }
 
 /// Fits the scales of motion and features, and says which channels are constant.
 ///
 /// # Errors
 /// When the frames at hand cannot be read.
-pub fn scales(dataset: &Dataset, n_frames: usize, watch: &Looker) -> Result<Scales, StoreError> {
+pub fn scales(
+    dataset: &Dataset,
+    n_frames: usize,
+    watch: &ProgressWatch,
+) -> Result<Scales, StoreError> {
     let (scales, constant) = fit_scales(dataset, n_frames)?;
     if !constant.is_empty() {
         watch.note(&format!(
@@ -194,7 +199,11 @@ pub fn scales(dataset: &Dataset, n_frames: usize, watch: &Looker) -> Result<Scal
 }
 
 /// Writes phrases that are left out into the table of failures, and withdraws those that are not any more.
-fn record(store: &Location, command: &'static str, left_out: &[LeftOut]) -> Result<(), StoreError> {
+fn record(
+    store: &Location,
+    command: &'static str,
+    left_out: &[ExcludedPhrase],
+) -> Result<(), StoreError> {
     let ledger = Ledger::read(store, command)?;
     let current: BTreeSet<&str> = left_out.iter().map(|one| one.phrase_id.as_str()).collect();
     let mut commit = Commit::new(store, command, "", ITEMS_FROM);
@@ -229,17 +238,17 @@ fn record(store: &Location, command: &'static str, left_out: &[LeftOut]) -> Resu
     if commit.is_empty() { Ok(()) } else { commit.publish().map(|_| ()) }
 }
 
-/// Whoever looks on: the command line.
-pub struct Looker<'a>(pub &'a dyn Progress);
+/// Shows the progress of a training on the command line.
+pub struct ProgressWatch<'a>(pub &'a dyn Progress);
 
-impl Looker<'_> {
+impl ProgressWatch<'_> {
     /// Says that the store does not answer.
     pub fn notice(&self, error: &StoreError, pause: Duration) {
         self.note(&format!("{error}; trying again in {:.0} s", pause.as_secs_f64()));
     }
 }
 
-impl Watch for Looker<'_> {
+impl Watch for ProgressWatch<'_> {
     fn begin(&self, stage: &'static str, step: u64, n_steps: u64) {
         self.0.start(stage, "steps", n_steps);
         self.0.skip(step);

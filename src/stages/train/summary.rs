@@ -6,47 +6,47 @@ use serde_json::json;
 
 use crate::stages::Summary;
 use crate::store::Location;
-use crate::training::{Baselines, End, LeftOut, Progress};
+use crate::training::{Baselines, ExcludedPhrase, Progress, TrainingEnd};
 
 /// Phrases left out that the account spells out.
 const N_SHOWN: usize = 10;
 
-/// What became of one network.
+/// The outcome of training one network.
 #[derive(Clone, Debug)]
-pub struct StageAccount {
+pub struct StageSummary {
     stage: &'static str,
     started_at: u64,
     progress: Progress,
-    end: End,
+    end: TrainingEnd,
     baselines: Option<Baselines>,
 }
 
-impl StageAccount {
+impl StageSummary {
     /// Returns the account of a stage that began at a step and ended.
-    pub fn of(stage: &'static str, progress: &Progress, started_at: u64, end: End) -> Self {
+    pub fn of(stage: &'static str, progress: &Progress, started_at: u64, end: TrainingEnd) -> Self {
         Self { stage, started_at, progress: progress.clone(), end, baselines: None }
     }
 }
 
-/// What became of a run.
+/// The summary of a run.
 #[derive(Clone, Debug)]
-pub struct Account {
+pub struct TrainSummary {
     run: String,
     store: String,
-    stages: Vec<StageAccount>,
-    left_out: Vec<LeftOut>,
+    stages: Vec<StageSummary>,
+    left_out: Vec<ExcludedPhrase>,
     resume: Option<String>,
 }
 
-impl Account {
+impl TrainSummary {
     /// Begins the account of a run.
-    pub fn new(run: &str, store: &Location, left_out: Vec<LeftOut>) -> Self {
+    pub fn new(run: &str, store: &Location, left_out: Vec<ExcludedPhrase>) -> Self {
         let (run, store) = (run.to_owned(), store.to_string());
         Self { run, store, stages: Vec::new(), left_out, resume: None }
     }
 
     /// Adds a stage.
-    pub fn add(&mut self, stage: StageAccount) {
+    pub fn add(&mut self, stage: StageSummary) {
         self.stages.push(stage);
     }
 
@@ -64,16 +64,16 @@ impl Account {
     }
 }
 
-impl Summary for Account {
+impl Summary for TrainSummary {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        for StageAccount { stage, started_at, progress, end, baselines } in &self.stages {
+        for StageSummary { stage, started_at, progress, end, baselines } in &self.stages {
             let n = progress.step - started_at;
             let how = match end {
-                End::Done if n == 0 => "was complete already",
-                End::Done => "is complete",
-                End::OutOfTime => "used up its time",
-                End::Stale => "stopped improving",
-                End::Interrupted => "was interrupted",
+                TrainingEnd::Done if n == 0 => "was complete already",
+                TrainingEnd::Done => "is complete",
+                TrainingEnd::OutOfTime => "used up its time",
+                TrainingEnd::Stale => "stopped improving",
+                TrainingEnd::Interrupted => "was interrupted",
             };
             let minutes = progress.elapsed_s / 60.0;
             write!(out, "{stage}: {how}, {} steps in {minutes:.1} min", progress.step)?;
@@ -115,12 +115,12 @@ impl Summary for Account {
 
     fn figures(&mut self) -> serde_json::Value {
         let stages = self.stages.iter().map(|stage| {
-            let StageAccount { stage, started_at, progress, end, baselines } = stage;
+            let StageSummary { stage, started_at, progress, end, baselines } = stage;
             let end = match end {
-                End::Done => "complete",
-                End::OutOfTime => "out_of_time",
-                End::Stale => "stale",
-                End::Interrupted => "interrupted",
+                TrainingEnd::Done => "complete",
+                TrainingEnd::OutOfTime => "out_of_time",
+                TrainingEnd::Stale => "stale",
+                TrainingEnd::Interrupted => "interrupted",
             };
             json!({
                 "stage": stage,
@@ -155,9 +155,9 @@ fn beside(loss: f64, other: f64) -> String {
     if percent < 0.0 { format!("{:.0} % above", -percent) } else { format!("{percent:.0} % below") }
 }
 
-/// What would be done.
+/// The summary of a dry run.
 #[derive(Clone, Debug)]
-pub struct DryRun {
+pub struct TrainDryRun {
     pub run: String,
     /// What the run would do.
     pub what: String,
@@ -167,7 +167,7 @@ pub struct DryRun {
     pub steps_per_epoch: usize,
 }
 
-impl Summary for DryRun {
+impl Summary for TrainDryRun {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
         let Self { run, what, n_train, n_validation, n_left_out, steps_per_epoch } = self;
         writeln!(

@@ -14,12 +14,13 @@ use parquet::file::properties::{EnabledStatistics, WriterProperties};
 use parquet::schema::types::ColumnPath;
 
 use super::{
-    COMMIT, Catalogue, Entry, FAILURE, FINGERPRINT, FOLDER, FORMAT, HEADER, INPUT_HASH, ITEM, META,
-    META_DIGEST, Meta, N_KEPT, ROW_GROUP_ROWS, Row, SUFFIX, Unusable, is_catalogue, number_of,
+    COMMIT, Catalogue, CatalogueRow, Entry, FAILURE, FINGERPRINT, FOLDER, FORMAT, HEADER,
+    INPUT_HASH, ITEM, META, META_DIGEST, Meta, N_KEPT, ROW_GROUP_ROWS, SUFFIX, UnusableReason,
+    is_catalogue, number_of,
 };
 use crate::store::StoreError;
 use crate::store::digest::{digest, digest_texts};
-use crate::store::location::{Listed, Location};
+use crate::store::location::{ListedObject, Location};
 use crate::store::manifest::{Header, Item, Manifest, Rank, stage_and_key};
 
 /// Writes a catalogue of a stage: what `old` says and the manifests that it does not cover.
@@ -30,7 +31,7 @@ pub(in crate::store) fn write(
     stage: &str,
     old: Option<&Catalogue>,
     newer: &[Manifest],
-    (listed, manifests): (&[Listed], &[Listed]),
+    (listed, manifests): (&[ListedObject], &[ListedObject]),
 ) -> Result<(), CatalogueError> {
     let file = store.temporary(&format!("{FOLDER}/{stage}/x"))?;
     let there: HashSet<&str> =
@@ -41,22 +42,22 @@ pub(in crate::store) fn write(
     let name = &digest_texts(std::iter::once(stage).chain(keys))[..16];
     let number = listed.iter().filter_map(|l| number_of(&l.path)).max().map_or(1, |n| n + 1);
     store.put_file_new(&format!("{FOLDER}/{stage}/{number:08}-{name}{SUFFIX}"), file)?;
-    let mut old: Vec<&Listed> = listed.iter().filter(|l| is_catalogue(&l.path)).collect();
+    let mut old: Vec<&ListedObject> = listed.iter().filter(|l| is_catalogue(&l.path)).collect();
     old.sort_by(|a, b| b.path.cmp(&a.path));
     for one in old.into_iter().skip(N_KEPT - 1) {
-        // Who reads it falls back on the newest; who may not remove it leaves it.
+        // A reader of it falls back on the newest; a process that may not remove it leaves it.
         store.remove(&one.path).ok();
     }
     Ok(())
 }
 
-/// What keeps a catalogue from being written.
+/// Why a catalogue cannot be written.
 #[derive(Debug, thiserror::Error)]
 pub(in crate::store) enum CatalogueError {
     #[error(transparent)]
     Store(#[from] StoreError),
     #[error("{0}")]
-    Unusable(Unusable),
+    Unusable(UnusableReason),
 }
 
 struct Writer<'a> {
@@ -73,7 +74,7 @@ struct Writer<'a> {
     dead: Vec<Vec<String>>,
     writer: ArrowWriter<tempfile::NamedTempFile>,
     schema: SchemaRef,
-    rows: Rows,
+    rows: CatalogueRows,
 }
 
 /// Places of headers in the new catalogue, which lists those that its rows name.
@@ -123,7 +124,7 @@ impl<'a> Writer<'a> {
         let writer =
             ArrowWriter::try_new(file, Arc::clone(&schema), Some(properties)).map_err(unusable)?;
         let newer_headers = newer.iter().map(Manifest::headers).collect();
-        let (headers, rows) = (HeaderPlaces::default(), Rows::default());
+        let (headers, rows) = (HeaderPlaces::default(), CatalogueRows::default());
         Ok(Self {
             old,
             newer,
@@ -179,7 +180,7 @@ impl<'a> Writer<'a> {
     fn merge(
         &mut self,
         old: &Catalogue,
-        row: Row,
+        row: CatalogueRow,
         item: &Item,
         newest: &mut std::iter::Peekable<impl Iterator<Item = (&'a str, (usize, usize))>>,
     ) -> Result<(), CatalogueError> {
@@ -217,12 +218,12 @@ impl<'a> Writer<'a> {
 
     fn push_newer(&mut self, (m, i): (usize, usize)) -> Result<(), CatalogueError> {
         let manifest = &self.newer[m];
-        let of_manifest = (m, manifest.header_of(i));
-        let header = match self.headers.of_newer.get(&of_manifest) {
+        let place_in_manifest = (m, manifest.header_of(i));
+        let header = match self.headers.of_newer.get(&place_in_manifest) {
             Some(&place) => place,
             None => {
-                let place = self.place_of(self.newer_headers[m][of_manifest.1].clone());
-                self.headers.of_newer.insert(of_manifest, place);
+                let place = self.place_of(self.newer_headers[m][place_in_manifest.1].clone());
+                self.headers.of_newer.insert(place_in_manifest, place);
                 place
             }
         };
@@ -291,7 +292,7 @@ fn schema() -> SchemaRef {
 
 /// Rows on their way into a catalogue.
 #[derive(Default)]
-struct Rows {
+struct CatalogueRows {
     n: usize,
     items: StringBuilder,
     commits: Int32Builder,
@@ -301,7 +302,7 @@ struct Rows {
     failures: StringBuilder,
 }
 
-impl Rows {
+impl CatalogueRows {
     fn push(&mut self, commit: usize, header: usize, item: &Item) {
         self.n += 1;
         self.items.append_value(&item.id);

@@ -96,7 +96,7 @@ impl Answer {
     /// Writes all rows as data, batch by batch in the order of the answer; returns how many there were.
     ///
     /// # Errors
-    /// What `out` says, and [`StoreError::Query`] within [`io::Error`].
+    /// The error of `out`, and [`StoreError::Query`] within [`io::Error`].
     pub fn write(self, format: DataFormat, out: &mut dyn Write) -> io::Result<u64> {
         let Self { frame, columns, explainer } = self;
         let failed = |e: PolarsError| match e {
@@ -195,7 +195,7 @@ impl TextTable {
     /// Writes the rows, and a line where some were left out.
     ///
     /// # Errors
-    /// What `out` says.
+    /// The error of `out`.
     pub fn write(&self, out: &mut dyn Write) -> io::Result<()> {
         writeln!(out, "{}", self.text)?;
         match self.cut {

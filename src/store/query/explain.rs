@@ -49,11 +49,11 @@ impl Explainer {
         let is_named = |schema: &&TableSchema| {
             self.named.iter().any(|name| name.eq_ignore_ascii_case(schema.name))
         };
-        let of_tables: Vec<_> = self.schemas.iter().filter(is_named).collect();
+        let named_tables: Vec<_> = self.schemas.iter().filter(is_named).collect();
         let names = |schema: &TableSchema| {
             schema.columns.iter().map(|c| c.name.to_string()).collect::<Vec<_>>()
         };
-        let columns: Vec<String> = of_tables.iter().flat_map(|schema| names(schema)).collect();
+        let columns: Vec<String> = named_tables.iter().flat_map(|schema| names(schema)).collect();
         let columns: Vec<&str> = columns.iter().map(String::as_str).collect();
         if columns.is_empty() {
             return None;
@@ -64,7 +64,7 @@ impl Explainer {
                  one of the other, and all else belongs into \"where\" or into a sub-select"
             ));
         }
-        let lists: Vec<_> = of_tables
+        let lists: Vec<_> = named_tables
             .iter()
             .map(|schema| format!("table {} has {}", schema.name, names(schema).join(", ")))
             .collect();

@@ -64,8 +64,9 @@ pub fn track(keys: &[[u8; BONE_KEY_BYTES]]) -> Result<Option<RigidTrack>, VmdErr
         let is_named = |key: &&[u8; BONE_KEY_BYTES]| {
             key.starts_with(name) && (name.len() == NAME_BYTES || key[name.len()] == 0)
         };
-        let of_bone: Result<Vec<_>, _> = keys.iter().filter(is_named).map(BoneKey::read).collect();
-        bones.push((rest, Keys::sorted(of_bone?)));
+        let bone_keys: Result<Vec<_>, _> =
+            keys.iter().filter(is_named).map(BoneKey::read).collect();
+        bones.push((rest, Keys::sorted(bone_keys?)));
     }
     if bones.iter().all(|(_, keys)| keys.is_empty()) {
         return Ok(None);

@@ -36,7 +36,7 @@ fn dense(mut a: Array2<f64>, mut b: Vec<f64>) -> Vec<f64> {
 
 /// The definition with whole matrices: p = (I w_p + DᵀD w_v + D²ᵀD² w_a)⁻¹ (p̂ w_p + Dᵀv̂ w_v + D²ᵀâ w_a), held
 /// values taken to the right.
-fn by_definition(measured: &Measured, axis: usize, held: &[bool]) -> Vec<f64> {
+fn by_definition(measured: &FusionMeasurements, axis: usize, held: &[bool]) -> Vec<f64> {
     let n = measured.position.len();
     let mut rows = Vec::new();
     for t in 0..n {
@@ -105,7 +105,7 @@ fn poses_are_those_of_scipy() {
     let quaternions = |first: usize| -> Vec<Quaternion> {
         (0..n).map(|t| std::array::from_fn(|i| at(t, first + i))).collect()
     };
-    let measured = Measured {
+    let measured = FusionMeasurements {
         position: vectors(0),
         velocity: vectors(3),
         acceleration: vectors(6),
@@ -197,7 +197,7 @@ fn backwards_in_time_is_the_same_motion_backwards() {
     let n = 53;
     let measured = noisy(&truth(n), &VARIANCES, 21);
     let negated = |x: [f64; 3]| x.map(|x| -x);
-    let back = Measured {
+    let back = FusionMeasurements {
         position: measured.position.iter().rev().copied().collect(),
         velocity: (0..n).map(|t| negated(measured.velocity[(2 * n - 2 - t) % n])).collect(),
         acceleration: (0..n).map(|t| measured.acceleration[(2 * n - 3 - t) % n]).collect(),
@@ -222,7 +222,7 @@ fn a_dancer_who_faces_elsewhere_is_fused_alike() {
     let measured = noisy(&truth(40), &VARIANCES, 31);
     let turn = from_axis_angle([0.0, 1.0, 0.0], 2.2);
     let turned = |x: &[[f64; 3]]| x.iter().map(|x| rotate(turn, *x)).collect::<Vec<_>>();
-    let other = Measured {
+    let other = FusionMeasurements {
         position: turned(&measured.position),
         velocity: turned(&measured.velocity),
         acceleration: turned(&measured.acceleration),
@@ -251,7 +251,7 @@ fn motion_falls_apart_where_it_is_not_finite() {
     holed.angular_velocity[3][2] = f64::NAN;
     let found = fused(&holed, &VARIANCES, &NONE);
     assert!(found[15][0].is_nan() && found[15][2] == f64::INFINITY);
-    let part = |from: usize, to: usize| Measured {
+    let part = |from: usize, to: usize| FusionMeasurements {
         position: holed.position[from..to].to_vec(),
         velocity: holed.velocity[from..to].to_vec(),
         acceleration: holed.acceleration[from..to].to_vec(),
@@ -335,7 +335,7 @@ fn what_follows_from_fused_poses_is_derived_and_a_second_time_changes_little() {
         let mut found = decoded.clone();
         let moved = process_holding(&config, &mut found, None, &NONE).expect("fused");
         assert_eq!(moved.position_max_mm > 0.0, n > 1, "a single frame has nothing to agree with");
-        let measured = Measured::of(found.view());
+        let measured = FusionMeasurements::of(found.view());
         let poses = Poses { position_m: measured.position, orientation: measured.orientation };
         let derived = frames_of(&poses, n);
         assert_eq!(found, derived);
@@ -368,7 +368,7 @@ fn a_capture_comes_out_of_noise_better_than_by_smoothing() {
             PostProcessConfig { coherence, savitzky_golay, ..PostProcessConfig::default() };
         let mut frames = decoded.clone();
         process(&config, &mut frames, None);
-        let found = Measured::of(frames.view());
+        let found = FusionMeasurements::of(frames.view());
         let error: f64 =
             (0..3).map(|axis| mean_square(&found.position, &poses.position_m, axis)).sum();
         let d = forward_differences;
@@ -406,7 +406,7 @@ fn filters_with_a_long_memory_are_as_smooth_as_the_solution() {
         };
         sum(&filters.velocity, &velocity) + sum(&filters.acceleration, &acceleration)
     };
-    let measured = Measured {
+    let measured = FusionMeasurements {
         position: still.clone(),
         velocity: velocity.clone(),
         acceleration: acceleration.clone(),

@@ -22,7 +22,7 @@ fn turns_about_one_axis_are_fused_as_numbers_are() {
     for axis in 0..3 {
         let along = |x: f64| std::array::from_fn(|i| if i == axis { x } else { 0.0 });
         let sign = |t: usize| if t % 5 < 2 { -1.0 } else { 1.0 };
-        let measured = Measured {
+        let measured = FusionMeasurements {
             position: angles.iter().map(|x| along(*x)).collect(),
             velocity: rates.iter().map(|x| along(*x)).collect(),
             acceleration: vec![[0.0; 3]; n],

@@ -7,7 +7,7 @@ use bytes::Bytes;
 use ndarray::{Array2, ArrayView2, s};
 use serde::Serialize;
 
-use super::{Baseline, BaselineMotion, MusicWindow, Request};
+use super::{Baseline, BaselineMotion, BaselineRequest, MusicWindow};
 use crate::audio::FeatureScale;
 use crate::diffusion::DiffusionConfig;
 use crate::model::{DecoderConfig, UNetConfig};
@@ -24,7 +24,7 @@ const WIDTH: usize = 2 * MOTION_DIM;
 
 /// What determines the motion of a baseline.
 #[derive(Serialize)]
-struct Digested<'a> {
+struct BaselineKey<'a> {
     version: u32,
     baseline: &'static str,
     /// Weights of the model; those of an untrained one follow from its sizes.
@@ -37,15 +37,19 @@ struct Digested<'a> {
     feature_scale: &'a FeatureScale,
     settings: &'a MotionSettings,
     seed: u64,
-    windows: Vec<DigestedWindow<'a>>,
+    windows: Vec<BaselineKeyWindow<'a>>,
 }
 
 /// Phrase, first frame, and digests of features, phase and clock.
 #[derive(Serialize)]
-struct DigestedWindow<'a>(&'a str, usize, String, Option<String>, Option<String>);
+struct BaselineKeyWindow<'a>(&'a str, usize, String, Option<String>, Option<String>);
 
 /// Returns the digest of a baseline.
-pub fn digest_of(baseline: Baseline, request: &Request, settings: &MotionSettings) -> String {
+pub fn digest_of(
+    baseline: Baseline,
+    request: &BaselineRequest,
+    settings: &MotionSettings,
+) -> String {
     let card = &request.model.card;
     let window = |window: &'_ MusicWindow| {
         let features: Vec<u8> = window.features.iter().flat_map(|x| x.to_le_bytes()).collect();
@@ -58,7 +62,7 @@ pub fn digest_of(baseline: Baseline, request: &Request, settings: &MotionSetting
             .map(|clock| digest(&clock.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>()));
         (window.first_frame, digest(&features), phase, clock)
     };
-    let digested = Digested {
+    let digested = BaselineKey {
         version: VERSION,
         baseline: baseline.name(),
         weights: (baseline != Baseline::Untrained).then(|| weights_digest(card)),
@@ -75,7 +79,7 @@ pub fn digest_of(baseline: Baseline, request: &Request, settings: &MotionSetting
             .iter()
             .map(|w| {
                 let (first, features, phase, clock) = window(w);
-                DigestedWindow(&w.phrase_id, first, features, phase, clock)
+                BaselineKeyWindow(&w.phrase_id, first, features, phase, clock)
             })
             .collect(),
     };

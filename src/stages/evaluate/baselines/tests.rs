@@ -47,12 +47,12 @@ fn model_in(folder: &Path, config: UNetConfig) -> OpenModel {
         prediction: Prediction::Sample,
         ..DiffusionConfig::default()
     };
-    let of_unet = |id| unet_parameters.unpacked(id);
-    let of_decoder = |id| decoder_parameters.unpacked(id);
+    let unet_weights = |id| unet_parameters.unpacked(id);
+    let decoder_weights = |id| decoder_parameters.unpacked(id);
     let storage = Storage::Fp32;
     let graphs = [
-        (unet(&config, &of_unet, &scale, Form::default(), storage), ModelFileName::Unet),
-        (decoder(&decoder_config, &of_decoder, storage), ModelFileName::Decoder),
+        (unet(&config, &unet_weights, &scale, Form::default(), storage), ModelFileName::Unet),
+        (decoder(&decoder_config, &decoder_weights, storage), ModelFileName::Decoder),
     ];
     let mut files = Vec::new();
     for (graph, name) in graphs {
@@ -183,7 +183,7 @@ impl Bench {
         seed: u64,
         n_threads: usize,
     ) -> anyhow::Result<Vec<BaselineMotion>> {
-        let request = Request {
+        let request = BaselineRequest {
             store: &self.store,
             model: &self.model,
             settings: &self.settings(),
@@ -232,8 +232,8 @@ fn an_untrained_network_moves_with_its_music_and_one_without_music_does_not() {
         // Every window has noise of its own.
         assert_ne!(motions[0].decoded, motions[1].decoded);
         assert_ne!(motions[0].decoded, motions[2].decoded);
-        let of_others = bench.sample(baseline, &others);
-        let is_same = motions.iter().zip(&of_others).all(|(a, b)| a.decoded == b.decoded);
+        let other_motion = bench.sample(baseline, &others);
+        let is_same = motions.iter().zip(&other_motion).all(|(a, b)| a.decoded == b.decoded);
         assert_eq!(is_same, baseline == Baseline::NoMusic);
     }
     assert_ne!(
@@ -296,7 +296,7 @@ fn what_was_sampled_is_read_again_and_what_is_broken_sampled_again() {
     let mut other = motions.clone();
     other[1].frames[[2, 3]] = 7.5;
     let settings = bench.settings();
-    let request = Request {
+    let request = BaselineRequest {
         store: &bench.store,
         model: &bench.model,
         settings: &settings,
@@ -330,7 +330,7 @@ fn a_digest_is_that_of_everything_that_determines_the_motion() {
     let windows = windows();
     let settings = bench.settings();
     let digest = |baseline, seed, windows: &[MusicWindow], settings: &RunSettings| {
-        let request = Request {
+        let request = BaselineRequest {
             store: &bench.store,
             model: &bench.model,
             settings,
@@ -364,8 +364,8 @@ fn a_digest_is_that_of_everything_that_determines_the_motion() {
     let mut other = model_in(bench.folder.path(), unet_config());
     other.card.weights_sha256.unet = "another".to_owned();
     assert_ne!(weights_digest(&other.card), weights_digest(&bench.model.card));
-    let of_other = |baseline| {
-        let request = Request {
+    let other_digest = |baseline| {
+        let request = BaselineRequest {
             store: &bench.store,
             model: &other,
             settings: &settings,
@@ -375,8 +375,8 @@ fn a_digest_is_that_of_everything_that_determines_the_motion() {
         };
         cache::digest_of(baseline, &request, &settings.0)
     };
-    assert_eq!(of_other(Baseline::Untrained), all[0]);
-    assert_ne!(of_other(Baseline::NoMusic), all[1]);
+    assert_eq!(other_digest(Baseline::Untrained), all[0]);
+    assert_ne!(other_digest(Baseline::NoMusic), all[1]);
 }
 
 #[test]

@@ -20,14 +20,14 @@ const FRAME: &str = "frame";
 
 /// How motion is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Format {
+pub enum ForeignFormat {
     Npy,
     Csv,
     Bvh,
     Parquet,
 }
 
-impl Format {
+impl ForeignFormat {
     /// Returns the format that a file is named after.
     pub fn of(path: &Path) -> Option<Self> {
         let extension = path.extension()?.to_string_lossy().to_ascii_lowercase();
@@ -48,13 +48,13 @@ impl Format {
 pub fn read(path: &Path) -> Result<(Array2<f32>, FileContent), Failure> {
     let place = path.display().to_string();
     let bytes = bytes_of(path, &place)?;
-    let (frames, content) = match Format::of(path) {
-        Some(Format::Npy) => of_npy(&place, &bytes)?,
-        Some(Format::Csv) => (of_csv(&place, bytes)?, FileContent::Channels),
-        Some(Format::Bvh) => {
+    let (frames, content) = match ForeignFormat::of(path) {
+        Some(ForeignFormat::Npy) => of_npy(&place, &bytes)?,
+        Some(ForeignFormat::Csv) => (of_csv(&place, bytes)?, FileContent::Channels),
+        Some(ForeignFormat::Bvh) => {
             (read_bvh(&place, &bytes, None, None)?.trajectory.into_array(), FileContent::Capture)
         }
-        Some(Format::Parquet) => of_parquet(&place, bytes)?,
+        Some(ForeignFormat::Parquet) => of_parquet(&place, bytes)?,
         None => {
             let message =
                 format!("{place}: is named like no motion; name it .npy, .csv, .bvh or .parquet");

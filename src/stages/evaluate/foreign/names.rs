@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use super::Phrase;
+use super::ForeignPhrase;
 use crate::stages::ingest::is_audio;
 
 /// Most digits of a sample's number.
@@ -20,7 +20,7 @@ pub struct Names<'a> {
 }
 
 impl<'a> Names<'a> {
-    pub fn new(phrases: &'a [Phrase]) -> Self {
+    pub fn new(phrases: &'a [ForeignPhrase]) -> Self {
         let (mut whole, mut last, mut audio) = (HashMap::new(), HashMap::new(), HashMap::new());
         for (i, phrase) in phrases.iter().enumerate() {
             // Whole names first, so that no phrase `a.ogg` takes the name of a phrase `a`.
@@ -48,8 +48,8 @@ impl<'a> Names<'a> {
         let whole = |name: &str| self.whole.get(name).copied();
         let bare = |name: &str| {
             let name = last_part(name);
-            let of = |names: &HashMap<&str, Option<usize>>| names.get(name).copied().flatten();
-            of(&self.last).or_else(|| of(&self.audio))
+            let lookup = |names: &HashMap<&str, Option<usize>>| names.get(name).copied().flatten();
+            lookup(&self.last).or_else(|| lookup(&self.audio))
         };
         let numbered = numbered(name);
         let first = |phrase: usize| (phrase, 0);

@@ -23,7 +23,7 @@ impl Bench {
         path.display().to_string()
     }
 
-    fn read(&self, phrases: &[Phrase]) -> ForeignMotions {
+    fn read(&self, phrases: &[ForeignPhrase]) -> ForeignMotions {
         read(self.dir(), phrases).expect("motions")
     }
 
@@ -45,8 +45,8 @@ impl Bench {
     }
 }
 
-fn phrase(id: &str) -> Phrase<'_> {
-    Phrase { id, url: "", n_frames: None }
+fn phrase(id: &str) -> ForeignPhrase<'_> {
+    ForeignPhrase { id, url: "", n_frames: None }
 }
 
 /// Motion whose values are all different.
@@ -202,17 +202,17 @@ fn a_capture_is_read_as_ingest_reads_it() {
 }
 
 /// Returns the phrase and sample that a file of each name is for, by the file's name.
-fn matched(names: &[&str], phrases: &[Phrase]) -> BTreeMap<String, (String, usize)> {
+fn matched(names: &[&str], phrases: &[ForeignPhrase]) -> BTreeMap<String, (String, usize)> {
     let bench = Bench::new();
     for name in names {
         bench.put(name, "x");
     }
     let found = bench.read(phrases);
-    let of = |file: &ForeignFile| {
+    let to_entry = |file: &ForeignFile| {
         let below = file.path.strip_prefix(bench.dir()).expect("below").display().to_string();
         (below, (file.phrase_id.clone(), file.sample))
     };
-    found.files.iter().map(of).collect()
+    found.files.iter().map(to_entry).collect()
 }
 
 #[test]
@@ -225,7 +225,7 @@ fn files_belong_to_phrases_by_their_names() {
         phrase("song.t1.2"),
         phrase("song"),
         phrase("x/0"),
-        Phrase { url: "file:///music/deep/Tune.flac", ..phrase("tune of June") },
+        ForeignPhrase { url: "file:///music/deep/Tune.flac", ..phrase("tune of June") },
     ];
     let cases = [
         // The name, with and without the extension of the audio.
@@ -341,7 +341,7 @@ fn a_motion_much_longer_or_shorter_than_its_music_has_a_note() {
     let note = |n_frames: usize, n_music: Option<usize>| {
         let bench = Bench::new();
         let place = bench.put("a.npy", npy_of(&ramp(n_frames)));
-        let found = bench.read(&[Phrase { n_frames: n_music, ..phrase("a") }]);
+        let found = bench.read(&[ForeignPhrase { n_frames: n_music, ..phrase("a") }]);
         let note = found.files[0].read().expect("a motion").note?;
         Some(note.strip_prefix(&place).expect("the file's name").to_owned())
     };
@@ -370,12 +370,12 @@ fn bad_files_are_refused_with_what_is_wrong() {
         );
         (FailureKind::Shape, message)
     };
-    let of = |shape: &[usize]| npy::write(shape, &vec![0.5_f32; shape.iter().product()]);
-    assert_eq!(refused("a.npy", &of(&[3, 24])), shape("[3, 24]", ""));
-    assert_eq!(refused("a.npy", &of(&[25, 3])), shape("[25, 3]", "; transpose it"));
-    assert_eq!(refused("a.npy", &of(&[0, 25])), shape("[0, 25]", ""));
-    assert_eq!(refused("a.npy", &of(&[1, 3, 25])), shape("[1, 3, 25]", ""));
-    assert_eq!(refused("a.npy", &of(&[])), shape("[]", ""));
+    let npy_of = |shape: &[usize]| npy::write(shape, &vec![0.5_f32; shape.iter().product()]);
+    assert_eq!(refused("a.npy", &npy_of(&[3, 24])), shape("[3, 24]", ""));
+    assert_eq!(refused("a.npy", &npy_of(&[25, 3])), shape("[25, 3]", "; transpose it"));
+    assert_eq!(refused("a.npy", &npy_of(&[0, 25])), shape("[0, 25]", ""));
+    assert_eq!(refused("a.npy", &npy_of(&[1, 3, 25])), shape("[1, 3, 25]", ""));
+    assert_eq!(refused("a.npy", &npy_of(&[])), shape("[]", ""));
 
     let header = exchange::csv_header();
     let no_frames = ": has no frames; write it again".to_owned();

@@ -26,8 +26,8 @@ fn listing(paths: &[&str]) -> Listing {
 }
 
 /// One line per phrase: its id and its files' roles, or its failure's kind and path.
-fn lines(plan: &Plan) -> Vec<String> {
-    let line = |phrase: &Planned| match &phrase.problem {
+fn lines(plan: &IngestPlan) -> Vec<String> {
+    let line = |phrase: &PlannedPhrase| match &phrase.problem {
         Some(failure) => format!("{}: {} {}", phrase.id, failure.kind.name(), failure.path),
         None => {
             let roles: Vec<_> = phrase.files.iter().map(|(role, _)| role.name()).collect();
