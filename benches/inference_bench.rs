@@ -23,7 +23,7 @@ use motiongen::diffusion::{
     DiffusionConfig, Prediction, Sampler, SamplerConfig, Schedule, Spacing,
 };
 use motiongen::generation::{
-    EagerEngine, Engine, Inputs, OnnxEngine, Sampling, SessionPlan, sample,
+    EagerEngine, Engine, EngineInputs, OnnxEngine, Sampling, SessionPlan, sample,
 };
 use motiongen::model::{DecoderConfig, MotionDecoder, Parameter, ParameterList, Preset, UNet1D};
 use motiongen::motion::MOTION_DIM;
@@ -200,7 +200,7 @@ impl Served {
                 let (x, audio) = (noise(batch, 1), music(batch));
                 let t = vec![500; batch];
                 let started = Instant::now();
-                let inputs = Inputs {
+                let inputs = EngineInputs {
                     x: x.view(),
                     t: &t,
                     audio: audio.view(),

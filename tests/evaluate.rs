@@ -93,8 +93,9 @@ fn put_card(store: &Path, model: &str) {
 fn weights(store: &Path) -> String {
     let text = std::fs::read(store.join("models/m/model.json")).expect("a card");
     let card: serde_json::Value = serde_json::from_slice(&text).expect("JSON");
-    let of = |network: &str| card["weights_sha256"][network].as_str().expect("a digest").to_owned();
-    let both = format!("{}\n{}\n", of("unet"), of("decoder"));
+    let digest_of =
+        |network: &str| card["weights_sha256"][network].as_str().expect("a digest").to_owned();
+    let both = format!("{}\n{}\n", digest_of("unet"), digest_of("decoder"));
     let digest = <sha2::Sha256 as sha2::Digest>::digest(both.as_bytes());
     digest.iter().map(|byte| format!("{byte:02x}")).collect()
 }
@@ -315,16 +316,16 @@ fn numbers_and_baselines_are_what_the_motions_were_made_to_have() {
     let checks: Vec<SanityCheckRow> = rows(&store);
     assert_eq!(checks.len(), 2 * 16 * 19);
     assert!(checks.iter().all(|row| row.value.is_some() && row.run == "locked"));
-    let of = |stage: &str, check: &str| {
+    let passes_of = |stage: &str, check: &str| {
         let is_it =
             |row: &&SanityCheckRow| row.stage.as_deref() == Some(stage) && row.check_name == check;
         let found: Vec<_> = checks.iter().filter(is_it).collect();
         let n_passed = found.iter().filter(|row| row.passed).count();
         (n_passed, found.iter().all(|row| row.by_construction == Some(true)))
     };
-    assert_eq!(of("final", "velocity"), (16, true));
-    assert_eq!(of("raw", "velocity"), (0, false));
-    assert_eq!(of("final", "finite"), (16, false));
+    assert_eq!(passes_of("final", "velocity"), (16, true));
+    assert_eq!(passes_of("raw", "velocity"), (0, false));
+    assert_eq!(passes_of("final", "finite"), (16, false));
 
     // What the songs are paired by, in a comparison.
     let songs: Vec<SongMetricRow> = rows(&store);
@@ -425,11 +426,11 @@ fn noise_passes_the_reference_and_fails_what_is_strict() {
         .filter(|row| !row.passed && row.stage.as_deref() == Some("final"))
         .map(|row| (row.phrase_id, row.check_name))
         .collect();
-    let of = |song: usize, checks: &[&str]| -> Vec<(String, String)> {
+    let failed_checks = |song: usize, checks: &[&str]| -> Vec<(String, String)> {
         checks.iter().map(|check| (songs[song].clone(), (*check).to_owned())).collect()
     };
-    let mut expected = of(1, &["velocity", "acceleration"]);
-    expected.extend(of(2, &["finite", "ranges"]));
+    let mut expected = failed_checks(1, &["velocity", "acceleration"]);
+    expected.extend(failed_checks(2, &["finite", "ranges"]));
     expected.sort();
     let mut found = failed;
     found.sort();

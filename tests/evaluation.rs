@@ -469,11 +469,12 @@ fn misses_are_summed_up_as_omnicontrol_does() {
     let (mut all_mm, mut all_deg) = (Vec::new(), Vec::new());
     for (row, sample) in golden.motions.iter().zip(&golden.control.samples) {
         let poses = row.poses();
-        let of = |i: usize| (poses.position_m[sample.at[i]], poses.orientation[sample.at[i]]);
+        let pose_at = |i: usize| (poses.position_m[sample.at[i]], poses.orientation[sample.at[i]]);
         let n = sample.at.len();
-        let mm: Vec<f64> = (0..n).map(|i| position_error_mm(of(i).0, sample.position[i])).collect();
+        let mm: Vec<f64> =
+            (0..n).map(|i| position_error_mm(pose_at(i).0, sample.position[i])).collect();
         let deg: Vec<f64> =
-            (0..n).map(|i| rotation_error_deg(of(i).1, sample.quaternion[i])).collect();
+            (0..n).map(|i| rotation_error_deg(pose_at(i).1, sample.quaternion[i])).collect();
         assert_all_near("miss in mm", &mm, &sample.mm);
         assert_all_near("miss in degrees", &deg, &sample.deg);
         all_mm.push(mm);

@@ -181,15 +181,15 @@ fn decoded_motion_is_kept_as_raw_motion_is() {
     let store = modelled(&dir);
     // The best of two: the decoded frames must be those of the candidate that was kept.
     generate(&store, &["--run=usual", "--best-of=2"]);
-    let of = |table: &str, run: &str| frames_of(&store, table, &format!("run = '{run}'"));
+    let frames_in = |table: &str, run: &str| frames_of(&store, table, &format!("run = '{run}'"));
     assert_eq!(
-        of(DECODED, "usual").lines().count(),
-        of(GENERATED, "usual").lines().count(),
+        frames_in(DECODED, "usual").lines().count(),
+        frames_in(GENERATED, "usual").lines().count(),
         "a row for every frame"
     );
-    assert_ne!(of(DECODED, "usual"), of(GENERATED, "usual"));
+    assert_ne!(frames_in(DECODED, "usual"), frames_in(GENERATED, "usual"));
     generate(&store, &["--run=rough", "--raw"]);
-    assert_eq!(of(DECODED, "rough"), of(GENERATED, "rough"));
+    assert_eq!(frames_in(DECODED, "rough"), frames_in(GENERATED, "rough"));
     let selected: Vec<String> = generations(&store)
         .into_iter()
         .filter(|row| row.run == "usual" && row.selected && row.candidate == 0)

@@ -8,7 +8,7 @@ use crate::audio::FeatureScale;
 use crate::autodiff::{Arena, Eager, Parameters, Tensor, Threads};
 use crate::model::{MotionDecoder, UNet1D, UNetConfig, UNetInputs, condition_scale};
 
-use super::engine::{Engine, EngineError, Inputs};
+use super::engine::{Engine, EngineError, EngineInputs};
 use super::pool::Pool;
 
 /// Runs a model by the interpreter that trains it.
@@ -63,7 +63,7 @@ impl Engine for EagerEngine {
         self.workers.len()
     }
 
-    fn predict(&self, inputs: &Inputs) -> Result<Array3<f32>, EngineError> {
+    fn predict(&self, inputs: &EngineInputs) -> Result<Array3<f32>, EngineError> {
         inputs.check(self.scale.centre.len())?;
         let (batch, frames, channels) = inputs.x.dim();
         let n_features = self.scale.centre.len();

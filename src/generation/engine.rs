@@ -8,7 +8,7 @@ use crate::onnx::OnnxError;
 
 /// The inputs of a prediction.
 #[derive(Clone, Copy, Debug)]
-pub struct Inputs<'a> {
+pub struct EngineInputs<'a> {
     /// Noisy motion, normalised, \[batch, frames, 25\].
     pub x: ArrayView3<'a, f32>,
     /// Step of each sample, \[batch\].
@@ -50,7 +50,7 @@ pub trait Engine: Sync {
     ///
     /// # Errors
     /// Shapes that do not fit, or what the runtime says.
-    fn predict(&self, inputs: &Inputs) -> Result<Array3<f32>, EngineError>;
+    fn predict(&self, inputs: &EngineInputs) -> Result<Array3<f32>, EngineError>;
 
     /// Decodes latents to motion, \[batch, frames, 25\] → \[batch, frames, 25\] in metres, seconds, radians.
     ///
@@ -59,7 +59,7 @@ pub trait Engine: Sync {
     fn decode(&self, latent: ArrayView3<f32>) -> Result<Array3<f32>, EngineError>;
 }
 
-impl Inputs<'_> {
+impl EngineInputs<'_> {
     /// Refuses inputs whose sizes do not fit each other.
     pub(super) fn check(&self, n_features: usize) -> Result<(), EngineError> {
         let (batch, frames, _) = self.x.dim();

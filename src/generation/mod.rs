@@ -24,7 +24,7 @@ pub use card::{
 };
 pub use control::{Constraints, ControlError, Miss, REACH_FRAMES, WantedValue, continuing, facing};
 pub use eager::EagerEngine;
-pub use engine::{Engine, EngineError, Inputs};
+pub use engine::{Engine, EngineError, EngineInputs};
 pub use learned::{LearnedFrom, MusicDigests, MusicSplit, Purpose, ShortDigest};
 pub use pool::Pool;
 pub use retrieval::Retrieval;

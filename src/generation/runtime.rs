@@ -12,7 +12,7 @@ use crate::onnx::{
     UNetNames,
 };
 
-use super::engine::{Engine, EngineError, Inputs};
+use super::engine::{Engine, EngineError, EngineInputs};
 use super::pool::Pool;
 
 /// Workers and their threads.
@@ -81,7 +81,7 @@ impl Engine for OnnxEngine {
         self.workers.len()
     }
 
-    fn predict(&self, inputs: &Inputs) -> Result<Array3<f32>, EngineError> {
+    fn predict(&self, inputs: &EngineInputs) -> Result<Array3<f32>, EngineError> {
         inputs.check(self.config.condition_dim())?;
         let batch = inputs.x.dim().0;
         let t: Vec<i64> = inputs.t.iter().map(|&t| t as i64).collect();

@@ -4,7 +4,7 @@ use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, concatenate};
 
 use crate::diffusion::{Refine, SamplerConfig, Schedule, denoise_guided, sample_refined};
 
-use super::engine::{Engine, EngineError, Inputs};
+use super::engine::{Engine, EngineError, EngineInputs};
 
 /// How motion is sampled.
 #[derive(Clone, Copy, Debug)]
@@ -46,7 +46,7 @@ pub fn sample(
     let denoise = |x: ArrayView3<f32>, t: usize| {
         denoise_guided(sampling.guidance, x, t, |x, t, dropped: &[bool]| {
             let t = vec![t; dropped.len()];
-            engine.predict(&Inputs { x, t: &t, audio, drop_audio: dropped, style })
+            engine.predict(&EngineInputs { x, t: &t, audio, drop_audio: dropped, style })
         })
     };
     sample_refined(sampling.config, sampling.schedule, start, denoise, noise, None, refine)

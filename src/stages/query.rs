@@ -59,11 +59,11 @@ impl Stage for Query {
             Format::Table => {
                 let n_shown = limit.unwrap_or(NonZeroUsize::new(N_SHOWN));
                 let table = answer.clone().text_table(n_shown)?;
-                Selected::Table { table, answer: limited(answer, limit) }
+                QueryResult::Table { table, answer: limited(answer, limit) }
             }
             Format::Data(format) => {
                 let answer = limited(answer, limit);
-                Selected::Data { answer: Some(answer), format, n_rows: 0 }
+                QueryResult::Data { answer: Some(answer), format, n_rows: 0 }
             }
         };
         let Some(output) = &params.output else { return Ok(Box::new(selected)) };
@@ -88,7 +88,7 @@ fn limited(answer: Answer, limit: Option<Option<NonZeroUsize>>) -> Answer {
     }
 }
 
-enum Selected {
+enum QueryResult {
     Table {
         table: TextTable,
         answer: Answer,
@@ -101,7 +101,7 @@ enum Selected {
     },
 }
 
-impl Selected {
+impl QueryResult {
     /// Returns the rows as JSON, or why they could not be read.
     fn rows(&mut self) -> Result<serde_json::Value, String> {
         let answer = match self {
@@ -124,7 +124,7 @@ impl Selected {
     }
 }
 
-impl Summary for Selected {
+impl Summary for QueryResult {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
         match self {
             Self::Table { table, .. } => table.write(out),

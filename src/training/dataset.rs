@@ -134,7 +134,7 @@ struct PhraseFrames {
 }
 
 /// Frames of one table by phrase, or why they are of no use.
-type Gathered = BTreeMap<String, Result<PhraseFrames, ExcludedPhrase>>;
+type PhraseResults = BTreeMap<String, Result<PhraseFrames, ExcludedPhrase>>;
 
 impl Dataset {
     /// Reads all phrases with motion and features.
@@ -397,11 +397,11 @@ fn gather(
     reading: &DatasetOptions,
     notice: &(dyn Fn(&StoreError, Duration) + Sync),
     count: &(dyn Fn() + Sync),
-) -> Result<Gathered, StoreError> {
+) -> Result<PhraseResults, StoreError> {
     let next = AtomicUsize::new(0);
-    let all = Mutex::new(Gathered::new());
+    let all = Mutex::new(PhraseResults::new());
     let failed: Mutex<Option<StoreError>> = Mutex::new(None);
-    let lock = |all: &Mutex<Gathered>, found: Gathered| {
+    let lock = |all: &Mutex<PhraseResults>, found: PhraseResults| {
         all.lock().unwrap_or_else(PoisonError::into_inner).extend(found);
     };
     let work = || {
@@ -414,7 +414,7 @@ fn gather(
             // A part that breaks off is read again from its beginning: what it left in the spool is
             // never looked at.
             let outcome = reading.patience.wait_out(notice, || {
-                let mut found = Gathered::new();
+                let mut found = PhraseResults::new();
                 part.visit_items(wanted, |id, frames| {
                     let one = keep(id, &frames, spool)?;
                     found.insert(id.to_owned(), one);

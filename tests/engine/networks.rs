@@ -112,11 +112,11 @@ fn check<E: Element>(name: &str, config: &UNetConfig, tolerance: f64) -> f64 {
     assert_eq!(places.len(), golden.parameters.len(), "parameters by name");
     gradients.all();
     let gradients = std::cell::RefCell::new(gradients);
-    let of = |name: &str| {
+    let gradient_of = |name: &str| {
         let id = places[name];
         gradients.borrow_mut().unpacked(id).into_iter().map(Element::to_f64).collect()
     };
-    worst = worst.max(golden.compare("grad", 0, tolerance, of));
+    worst = worst.max(golden.compare("grad", 0, tolerance, gradient_of));
 
     let mut eager = Eager::new(&parameters, &arena);
     let (_, again): (Vec<Tensor<E>>, _) = case

@@ -25,36 +25,39 @@ fn check(
     f: impl Fn(&mut Tape<f64>, &[T], &[ParameterId]) -> Result<T>,
 ) {
     let golden = Golden::open("ops.safetensors");
-    let of = |name: &str| format!("{case}/{name}");
+    let golden_name = |name: &str| format!("{case}/{name}");
     let mut list = ParameterList::default();
     let mut scope = Scope::root(&mut list);
     let ids: Vec<_> = weights
         .iter()
-        .map(|(name, role)| scope.parameter(name, golden.shape(&of(name)), Init::Zeros, *role))
+        .map(|(name, role)| {
+            scope.parameter(name, golden.shape(&golden_name(name)), Init::Zeros, *role)
+        })
         .collect();
-    let parameters =
-        Parameters::<f64>::from_fn(list, |parameter| golden.values(&of(&parameter.name)).to_vec());
+    let parameters = Parameters::<f64>::from_fn(list, |parameter| {
+        golden.values(&golden_name(&parameter.name)).to_vec()
+    });
     let arena = Arena::default();
     let mut tape = Tape::new(&parameters, &arena, None);
     let tensors: Vec<_> = inputs
         .iter()
-        .map(|name| tape.input(golden.shape(&of(name)), golden.values(&of(name))))
+        .map(|name| tape.input(golden.shape(&golden_name(name)), golden.values(&golden_name(name))))
         .collect();
     let y = f(&mut tape, &tensors, &ids).expect("shapes fit");
-    assert_eq!(y.shape(), golden.shape(&of("output")), "{case}");
-    assert_near(case, y.data(), golden.values(&of("output")), TOLERANCE);
-    let cotangent = tape.constant(y.shape(), golden.values(&of("cotangent")));
+    assert_eq!(y.shape(), golden.shape(&golden_name("output")), "{case}");
+    assert_near(case, y.data(), golden.values(&golden_name("output")), TOLERANCE);
+    let cotangent = tape.constant(y.shape(), golden.values(&golden_name("cotangent")));
     let mut gradients = Gradients::new(&parameters);
     let found = tape.backward_from(y, cotangent, &mut gradients).expect("finite");
     for (name, tensor) in inputs.iter().zip(&tensors) {
-        if let Some(wanted) = golden.get(&of(&format!("grad_{name}"))) {
+        if let Some(wanted) = golden.get(&golden_name(&format!("grad_{name}"))) {
             let got = found.of(tensor).expect("a gradient").data();
             assert_near(&format!("{case}, gradient of {name}"), got, wanted, TOLERANCE);
         }
     }
     for ((name, _), &id) in weights.iter().zip(&ids) {
         let got = gradients.unpacked(id);
-        let wanted = golden.values(&of(&format!("grad_{name}")));
+        let wanted = golden.values(&golden_name(&format!("grad_{name}")));
         assert_near(&format!("{case}, gradient of {name}"), &got, wanted, TOLERANCE);
     }
 }

@@ -37,15 +37,15 @@ fn sampling_can_begin_from_the_librarys_nearest_phrases() {
             assert_eq!(names[0], row.phrase_id);
         }
     }
-    let of = |name: &str| {
+    let frames_of_run = |name: &str| {
         let sql = format!("select * from generated where run = '{name}' order by phrase_id, frame");
         let output =
             run(["query", "--store", &store.display().to_string(), &sql, "--format", "csv"]);
         output.stdout.replace(name, "")
     };
-    assert_ne!(of("primed"), of("plain"));
+    assert_ne!(frames_of_run("primed"), frames_of_run("plain"));
     generate(&store, &["--run=again", "--prime=0.5", "--threads=2"]);
-    assert_eq!(of("again"), of("primed"), "whatever the number of threads");
+    assert_eq!(frames_of_run("again"), frames_of_run("primed"), "whatever the number of threads");
 
     let refused = |more: &[&str]| {
         let output = finish(&mut command(&store, more));
@@ -118,9 +118,9 @@ fn what_is_hardly_made_noisy_stays_near_the_librarys_motion() {
     let trained = ["--steps=20", "--decoder-steps=400", "--warmup-steps=5", "--prediction=epsilon"];
     let store = modelled_with(&dir, &trained);
     let usual = ["--raw", "--guidance=1", "--sampler=ddim"];
-    let of = |more: &[&str]| generate(&store, &[&usual, more].concat());
-    of(&["--run=plain"]);
-    of(&["--run=primed", "--prime=0.99"]);
+    let generate_with = |more: &[&str]| generate(&store, &[&usual, more].concat());
+    generate_with(&["--run=plain"]);
+    generate_with(&["--run=primed", "--prime=0.99"]);
     let library = crate::support::motion(&store);
     let all: Vec<f32> =
         library.values().flat_map(|frames| frames.as_flattened().to_vec()).collect();

@@ -113,11 +113,11 @@ fn features_and_motions_of_replaced_files_are_not_taken() {
     assert!(danced.stdout.contains("  1 motions made ("), "{danced:?}");
     assert!(danced.stdout.contains(", 15 up to date, 0 failed"), "{danced:?}");
     let now = generations(&store);
-    let of = |rows: &[GenerationRow]| {
+    let hash_in = |rows: &[GenerationRow]| {
         rows.iter().find(|row| row.phrase_id == id).expect("a row").content_hash.clone()
     };
-    assert_ne!(of(&now), of(&before));
-    assert_eq!(of(&now), Some(phrases(&store)[&id].content_hash.clone()));
+    assert_ne!(hash_in(&now), hash_in(&before));
+    assert_eq!(hash_in(&now), Some(phrases(&store)[&id].content_hash.clone()));
     succeed(&mut stage("evaluate", &store, &["--run=m", "--quick"]));
     assert_eq!(train(&store, "other", &["--dry-run", "--max-failed=0"]).code, 0);
 }

@@ -125,8 +125,9 @@ fn tunes_are_arranged_and_broken_ones_are_listed() {
     assert!(done.stdout.contains("7 songs danced to"), "{}", done.stdout);
     let refused: BTreeSet<(String, String)> =
         failures(&store).into_values().map(|row| (row.phrase_id, row.kind)).collect();
-    let of = |name: &str| (name.to_owned(), "abc_format".to_owned());
-    let expected = [of("more/bad.ABC-0001"), of("more/bad.ABC-0002"), of("none.abc")];
+    let refusal = |name: &str| (name.to_owned(), "abc_format".to_owned());
+    let expected =
+        [refusal("more/bad.ABC-0001"), refusal("more/bad.ABC-0002"), refusal("none.abc")];
     assert_eq!(refused, expected.into_iter().collect());
     let found = by_song(&store);
     assert_eq!(found.len(), 7);

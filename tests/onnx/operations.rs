@@ -211,7 +211,7 @@ fn run<G: Graph>(call: Call, g: &mut G, x: &Given<G::Tensor>, ids: &Ids) -> Resu
 }
 
 fn values() -> BTreeMap<&'static str, (Vec<usize>, Vec<f32>)> {
-    let of = |shape: &[usize], seed| {
+    let normal_array = |shape: &[usize], seed| {
         let n = shape.iter().product();
         (shape.to_vec(), normal(n, seed))
     };
@@ -219,11 +219,11 @@ fn values() -> BTreeMap<&'static str, (Vec<usize>, Vec<f32>)> {
     mask[FRAMES - 4..FRAMES].fill(0.0);
     mask[2 * FRAMES - 1] = 0.0;
     BTreeMap::from([
-        ("x", of(&[BATCH, FRAMES, WIDTH], 1)),
-        ("other", of(&[BATCH, FRAMES, WIDTH], 2)),
-        ("context", of(&[BATCH, KEYS, WIDTH], 3)),
-        ("samples", of(&[BATCH, WIDTH], 4)),
-        ("film", of(&[BATCH, 2 * WIDTH], 5)),
+        ("x", normal_array(&[BATCH, FRAMES, WIDTH], 1)),
+        ("other", normal_array(&[BATCH, FRAMES, WIDTH], 2)),
+        ("context", normal_array(&[BATCH, KEYS, WIDTH], 3)),
+        ("samples", normal_array(&[BATCH, WIDTH], 4)),
+        ("film", normal_array(&[BATCH, 2 * WIDTH], 5)),
         ("choice", (vec![BATCH], vec![0.0, 1.0, 0.0])),
         ("mask", (vec![BATCH, FRAMES], mask)),
         ("index", (vec![BATCH], vec![8.0, 0.0, 3.0])),

@@ -47,10 +47,10 @@ fn short<'a>(digests: impl Iterator<Item = &'a str>) -> Vec<String> {
 
 /// Songs and phrases of a split that could be learned from, as lists have them.
 fn of_split(rows: &[PhraseRow], split: &str) -> [Vec<String>; 2] {
-    let of = || rows.iter().filter(|row| row.split == split && row.has_motion);
+    let split_rows = || rows.iter().filter(|row| row.split == split && row.has_motion);
     [
-        short(of().map(|row| row.song_hash.as_deref().expect("a song"))),
-        short(of().map(|row| row.content_hash.as_str())),
+        short(split_rows().map(|row| row.song_hash.as_deref().expect("a song"))),
+        short(split_rows().map(|row| row.content_hash.as_str())),
     ]
 }
 

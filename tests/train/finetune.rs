@@ -35,18 +35,18 @@ fn coherence_improves_and_every_loss_is_logged() {
     assert_eq!(steps.len(), 60);
     for row in &steps {
         assert_eq!((row.learning_rate, row.lr_decoder), (Some(1e-4), Some(1e-3)));
-        let of = |x: Option<f64>| x.expect("a loss");
-        let temporal = of(row.velocity_coherence)
-            + of(row.acceleration_coherence)
-            + of(row.jerk)
-            + of(row.quaternion_delta)
-            + of(row.phase_monotonic)
-            + of(row.position_smoothness);
-        let total = of(row.diffusion)
-            + 3.0 * (of(row.decoder_position) + of(row.decoder_quaternion))
+        let loss = |x: Option<f64>| x.expect("a loss");
+        let temporal = loss(row.velocity_coherence)
+            + loss(row.acceleration_coherence)
+            + loss(row.jerk)
+            + loss(row.quaternion_delta)
+            + loss(row.phase_monotonic)
+            + loss(row.position_smoothness);
+        let total = loss(row.diffusion)
+            + 3.0 * (loss(row.decoder_position) + loss(row.decoder_quaternion))
             + 10.0 * temporal;
         // Sums of a dozen single-precision numbers.
-        assert!((of(row.loss) - total).abs() < 1e-5 * total, "{} and {total}", of(row.loss));
+        assert!((loss(row.loss) - total).abs() < 1e-5 * total, "{} and {total}", loss(row.loss));
     }
     let validations: Vec<_> = rows.iter().filter(|row| row.kind == "validation").collect();
     let (first, last) = (validations[0], validations[validations.len() - 1]);

@@ -98,17 +98,17 @@ fn parts_of_a_batch_add_up() {
     let store = make_store(&dir);
     // Without dropout a batch in parts is the same batch; only sums are rounded in another order.
     let common = ["--steps=3", "--decoder-steps=1", "--dropout=0"];
-    let of = |run: &str, parts: [&str; 2]| {
+    let log_of = |run: &str, parts: [&str; 2]| {
         assert_eq!(train(&store, run, &[&common[..], &parts].concat()).code, 0);
         log(&store, run, "diffusion")
     };
-    let whole = of("whole", ["--accumulate=1", "--side-by-side=1"]);
+    let whole = log_of("whole", ["--accumulate=1", "--side-by-side=1"]);
     for (run, parts) in [
         ("one after the other", ["--accumulate=3", "--side-by-side=1"]),
         ("at once", ["--accumulate=1", "--side-by-side=3"]),
         ("both", ["--accumulate=2", "--side-by-side=2"]),
     ] {
-        let parts = of(&run.replace(' ', "-"), parts);
+        let parts = log_of(&run.replace(' ', "-"), parts);
         for (whole, parts) in whole.iter().zip(parts) {
             let (a, b) = (whole.loss.expect("a loss"), parts.loss.expect("a loss"));
             assert!((a - b).abs() < 1e-5 * a, "{run}, step {}: {a} and {b}", whole.step);

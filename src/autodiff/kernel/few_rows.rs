@@ -7,7 +7,7 @@ use crate::autodiff::element::Element;
 
 use super::gather::{Conv, ZERO_ROW};
 use super::pack::{PANEL, panels, transpose_16};
-use super::product::Shared;
+use super::product::SharedPointer;
 use super::tile::{MAX_PANELS, MAX_ROWS, Tile, prefetch};
 
 /// Rows of the weight that are fetched ahead of their use.
@@ -94,7 +94,7 @@ pub fn input_gradient_of_few<E: Element>(
     let turned_of = &*turned_of;
 
     let gather = conv.forward();
-    let out = Shared::new(d_source);
+    let out = SharedPointer::new(d_source);
     let in_rows = conv.in_rows();
     (0..panels(channels)).into_par_iter().for_each(|panel| {
         let first = panel * PANEL;

@@ -23,11 +23,11 @@ const BLOCK: usize = 384;
 const FEW_ROWS: usize = 64;
 
 /// A place to write from several tasks, each its own columns.
-pub struct Shared<E>(*mut E);
+pub struct SharedPointer<E>(*mut E);
 // SAFETY: tasks write disjoint elements (invariant 2 of the module).
-unsafe impl<E: Send> Sync for Shared<E> {}
+unsafe impl<E: Send> Sync for SharedPointer<E> {}
 
-impl<E> Shared<E> {
+impl<E> SharedPointer<E> {
     /// Shares memory that outlives the tasks.
     pub fn new(memory: &mut [E]) -> Self {
         Self(memory.as_mut_ptr())
@@ -85,7 +85,7 @@ unsafe fn run_rows<E: Element>(
     source_channels: usize,
     block: &Block<E>,
     zeros: &[E],
-    out: &Shared<E>,
+    out: &SharedPointer<E>,
     out_columns: usize,
     columns: Range<usize>,
     add: bool,
@@ -144,7 +144,7 @@ pub fn product<E: Element>(
     assert_eq!(out.len(), gather.target.len() * n, "rows of {n} outputs");
     assert!(bias.is_none_or(|bias| bias.len() == n), "a bias of {n}");
     let zeros = zeros::<E>();
-    let out = Shared::new(out);
+    let out = SharedPointer::new(out);
     let groups = groups(panels(n));
     let chunks = row_chunks(gather.target.len(), groups.len());
     let tasks: Vec<_> =
@@ -209,7 +209,7 @@ pub fn input_gradient<E: Element>(
     }
     let phases = conv.backward();
     let zeros = zeros::<E>();
-    let out = Shared::new(d_source);
+    let out = SharedPointer::new(d_source);
     let groups = groups(panels(channels));
     let scratch = || Arena::<E>::aligned(MAX_PANELS * BLOCK * PANEL);
     groups.into_par_iter().for_each_init(scratch, |scratch, group| {

@@ -4,7 +4,7 @@ use proptest::prelude::*;
 use super::*;
 use crate::diffusion::{DiffusionConfig, Prediction, Sampler, SamplerConfig, Schedule, Spacing};
 use crate::generation::control::WantedValue;
-use crate::generation::engine::Inputs;
+use crate::generation::engine::EngineInputs;
 use crate::generation::walk::walk;
 use crate::motion::{Channel, ChannelLimits};
 
@@ -29,7 +29,7 @@ impl Engine for ByHeart {
         1
     }
 
-    fn predict(&self, inputs: &Inputs) -> Result<Array3<f32>, EngineError> {
+    fn predict(&self, inputs: &EngineInputs) -> Result<Array3<f32>, EngineError> {
         inputs.check(N_FEATURES)?;
         let mut predicted = Array3::zeros(inputs.x.raw_dim());
         for (mut window, audio) in predicted.outer_iter_mut().zip(inputs.audio.outer_iter()) {
@@ -238,7 +238,7 @@ impl Engine for Silent<'_> {
         1
     }
 
-    fn predict(&self, inputs: &Inputs) -> Result<Array3<f32>, EngineError> {
+    fn predict(&self, inputs: &EngineInputs) -> Result<Array3<f32>, EngineError> {
         Ok(Array3::zeros(inputs.x.raw_dim()))
     }
 

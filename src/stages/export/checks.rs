@@ -11,7 +11,7 @@ use super::files::ExportedFiles;
 use crate::autodiff::{Parameters, Stream};
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
 use crate::generation::{
-    EagerEngine, Engine, Inputs, OnnxEngine, Sampling, SessionPlan, file_names, sample,
+    EagerEngine, Engine, EngineInputs, OnnxEngine, Sampling, SessionPlan, file_names, sample,
 };
 use crate::model::{MotionDecoder, Parameter, ParameterList, UNet1D, condition};
 use crate::motion::MOTION_DIM;
@@ -41,7 +41,7 @@ const DERIVED_TOLERANCE: f64 = 1e-2;
 const ROUNDING_TOLERANCE: f64 = 0.05;
 
 /// The trained networks and exported files to compare.
-pub struct Checking<'a> {
+pub struct ExportChecks<'a> {
     pub dataset: &'a Dataset,
     pub params: &'a Params,
     pub trained: &'a TrainedRun,
@@ -78,7 +78,7 @@ struct Case {
     n_frames: usize,
 }
 
-impl Checking<'_> {
+impl ExportChecks<'_> {
     /// Runs the checks.
     ///
     /// # Errors
@@ -243,8 +243,13 @@ impl Checking<'_> {
         let n = case.n_samples;
         let t: Vec<usize> = (0..n).map(|i| (i + 1) * (n_steps - 1) / n).collect();
         let drop: Vec<bool> = (0..n).map(|i| n > 1 && i + 1 == n).collect();
-        let inputs =
-            Inputs { x: x.view(), t: &t, audio: audio.view(), drop_audio: &drop, style: None };
+        let inputs = EngineInputs {
+            x: x.view(),
+            t: &t,
+            audio: audio.view(),
+            drop_audio: &drop,
+            style: None,
+        };
         let (a, onnx_s) = timed(|| onnx.predict(&inputs))?;
         let (b, eager_s) = timed(|| eager.predict(&inputs))?;
         let row = self.row("forward", case, difference(a.view(), b.view()));

@@ -9,7 +9,7 @@ use std::path::PathBuf;
 
 use anyhow::{bail, ensure};
 
-use self::checks::{CheckResults, Checking, eager};
+use self::checks::{CheckResults, ExportChecks, eager};
 use self::files::ExportedFiles;
 use self::report::{ExportDryRun, ExportSummary};
 use super::learned;
@@ -134,7 +134,7 @@ impl Stage for Export {
         }
         // Before anything is computed: without the library there is nothing to check with.
         let runtime = Runtime::load(params.ort_lib.as_deref())?;
-        let checking = Checking {
+        let checking = ExportChecks {
             dataset: &phrases.dataset,
             params: &params,
             trained: &trained,

@@ -255,6 +255,16 @@ mod tests {
     }
 
     #[test]
+    fn the_text_in_digests_is_that_of_earlier_versions() {
+        let text = format!("{:?}", asked(""));
+        assert!(
+            text.starts_with("Asked { file: ConstraintsFile { start: None, end: None, "),
+            "{text}"
+        );
+        assert!(text.ends_with(" }, before: None }"), "{text}");
+    }
+
+    #[test]
     fn every_kind_of_constraint_is_read() {
         let text = "
             [start]

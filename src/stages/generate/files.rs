@@ -245,21 +245,21 @@ fn facts(made: &GeneratedMotion) -> Vec<(String, String)> {
 }
 
 /// Frames on their way to a player, as CSV.
-struct Stream {
+struct FrameStream {
     out: Box<dyn Write>,
     n_frames: usize,
 }
 
-fn open_stream(target: &str) -> anyhow::Result<Stream> {
+fn open_stream(target: &str) -> anyhow::Result<FrameStream> {
     let mut out: Box<dyn Write> = match target {
         "-" => Box::new(io::stdout()),
         path => Box::new(File::create(path).with_context(|| format!("while writing {path}"))?),
     };
     out.write_all(csv_header().as_bytes())?;
-    Ok(Stream { out, n_frames: 0 })
+    Ok(FrameStream { out, n_frames: 0 })
 }
 
-impl Stream {
+impl FrameStream {
     fn write(&mut self, frames: ArrayView2<f32>) -> io::Result<()> {
         write_csv_rows(frames, self.n_frames, &mut self.out)?;
         self.n_frames += frames.nrows();

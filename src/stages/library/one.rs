@@ -245,15 +245,15 @@ pub fn dance<E: From<Failure>>(
 }
 
 /// Beats by their time from the begin of a phrase and their number in the bar.
-type Numbered = Vec<(f64, u32)>;
+type NumberedBeats = Vec<(f64, u32)>;
 
 /// Returns the beats of a phrase, and those after it up to the next downbeat, at least one.
-fn beats_of(grid: &BeatGrid, first: usize, n_frames: usize) -> (Numbered, Numbered) {
+fn beats_of(grid: &BeatGrid, first: usize, n_frames: usize) -> (NumberedBeats, NumberedBeats) {
     let (start_s, end_s) = (frames_to_s(first), frames_to_s(first + n_frames));
     let beats = grid.beats();
     let begin = beats.partition_point(|beat| beat.time_s < start_s);
     let end = beats.partition_point(|beat| beat.time_s < end_s);
-    let numbered = |beats: &[choreography::Beat]| -> Numbered {
+    let numbered = |beats: &[choreography::Beat]| -> NumberedBeats {
         beats.iter().map(|beat| (beat.time_s - start_s, beat.number)).collect()
     };
     let later = beats[end..].iter().position(|beat| beat.number == 1).map_or(0, |i| i + 1);

@@ -8,8 +8,8 @@ use crate::audio::FeatureScale;
 use crate::autodiff::{Parameters, Stream};
 use crate::diffusion::{DiffusionConfig, Prediction};
 use crate::generation::{
-    Engine as _, FileEntry, Inputs, MODEL_FORMAT, ModelFileName, Networks, Provenance, file_names,
-    own_channels, own_features,
+    Engine as _, EngineInputs, FileEntry, MODEL_FORMAT, ModelFileName, Networks, Provenance,
+    file_names, own_channels, own_features,
 };
 use crate::model::{DecoderConfig, MotionDecoder, ParameterList, UNet1D, UNetConfig};
 use crate::motion::Normalizer;
@@ -261,7 +261,7 @@ fn with_its_zeros_a_fresh_network_says_the_same_for_every_input() {
     let mut x = ndarray::Array3::zeros((1, WINDOW, 25));
     Stream::new(4, 0).normal(0, x.as_slice_mut().expect("in order"));
     let inputs =
-        Inputs { x: x.view(), t: &[30], audio: audio.view(), drop_audio: &[], style: None };
+        EngineInputs { x: x.view(), t: &[30], audio: audio.view(), drop_audio: &[], style: None };
     assert!(fresh.predict(&inputs).expect("a prediction").iter().all(|x| *x == 0.0));
     let predicted = drawn.predict(&inputs).expect("a prediction");
     assert!(predicted.std(0.0) > 0.01, "{}", predicted.std(0.0));
