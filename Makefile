@@ -27,7 +27,8 @@ build: ## build the executables (dev profile)
 demo: build setup ## from tests/data to tables, a library, trained networks, a plot and answers (build/demo)
 	@$(MAKE) --file pipelines/demo.mk BIN=$(BIN)
 
-# Processors round transforms differently; a phrase that library constructs is named by a digest of every bit.
+# Processors round transforms differently, and a phrase that library constructs is named by a digest of every bit. One row
+# of motion that moves by half of its column's spread is told.
 TABLES := phrases,motion,beats,features,extractions
 DIFF_TABLES = $(BIN)/examples/diff-tables --tables $(TABLES)
 .PHONY: build-diff-tables
@@ -35,7 +36,7 @@ build-diff-tables:
 	$(CARGO) build --locked --example diff-tables
 .PHONY: check-tables
 check-tables: build-diff-tables ## compare the demo's tables with what is kept of them (pipelines/demo.tables.json)
-	$(DIFF_TABLES) pipelines/demo.tables.json build/demo/store --tolerance features=1e-4 --tolerance motion=1e-5 \
+	$(DIFF_TABLES) pipelines/demo.tables.json build/demo/store --tolerance features=1e-4 --tolerance motion=1e-3 \
 	  --tolerance phrases.content_hash=inf
 .PHONY: keep-tables
 keep-tables: build-diff-tables ## keep the demo's tables as they are now; CHANGELOG says why they changed
