@@ -162,6 +162,10 @@ bench-store: build/bench-venv/ready ## measure a store of a million phrases, and
 bench-room: ## build the room autodiff alone, from nothing
 	$(PYTHON) benches/room.py
 
+.PHONY: check-fuzz
+check-fuzz: ## check that the fuzz targets compile (needs a C++ compiler)
+	cd fuzz && RUSTC_BOOTSTRAP=1 $(CARGO) check --locked --quiet
+
 FUZZ_SECONDS ?= 60
 .PHONY: fuzz
 fuzz: ## fuzz the readers of untrusted files, each for a minute [FUZZ_SECONDS=600]

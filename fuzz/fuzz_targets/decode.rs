@@ -8,6 +8,9 @@ use std::io::Cursor;
 
 use libfuzzer_sys::fuzz_target;
 
+#[path = "../../src/instructions.rs"]
+#[allow(dead_code, unused_imports, unused_macros, reason = "this target reaches a part of the module")]
+mod instructions;
 #[path = "../../src/audio/mod.rs"]
 #[allow(dead_code, unused_imports, reason = "this target reaches a part of the modules")]
 mod audio;

@@ -4,6 +4,9 @@
 
 use libfuzzer_sys::fuzz_target;
 
+#[path = "../../src/instructions.rs"]
+#[allow(dead_code, unused_imports, unused_macros, reason = "this target reaches a part of the module")]
+mod instructions;
 #[path = "../../src/autodiff/mod.rs"]
 #[allow(dead_code, reason = "this target reaches a part of the modules")]
 mod autodiff;
