@@ -164,7 +164,7 @@ bench-room: ## build the room autodiff alone, from nothing
 
 .PHONY: check-fuzz
 check-fuzz: ## check that the fuzz targets compile (needs a C++ compiler)
-	cd fuzz && RUSTC_BOOTSTRAP=1 $(CARGO) check --locked --quiet
+	cd fuzz && RUSTFLAGS='-A warnings' RUSTC_BOOTSTRAP=1 $(CARGO) check --locked --quiet
 
 FUZZ_SECONDS ?= 60
 .PHONY: fuzz
