@@ -26,7 +26,7 @@ CONFIG = ROOT / "pipelines" / "demo.toml"
 MUSIC21 = "music21==10.5.1"
 LOSSES = ["--velocity-loss", "0.03", "--acceleration-loss", "0.03", "--difference-losses", "0.03,0.003,0.0003"]
 
-Row = collections.namedtuple("Row", "library clock losses fuse")
+Row = collections.namedtuple("Row", "songs clock losses fuse")
 ROWS = {
     "nothing": Row("plain", False, False, False),
     "clock": Row("plain", True, False, False),
@@ -115,7 +115,7 @@ class Bench:
 
     def train(self, row: Row, seed: int) -> tuple[pathlib.Path, str]:
         """Trains the networks of a row, and returns their store and run."""
-        args, store = self.args, self.store(row.library)
+        args, store = self.args, self.store(row.songs)
         name = "-".join(["clock" if row.clock else "deaf", "losses" if row.losses else "plain", str(seed)])
         flags = [] if row.clock else ["--no-clock"]
         flags += LOSSES if row.losses else []
