@@ -3,6 +3,7 @@
 mod determinism;
 pub mod golden;
 mod golden_values;
+mod group;
 mod messages;
 mod networks;
 mod operations;

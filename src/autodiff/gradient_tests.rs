@@ -11,6 +11,7 @@ use ndarray::Array2;
 use proptest::prelude::*;
 
 use super::op::binary::{AddToFrames, Binary, Pair};
+use super::op::dancers::TakeSamples;
 use super::op::elementwise::{Function, Map};
 use super::op::frames::TakeFrames;
 use super::op::lookup::Quantize;
@@ -286,6 +287,47 @@ proptest! {
     }
 
     #[test]
+    fn dancers_and_tokens(
+        batch in 1..3_usize, n_dancers in 1..4_usize, frames in 1..5_usize, channels in 1..4_usize,
+    ) {
+        let rows = batch * n_dancers;
+        let x = || input(&[rows, frames, channels], 1);
+        let like = || fixed(&[batch], vec![0.0; batch]);
+        check(&[x(), like()], &none(), |g, x| g.rebatch(&x[0], &x[1]));
+        check(&[input(&[batch, frames, channels], 2), x()], &none(), |g, x| {
+            let repeated = g.repeat_batch(&x[0], &x[1])?;
+            g.mul(&repeated, &x[1])
+        });
+        check(&[input(&[batch, channels], 3), fixed(&[rows, 1], vec![0.0; rows])], &none(), |g, x| {
+            g.repeat_batch(&x[0], &x[1])
+        });
+        check(&[x(), input(&[rows, channels], 4), input(&[rows, 2, channels], 5)], &none(), |g, x| {
+            let joined = g.concat_frames(&[&x[1], &x[0], &x[2], &x[1]])?;
+            let head = g.frames(&joined, 0, Some(frames + 1))?;
+            let tail = g.frames(&joined, 3, None)?;
+            g.mul(&head, &tail)
+        });
+        let mask: Vec<_> = (0..rows * frames).map(|i| [1.0, 0.0, 1.0, 2.5][i % 4]).collect();
+        let mask = || fixed(&[rows, frames], mask.clone());
+        check(&[x()], &none(), |g, x| {
+            g.apply(TakeSamples::new(vec![rows - 1, 0, rows - 1]), &[&x[0]])
+        });
+        for bias in [0.0, 1.0] {
+            check(&[x(), input(&[rows, 2 * channels], 6)], &none(), |g, x| {
+                g.modulate(&x[0], &x[1], bias)
+            });
+        }
+        check(&[x(), mask()], &none(), |g, x| g.normalize_frames(&x[0], Some(&x[1]), 1e-2));
+        check(&[x()], &none(), |g, x| g.normalize_frames(&x[0], None, 1e-2));
+        check(&[x(), mask()], &none(), |g, x| g.mean_frames(&x[0], Some(&x[1])));
+        check(&[x()], &none(), |g, x| g.mean_frames(&x[0], None));
+        check(&[input(&[rows, frames + 2, channels], 7), mask()], &none(), |g, x| {
+            let mask = g.token_mask(&x[1], 2)?;
+            g.mean_frames(&x[0], Some(&mask))
+        });
+    }
+
+    #[test]
     fn functions_of_one_number(rows in 1..4_usize, channels in 1..7_usize) {
         // Away from zero, where |x|, ReLU and the clamp have corners.
         let mut x = input(&[rows, channels], 1);
@@ -398,4 +440,46 @@ fn a_fixed_table_gives_its_rows() {
     let index = eager.input(&[2], &[3.0, 1.0]);
     let y = eager.gather(&table, &index).expect("within the table");
     assert_eq!((y.shape(), y.data()), (&[2, 3][..], &[30.0, 31.0, 32.0, 10.0, 11.0, 12.0][..]));
+}
+
+#[test]
+fn dancers_are_folded_without_moving_a_number_and_refused_where_they_do_not_fit() {
+    let p = none();
+    let arena = Arena::default();
+    let mut g = Eager::new(&p, &arena);
+    let values: Vec<f64> = (0..12).map(f64::from).collect();
+    let x = g.input(&[6, 2, 1], &values);
+    let [two, four] = [2, 4].map(|n| g.input(&[n], &vec![0.0; n]));
+    let y = g.rebatch(&x, &two).expect("shapes fit");
+    assert_eq!((y.shape(), y.data()), (&[2, 6, 1][..], &values[..]));
+    let back = g.rebatch(&y, &x).expect("shapes fit");
+    assert_eq!((back.shape(), back.data()), (&[6, 2, 1][..], &values[..]));
+    let five = g.input(&[5], &[0.0; 5]);
+    assert_eq!(
+        g.rebatch(&x, &five).expect_err("5 does not divide 12").to_string(),
+        "rebatch: 6 × 2 frames cannot be split into 5 samples alike"
+    );
+    assert_eq!(
+        g.repeat_batch(&four, &x).expect_err("4 does not divide 6").to_string(),
+        "repeat_batch: 4 samples cannot be repeated to 6"
+    );
+    let z = g.input(&[2, 3, 1], &[0.0; 6]);
+    assert_eq!(
+        g.concat_frames(&[&x, &z]).expect_err("other batches").to_string(),
+        "concat_frames: shapes [6, 2, 1] and [2, 3, 1] differ in batch or channels"
+    );
+    assert_eq!(
+        g.frames(&x, 1, Some(2)).expect_err("there are two").to_string(),
+        "frames: input has 2 frames, 2 from frame 1 on asked for"
+    );
+    let mask = g.input(&[2, 2], &[1.0; 4]);
+    assert_eq!(
+        g.mean_frames(&z, Some(&mask)).expect_err("another mask").to_string(),
+        "mean_frames: mask has shape [2, 2], input expects [2, 3]"
+    );
+    let film = g.input(&[2, 1], &[1.0; 2]);
+    assert_eq!(
+        g.modulate(&z, &film, 1.0).expect_err("half a scale").to_string(),
+        "modulate: scale and shift have shape [2, 1], input expects [2, 2]"
+    );
 }

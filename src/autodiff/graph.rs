@@ -14,6 +14,7 @@ use super::op::attention::{Attend, InputChannels};
 use super::op::binary::{AddToFrames, Binary, Pair};
 use super::op::channels::{Concat, TakeChannels};
 use super::op::conv::Product;
+use super::op::dancers::{Rebatch, RepeatBatch};
 use super::op::dropout::Dropout;
 use super::op::elementwise::{Function, Map};
 use super::op::filter::FilterFrames;
@@ -21,10 +22,12 @@ use super::op::frames::{FrameMask, ReplaceEnds, StrideMask, TakeFrames};
 use super::op::group_norm::NormFilmActivate;
 use super::op::layer_norm::LayerNormalize;
 use super::op::lookup::{Embed, Gather};
+use super::op::modulation::{MeanFrames, Modulate, NormalizeFrames};
 use super::op::normalize::Normalize;
 use super::op::parameter::Take;
 use super::op::rotary::Rotary;
 use super::op::select::Select;
+use super::op::tokens::{ConcatFrames, TokenMask};
 use super::operation::Interpreter;
 use super::tensor::Tensor;
 
@@ -215,6 +218,57 @@ impl<I: Interpreter> Graph for I {
 
     fn stride_mask(&mut self, mask: &Self::Tensor, stride: usize) -> Result<Self::Tensor> {
         self.apply(StrideMask { stride }, &[mask])
+    }
+
+    fn rebatch(&mut self, x: &Self::Tensor, like: &Self::Tensor) -> Result<Self::Tensor> {
+        self.apply(Rebatch::default(), &[x, like])
+    }
+
+    fn repeat_batch(&mut self, x: &Self::Tensor, like: &Self::Tensor) -> Result<Self::Tensor> {
+        self.apply(RepeatBatch::default(), &[x, like])
+    }
+
+    fn concat_frames(&mut self, parts: &[&Self::Tensor]) -> Result<Self::Tensor> {
+        self.apply(ConcatFrames::default(), parts)
+    }
+
+    fn frames(
+        &mut self,
+        x: &Self::Tensor,
+        first: usize,
+        n: Option<usize>,
+    ) -> Result<Self::Tensor> {
+        self.apply(TakeFrames::from(first, n), &[x])
+    }
+
+    fn token_mask(&mut self, mask: &Self::Tensor, n: usize) -> Result<Self::Tensor> {
+        self.apply(TokenMask { n }, &[mask])
+    }
+
+    fn modulate(
+        &mut self,
+        x: &Self::Tensor,
+        film: &Self::Tensor,
+        bias: f64,
+    ) -> Result<Self::Tensor> {
+        self.apply(Modulate::new(bias), &[x, film])
+    }
+
+    fn normalize_frames(
+        &mut self,
+        x: &Self::Tensor,
+        mask: Option<&Self::Tensor>,
+        epsilon: f64,
+    ) -> Result<Self::Tensor> {
+        self.apply(NormalizeFrames::new(epsilon), &with(&[x], mask))
+    }
+
+    fn mean_frames(
+        &mut self,
+        x: &Self::Tensor,
+        mask: Option<&Self::Tensor>,
+    ) -> Result<Self::Tensor> {
+        self.apply(MeanFrames::default(), &with(&[x], mask))
     }
 
     fn checkpoint<F>(&mut self, inputs: &[&Self::Tensor], part: F) -> Result<Self::Tensor>

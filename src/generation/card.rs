@@ -7,7 +7,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use super::LearnedFrom;
 use crate::audio::{FEATURE_DIM, FeatureScale, feature_names};
 use crate::diffusion::DiffusionConfig;
-use crate::model::{DecoderConfig, MotionDecoder, UNet1D, UNetConfig};
+use crate::model::{DecoderConfig, Family, MotionDecoder, UNet1D, UNetConfig};
 use crate::motion::postprocess::FusionVariances;
 use crate::motion::rates::MotionRange;
 use crate::motion::{CHANNEL_NAMES, MOTION_DIM, Normalizer};
@@ -24,7 +24,7 @@ const MAX_PARAMETERS: usize = 1 << 31;
 /// Bytes of a file beside eight for each parameter and each value of the table of steps.
 const MAX_GRAPH_BYTES: u64 = 64 << 20;
 /// Longest window, in frames: over half an hour.
-const MAX_WINDOW_FRAMES: usize = 1 << 16;
+pub(super) const MAX_WINDOW_FRAMES: usize = 1 << 16;
 /// Longest name of a model, in bytes.
 const MAX_NAME_BYTES: usize = 100;
 
@@ -36,6 +36,9 @@ pub mod file_names {
     pub const UNET_WEIGHTS: &str = "unet.weights.bin";
     pub const DECODER: &str = "decoder.onnx";
     pub const DECODER_WEIGHTS: &str = "decoder.weights.bin";
+    /// Of a model of the family `group`.
+    pub const DENOISER: &str = "denoiser.onnx";
+    pub const SCORE: &str = "score.onnx";
 }
 
 /// The files that a model can have beside its card; a card can name no other.
@@ -45,11 +48,20 @@ pub enum ModelFileName {
     UnetWeights,
     Decoder,
     DecoderWeights,
+    Denoiser,
+    Score,
 }
 
 impl ModelFileName {
     /// Every name, in the order in which cards list them.
-    pub const ALL: [Self; 4] = [Self::Unet, Self::UnetWeights, Self::Decoder, Self::DecoderWeights];
+    pub const ALL: [Self; 6] = [
+        Self::Unet,
+        Self::UnetWeights,
+        Self::Decoder,
+        Self::DecoderWeights,
+        Self::Denoiser,
+        Self::Score,
+    ];
 
     /// Returns the name of the file.
     pub fn name(self) -> &'static str {
@@ -58,6 +70,8 @@ impl ModelFileName {
             Self::UnetWeights => file_names::UNET_WEIGHTS,
             Self::Decoder => file_names::DECODER,
             Self::DecoderWeights => file_names::DECODER_WEIGHTS,
+            Self::Denoiser => file_names::DENOISER,
+            Self::Score => file_names::SCORE,
         }
     }
 
@@ -94,6 +108,9 @@ impl<'de> Deserialize<'de> for ModelFileName {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ModelCard {
     pub format: u32,
+    /// Cards of release 0.1 name none.
+    #[serde(default, skip_serializing_if = "Family::is_unet")]
+    pub family: Family,
     pub name: String,
     /// The program that wrote it.
     pub program: String,
@@ -136,6 +153,136 @@ pub struct SamplingDefaults {
     pub guidance: f64,
     /// Of the errors that the decoder's heads leave, by which its last layer and post-processing weigh its channels.
     pub fusion_variances: FusionVariances,
+}
+
+impl SamplingDefaults {
+    /// Refuses numbers that no motion can be sampled with.
+    pub(super) fn check(&self) -> Result<(), String> {
+        if !(self.guidance.is_finite() && self.guidance >= 0.0) {
+            return Err(format!(
+                "guidance is {}; it must be 0 or more; export the model again",
+                self.guidance
+            ));
+        }
+        match self.fusion_variances.unsound() {
+            Some((name, variance)) => Err(format!(
+                "{name} of fusion_variances is {variance}; it must be above 0; export the model again"
+            )),
+            None => Ok(()),
+        }
+    }
+}
+
+/// What a card says first of all.
+#[derive(Debug, Deserialize)]
+pub(super) struct Head {
+    format: u32,
+    #[serde(default)]
+    family: Option<String>,
+}
+
+impl Head {
+    /// Reads format and family; another format is refused.
+    pub(super) fn read(bytes: &[u8], place: &str) -> Result<Self, CardError> {
+        let place = || place.to_owned();
+        let head: Self = serde_json::from_slice(bytes)
+            .map_err(|e| CardError::Unreadable { place: place(), reason: e.to_string() })?;
+        if head.format != MODEL_FORMAT {
+            return Err(CardError::Format { place: place(), found: head.format });
+        }
+        Ok(head)
+    }
+
+    /// Refuses a card of another family.
+    pub(super) fn expect(&self, family: Family, place: &str) -> Result<(), CardError> {
+        let found = self.family.as_deref().unwrap_or(Family::default().name());
+        if found == family.name() {
+            return Ok(());
+        }
+        let found = found.chars().take(MAX_NAME_BYTES).collect();
+        Err(CardError::Family { place: place.to_owned(), found, wanted: family.name() })
+    }
+}
+
+/// Returns the family of a model by its card.
+///
+/// # Errors
+/// [`CardError`] for a text that is no card, or one of another format.
+pub fn family_of(bytes: &[u8], place: &str) -> Result<Family, CardError> {
+    let head = Head::read(bytes, place)?;
+    let is_group = head.family.as_deref() == Some(Family::Group.name());
+    Ok(if is_group { Family::Group } else { Family::Unet })
+}
+
+/// Refuses other channels, features or frames than those of this program.
+pub(super) fn check_layout(
+    (channels, features, fps): (&[String], &[String], f64),
+    n_scaled: [usize; 2],
+    place: &str,
+) -> Result<(), CardError> {
+    let layout = |what, detail| Err(CardError::Layout { place: place.to_owned(), what, detail });
+    if let Some(detail) = difference(channels, &own_channels()) {
+        return layout("channels", detail);
+    }
+    if let Some(detail) = difference(features, &own_features()) {
+        return layout("features", detail);
+    }
+    if fps != FPS {
+        return layout("frames", format!("{fps} a second instead of {FPS}"));
+    }
+    if let Some(n) = n_scaled.into_iter().find(|&n| n != FEATURE_DIM) {
+        return layout("features", format!("{n} are scaled instead of {FEATURE_DIM}"));
+    }
+    Ok(())
+}
+
+/// Refuses scales by which nothing can be divided.
+pub(super) fn check_scales(
+    normalizer: &Normalizer,
+    feature_scale: &FeatureScale,
+) -> Result<(), String> {
+    let centres = normalizer.centre.iter().chain(&feature_scale.centre);
+    let scales = normalizer.scale.iter().chain(&feature_scale.scale);
+    if let Some(centre) = centres.into_iter().find(|x| !x.is_finite()) {
+        return Err(format!("a centre is {centre}; export the model again"));
+    }
+    if let Some(scale) = scales.into_iter().find(|x| !(x.is_finite() && **x > 0.0)) {
+        return Err(format!("a scale is {scale}; it must be above 0; export the model again"));
+    }
+    Ok(())
+}
+
+/// Refuses files that are listed twice, are of another family, or are larger than `most` says of their name.
+pub(super) fn check_file_list(
+    files: &[FileEntry],
+    most: impl Fn(ModelFileName) -> Result<u64, String>,
+) -> Result<(), String> {
+    for (i, FileEntry { name, n_bytes, .. }) in files.iter().enumerate() {
+        if files[..i].iter().any(|before| before.name == *name) {
+            return Err(format!("{name} is listed twice; export the model again"));
+        }
+        let most = most(*name)?;
+        if *n_bytes > most {
+            return Err(format!(
+                "{name} has {n_bytes} bytes, a network of these sizes at most {most}; export the model again"
+            ));
+        }
+    }
+    Ok(())
+}
+
+/// Returns the bytes that a file of so many numbers may have.
+pub(super) fn most_bytes(n_values: usize) -> u64 {
+    8 * n_values as u64 + MAX_GRAPH_BYTES
+}
+
+/// Says what is wrong with a name that is none.
+pub(super) fn name_problem(name: &str) -> String {
+    let name: String = name.chars().take(MAX_NAME_BYTES).collect();
+    format!(
+        "name {name:?} is none of a model: 1 to {MAX_NAME_BYTES} letters, digits, -, _ and ., and no . at \
+         the beginning; export the model again"
+    )
 }
 
 /// Guidance of models whose card tells none, as release 0.1 sampled them.
@@ -183,6 +330,8 @@ pub enum CardError {
          motiongen that wrote it, or export the model again"
     )]
     Format { place: String, found: u32 },
+    #[error("{place}: is a model of the family {found}, and one of the family {wanted} is needed")]
+    Family { place: String, found: String, wanted: &'static str },
     #[error(
         "{place}: is a model of other {what}: {detail}; train and export a model with this version of \
          motiongen"
@@ -210,51 +359,18 @@ impl ModelCard {
     /// # Errors
     /// One sentence for a text that is no card, another format, another layout of channels or features.
     pub fn read(bytes: &[u8], place: &str) -> Result<Self, CardError> {
-        #[derive(Deserialize)]
-        struct Head {
-            format: u32,
-        }
-        let place = || place.to_owned();
-        let unreadable =
-            |e: serde_json::Error| CardError::Unreadable { place: place(), reason: e.to_string() };
-        let Head { format } = serde_json::from_slice(bytes).map_err(unreadable)?;
-        if format != MODEL_FORMAT {
-            return Err(CardError::Format { place: place(), found: format });
-        }
-        let card: Self = serde_json::from_slice(bytes).map_err(unreadable)?;
-        let layout = |what, detail| Err(CardError::Layout { place: place(), what, detail });
-        if let Some(detail) = difference(&card.channels, &own_channels()) {
-            return layout("channels", detail);
-        }
-        if let Some(detail) = difference(&card.features, &own_features()) {
-            return layout("features", detail);
-        }
-        if card.fps != FPS {
-            return layout("frames", format!("{} a second instead of {FPS}", card.fps));
-        }
-        for n_scaled in [card.feature_scale.centre.len(), card.feature_scale.scale.len()] {
-            if n_scaled != FEATURE_DIM {
-                let detail = format!("{n_scaled} are scaled instead of {FEATURE_DIM}");
-                return layout("features", detail);
-            }
-        }
-        let config = |problem: String| CardError::Config { place: place(), problem };
+        Head::read(bytes, place)?.expect(Family::Unet, place)?;
+        let card: Self = serde_json::from_slice(bytes).map_err(|e| CardError::Unreadable {
+            place: place.to_owned(),
+            reason: e.to_string(),
+        })?;
+        let n_scaled = [card.feature_scale.centre.len(), card.feature_scale.scale.len()];
+        check_layout((&card.channels, &card.features, card.fps), n_scaled, place)?;
+        let config = |problem: String| CardError::Config { place: place.to_owned(), problem };
         let n_elements = card.check_networks().map_err(config)?;
-        card.check_scales().map_err(config)?;
+        check_scales(&card.normalizer, &card.feature_scale).map_err(config)?;
         card.check_files(&n_elements).map_err(config)?;
-        if let Some(sampling) = &card.sampling {
-            if !(sampling.guidance.is_finite() && sampling.guidance >= 0.0) {
-                return Err(config(format!(
-                    "guidance is {}; it must be 0 or more; export the model again",
-                    sampling.guidance
-                )));
-            }
-            if let Some((name, variance)) = sampling.fusion_variances.unsound() {
-                return Err(config(format!(
-                    "{name} of fusion_variances is {variance}; it must be above 0; export the model again"
-                )));
-            }
-        }
+        card.sampling.as_ref().map_or(Ok(()), SamplingDefaults::check).map_err(config)?;
         if !(2..=MAX_WINDOW_FRAMES).contains(&card.window_frames) {
             return Err(config(format!(
                 "window_frames is {}; it must be 2 to {MAX_WINDOW_FRAMES}; export the model again",
@@ -262,11 +378,7 @@ impl ModelCard {
             )));
         }
         if !is_name(&card.name) {
-            let name: String = card.name.chars().take(MAX_NAME_BYTES).collect();
-            return Err(config(format!(
-                "name {name:?} is none of a model: 1 to {MAX_NAME_BYTES} letters, digits, -, _ and ., and no . at \
-                 the beginning; export the model again"
-            )));
+            return Err(config(name_problem(&card.name)));
         }
         Ok(card)
     }
@@ -303,40 +415,20 @@ impl ModelCard {
         Ok(n_elements)
     }
 
-    /// Refuses scales by which nothing can be divided.
-    fn check_scales(&self) -> Result<(), String> {
-        let Self { normalizer, feature_scale, .. } = self;
-        let centres = normalizer.centre.iter().chain(&feature_scale.centre);
-        let scales = normalizer.scale.iter().chain(&feature_scale.scale);
-        if let Some(centre) = centres.into_iter().find(|x| !x.is_finite()) {
-            return Err(format!("a centre is {centre}; export the model again"));
-        }
-        if let Some(scale) = scales.into_iter().find(|x| !(x.is_finite() && **x > 0.0)) {
-            return Err(format!("a scale is {scale}; it must be above 0; export the model again"));
-        }
-        Ok(())
-    }
-
     /// Refuses files that are listed twice, or are larger than what they hold.
     fn check_files(&self, n_elements: &Networks<usize>) -> Result<(), String> {
         let n_table = self.unet.n_steps * self.unet.time_embed_dim;
-        let most = |n_values: usize| 8 * n_values as u64 + MAX_GRAPH_BYTES;
-        let (of_unet, of_decoder) = (most(n_elements.unet + n_table), most(n_elements.decoder));
-        for (i, FileEntry { name, n_bytes, .. }) in self.files.iter().enumerate() {
-            if self.files[..i].iter().any(|before| before.name == *name) {
-                return Err(format!("{name} is listed twice; export the model again"));
+        check_file_list(&self.files, |name| match name {
+            ModelFileName::Unet | ModelFileName::UnetWeights => {
+                Ok(most_bytes(n_elements.unet + n_table))
             }
-            let most = match name {
-                ModelFileName::Unet | ModelFileName::UnetWeights => of_unet,
-                ModelFileName::Decoder | ModelFileName::DecoderWeights => of_decoder,
-            };
-            if *n_bytes > most {
-                return Err(format!(
-                    "{name} has {n_bytes} bytes, a network of these sizes at most {most}; export the model again"
-                ));
+            ModelFileName::Decoder | ModelFileName::DecoderWeights => {
+                Ok(most_bytes(n_elements.decoder))
             }
-        }
-        Ok(())
+            other => Err(format!(
+                "{other} is no file of a model of the family unet; export the model again"
+            )),
+        })
     }
 
     /// Returns the guidance that the model is sampled with unless the user says otherwise.

@@ -7,6 +7,7 @@ mod card;
 mod control;
 mod eager;
 mod engine;
+mod group;
 mod learned;
 mod pool;
 mod retrieval;
@@ -20,11 +21,15 @@ mod windows;
 
 pub use card::{
     CardError, FileEntry, MAX_CARD_BYTES, MODEL_FORMAT, ModelCard, ModelFileName, Networks,
-    Provenance, SamplingDefaults, file_names, is_name, own_channels, own_features,
+    Provenance, SamplingDefaults, family_of, file_names, is_name, own_channels, own_features,
 };
 pub use control::{Constraints, ControlError, Miss, REACH_FRAMES, WantedValue, continuing, facing};
 pub use eager::EagerEngine;
 pub use engine::{Engine, EngineError, EngineInputs};
+pub use group::{
+    GroupCard, GroupEngine, GroupEngineInputs, GroupGenerator, GroupProvenance, GroupTrack,
+    consistency_factor,
+};
 pub use learned::{LearnedFrom, MusicDigests, MusicSplit, Purpose, ShortDigest};
 pub use pool::Pool;
 pub use retrieval::Retrieval;

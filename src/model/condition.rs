@@ -7,6 +7,28 @@ use crate::motion::CLOCK_DIM;
 
 use super::unet::UNetConfig;
 
+/// The numbers of a frame of music that a network hears.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ConditionConfig {
+    /// Features of a frame.
+    pub audio_cond_dim: usize,
+    /// Whether the clock comes behind them.
+    pub clock: bool,
+}
+
+impl ConditionConfig {
+    /// Returns the numbers of a frame: features, then the clock.
+    pub fn dim(self) -> usize {
+        self.audio_cond_dim + if self.clock { CLOCK_DIM } else { 0 }
+    }
+}
+
+impl From<&UNetConfig> for ConditionConfig {
+    fn from(config: &UNetConfig) -> Self {
+        Self { audio_cond_dim: config.audio_cond_dim, clock: config.clock }
+    }
+}
+
 /// Returns the condition of a network for features, \[T, 163\], and a clock, \[T, 10\]: \[T, condition_dim\].
 ///
 /// A network without a clock hears the features alone; one with a clock hears zeros where none is known.
@@ -14,11 +36,11 @@ use super::unet::UNetConfig;
 /// # Panics
 /// When features and clock have other numbers of frames.
 pub fn condition(
-    config: &UNetConfig,
+    config: impl Into<ConditionConfig>,
     features: ArrayView2<f32>,
     clock: Option<ArrayView2<f32>>,
 ) -> Array2<f32> {
-    if !config.clock {
+    if !config.into().clock {
         return features.to_owned();
     }
     let unknown = Array2::zeros((features.nrows(), CLOCK_DIM));
@@ -27,9 +49,12 @@ pub fn condition(
 }
 
 /// Returns the scale of a network's condition: that of the features; the clock keeps its unit.
-pub fn condition_scale(config: &UNetConfig, features: &FeatureScale) -> FeatureScale {
+pub fn condition_scale(
+    config: impl Into<ConditionConfig>,
+    features: &FeatureScale,
+) -> FeatureScale {
     let mut scale = features.clone();
-    let n = config.condition_dim();
+    let n = config.into().dim();
     scale.centre.resize(n, 0.0);
     scale.scale.resize(n, 1.0);
     scale

@@ -291,6 +291,57 @@ pub trait Graph: Sized {
     /// Takes every `stride`-th frame of a mask, from the first on.
     fn stride_mask(&mut self, mask: &Self::Tensor, stride: usize) -> Result<Self::Tensor>;
 
+    /// The same numbers in the same order, in as many samples as `like` has: folds the dancers of a group from the
+    /// batch into the frames, and unfolds them.
+    ///
+    /// \[rows, frames, …\], like \[batch, …\] → \[batch, rows · frames / batch, …\]
+    fn rebatch(&mut self, x: &Self::Tensor, like: &Self::Tensor) -> Result<Self::Tensor>;
+
+    /// Each sample repeated, one after the other, to as many as `like` has.
+    ///
+    /// \[batch, …\], like \[rows, …\], rows a multiple of batch → \[rows, …\]
+    fn repeat_batch(&mut self, x: &Self::Tensor, like: &Self::Tensor) -> Result<Self::Tensor>;
+
+    /// Puts frames one after the other; a vector, \[batch, channels\], is one frame.
+    fn concat_frames(&mut self, parts: &[&Self::Tensor]) -> Result<Self::Tensor>;
+
+    /// Takes `n` frames from the frame `first` on, or all behind it.
+    fn frames(
+        &mut self,
+        x: &Self::Tensor,
+        first: usize,
+        n: Option<usize>,
+    ) -> Result<Self::Tensor>;
+
+    /// Puts `n` tokens, which count, before the frames of a mask: \[batch, frames\] → \[batch, n + frames\].
+    fn token_mask(&mut self, mask: &Self::Tensor, n: usize) -> Result<Self::Tensor>;
+
+    /// (bias + s) x + h, a scale and a shift for each sample.
+    ///
+    /// `x`: \[batch, frames, channels\]; `film`: \[batch, 2 channels\], s then h. With bias 1 Perez et al., "FiLM",
+    /// AAAI 2018; with bias 0 the affine part of AdaIN (Huang and Belongie, ICCV 2017, eq. 8).
+    fn modulate(
+        &mut self,
+        x: &Self::Tensor,
+        film: &Self::Tensor,
+        bias: f64,
+    ) -> Result<Self::Tensor>;
+
+    /// (x − μ) / √(σ² + ε), μ and σ² of each channel over the frames of a sample that count, \[batch, frames\].
+    fn normalize_frames(
+        &mut self,
+        x: &Self::Tensor,
+        mask: Option<&Self::Tensor>,
+        epsilon: f64,
+    ) -> Result<Self::Tensor>;
+
+    /// Mean over the frames of a sample that count: \[batch, frames, channels\] → \[batch, channels\].
+    fn mean_frames(
+        &mut self,
+        x: &Self::Tensor,
+        mask: Option<&Self::Tensor>,
+    ) -> Result<Self::Tensor>;
+
     /// Runs a part of the network whose inner values need not be kept for its gradient.
     ///
     /// An interpreter that differentiates runs the part again when its gradient is due (Chen et al.,

@@ -332,6 +332,72 @@ impl Graph for Outline<'_> {
             .collect())
     }
 
+    fn rebatch(&mut self, x: &Vec<usize>, like: &Vec<usize>) -> Result<Vec<usize>> {
+        let (Some([rows, frames]), Some(&batch)) = (x.first_chunk(), like.first()) else {
+            let problem = format!("input has shape {x:?}, expected [rows, frames, channels]");
+            return Err(GraphError::shape("rebatch", problem));
+        };
+        if batch == 0 || !(rows * frames).is_multiple_of(batch) {
+            let problem =
+                format!("{rows} × {frames} frames cannot be split into {batch} samples alike");
+            return Err(GraphError::shape("rebatch", problem));
+        }
+        let mut shape = x.clone();
+        (shape[0], shape[1]) = (batch, rows * frames / batch);
+        Ok(self.result(shape))
+    }
+
+    fn repeat_batch(&mut self, x: &Vec<usize>, like: &Vec<usize>) -> Result<Vec<usize>> {
+        let mut shape = x.clone();
+        if let (Some(rows), Some(&n)) = (shape.first_mut(), like.first()) {
+            *rows = n;
+        }
+        Ok(self.result(shape))
+    }
+
+    fn concat_frames(&mut self, parts: &[&Vec<usize>]) -> Result<Vec<usize>> {
+        let frames = |x: &&Vec<usize>| if x.len() == 2 { 1 } else { x[1] };
+        let Some(first) = parts.first() else {
+            return Err(GraphError::shape("concat_frames", "there is nothing to join"));
+        };
+        let channels = first.last().copied().unwrap_or_default();
+        let shape = vec![first[0], parts.iter().map(frames).sum(), channels];
+        Ok(self.result(shape))
+    }
+
+    fn frames(&mut self, x: &Vec<usize>, first: usize, n: Option<usize>) -> Result<Vec<usize>> {
+        let [batch, frames, channels] = three("frames", x)?;
+        let taken = n.unwrap_or(frames.saturating_sub(first));
+        Ok(self.result(vec![batch, taken, channels]))
+    }
+
+    fn token_mask(&mut self, mask: &Vec<usize>, n: usize) -> Result<Vec<usize>> {
+        Ok(mask.iter().enumerate().map(|(i, m)| if i == 1 { m + n } else { *m }).collect())
+    }
+
+    fn modulate(
+        &mut self,
+        x: &Vec<usize>,
+        _film: &Vec<usize>,
+        _bias: f64,
+    ) -> Result<Vec<usize>> {
+        Ok(self.result(x.clone()))
+    }
+
+    fn normalize_frames(
+        &mut self,
+        x: &Vec<usize>,
+        _mask: Option<&Vec<usize>>,
+        _epsilon: f64,
+    ) -> Result<Vec<usize>> {
+        Ok(self.result(x.clone()))
+    }
+
+    fn mean_frames(&mut self, x: &Vec<usize>, _mask: Option<&Vec<usize>>) -> Result<Vec<usize>> {
+        let [batch, _, channels] = three("mean_frames", x)?;
+        Ok(self.result(vec![batch, channels]))
+    }
+
     fn checkpoint<F>(&mut self, inputs: &[&Vec<usize>], part: F) -> Result<Vec<usize>>
     where
         F: Fn(&mut Self, &[Vec<usize>]) -> Result<Vec<usize>> + Send + 'static,

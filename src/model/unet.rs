@@ -359,7 +359,7 @@ fn blocks_then_attention<G: Graph>(
 ///
 /// In f64, since the sine of a large angle in f32 is off by 3e-5 (Vaswani et al., "Attention Is All
 /// You Need", NIPS 2017, sec. 3.5, cosines first as in Dhariwal and Nichol's code).
-fn time_table(n_steps: usize, dim: usize) -> Array2<f64> {
+pub(super) fn time_table(n_steps: usize, dim: usize) -> Array2<f64> {
     let half = dim / 2;
     Array2::from_shape_fn((n_steps, dim), |(t, i)| {
         let angle = t as f64 * (-(10_000_f64.ln()) * (i % half) as f64 / half as f64).exp();

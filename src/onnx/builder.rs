@@ -131,8 +131,22 @@ impl<'p> Builder<'p> {
         value
     }
 
+    /// Adds an input whose samples are not those of other inputs.
+    pub fn batched_input(
+        &mut self,
+        name: &str,
+        axes: Axes,
+        batch: &str,
+        channels: usize,
+        meaning: &str,
+    ) -> Value {
+        let value = self.input(name, axes, channels, meaning);
+        self.name_axis(0, batch);
+        value
+    }
+
     /// Names an axis of the input that was added last.
-    fn name_axis(&mut self, axis: usize, name: &str) {
+    pub(super) fn name_axis(&mut self, axis: usize, name: &str) {
         let shape = self.inputs.last_mut().and_then(|info| info.r#type.as_mut());
         let shape = shape.and_then(|t| t.tensor_type.as_mut()).and_then(|t| t.shape.as_mut());
         if let Some(dimension) = shape.and_then(|shape| shape.dim.get_mut(axis)) {

@@ -1,8 +1,10 @@
-//! The two models of an export: the UNet and the decoder, with their inputs and outputs.
+//! The models of an export, with their inputs and outputs: the UNet and the decoder, or the denoiser and the score
+//! of a group.
 
 use crate::audio::FeatureScale;
 use crate::model::{
-    DecoderConfig, Graph as _, MotionDecoder, ParameterId, Result, UNet1D, UNetConfig, UNetInputs,
+    DecoderConfig, Graph as _, GroupConfig, GroupDenoiser, GroupInputs, GroupScore,
+    GroupScoreInputs, MotionDecoder, ParameterId, Result, UNet1D, UNetConfig, UNetInputs,
 };
 use crate::motion::{CLOCK_DIM, MOTION_DIM};
 
@@ -127,4 +129,138 @@ pub fn decoder(
         "position m, velocity m/s, acceleration m/s2, quaternion w x y z, angular velocity rad/s, bar phase, style",
     )?;
     Ok(g.finish("decoder"))
+}
+
+/// The inputs and outputs of `denoiser.onnx`.
+#[derive(Clone, Copy, Debug)]
+pub struct GroupNames;
+
+impl GroupNames {
+    pub const X: &'static str = "x_t";
+    pub const T: &'static str = "t";
+    pub const AUDIO: &'static str = "audio";
+    /// Only in networks that hear the clock.
+    pub const CLOCK: &'static str = "clock";
+    /// May be left out.
+    pub const DROP_AUDIO: &'static str = "drop_audio";
+    pub const NUMBER: &'static str = "number";
+    pub const Z: &'static str = "z";
+    pub const X0: &'static str = "x0";
+    pub const W: &'static str = "w";
+}
+
+/// The inputs and the output of `score.onnx`.
+#[derive(Clone, Copy, Debug)]
+pub struct GroupScoreNames;
+
+impl GroupScoreNames {
+    pub const X0: &'static str = "x0";
+    pub const T: &'static str = "t";
+    pub const W: &'static str = "w";
+    pub const NUMBER: &'static str = "number";
+    pub const LOG_RATIO: &'static str = "log_ratio";
+}
+
+/// What the row of the number of dancers means.
+const NUMBER: &str = "dancers of each group less 1, at most the largest number in training less 1";
+
+/// Writes the denoiser of a group: x_t, t, the music and the noise of the group → clean motion and the embedding of
+/// the group.
+///
+/// All groups of a batch have as many dancers as the batches of x_t and t say. Features come as the `features` table
+/// has them and are scaled within.
+///
+/// # Errors
+/// A configuration of which no network can be made.
+pub fn group_denoiser(
+    config: &GroupConfig,
+    weights: &dyn Fn(ParameterId) -> Vec<f32>,
+    scale: &FeatureScale,
+    storage: Storage,
+) -> Result<Graph> {
+    let (denoiser, list) = GroupDenoiser::new(config);
+    let mut g = Builder::new(&list, weights, Form::default(), storage);
+    let x = g.batched_input(
+        GroupNames::X,
+        Axes::Frames,
+        "dancers",
+        config.motion_dim,
+        "noisy motion, normalised, group by group and dancer by dancer, 30 frames a second",
+    );
+    let t =
+        g.integer_input(GroupNames::T, Axes::Batch, "step of the diffusion, 0 the least noisy");
+    let audio = g.input(
+        GroupNames::AUDIO,
+        Axes::Frames,
+        config.audio_cond_dim,
+        "features of the music as motiongen extract writes them",
+    );
+    let clock = config.clock.then(|| {
+        g.input(
+            GroupNames::CLOCK,
+            Axes::Frames,
+            CLOCK_DIM,
+            "cos and sin of 2 pi n bars for n = 1, 2, 3 and the beats of a bar, ln(tempo / 120), 1 where known; \
+             zeros where unknown",
+        )
+    });
+    let drop_audio = g.optional_input(
+        GroupNames::DROP_AUDIO,
+        Axes::Batch,
+        0,
+        "1 for groups that go without music, 0 where left out",
+    );
+    let number = g.integer_input(GroupNames::NUMBER, Axes::Batch, NUMBER);
+    let z = g.input(
+        GroupNames::Z,
+        Axes::Samples,
+        config.width,
+        "noise of the group embedding, standard normal; the same for all windows of a track",
+    );
+    let features = g.standardized(audio, &scale.centre, &scale.scale)?;
+    let audio = match &clock {
+        Some(clock) => g.concat(&[&features, clock])?,
+        None => features,
+    };
+    let inputs = GroupInputs {
+        x: &x,
+        t: &t,
+        audio: &audio,
+        drop_audio: Some(&drop_audio),
+        number: &number,
+        z: &z,
+        mask: None,
+    };
+    let found = denoiser.forward(&mut g, &inputs)?;
+    g.output(GroupNames::X0, found.x0, "clean motion, normalised")?;
+    g.output(GroupNames::W, found.w, "embedding of the group, for score.onnx")?;
+    Ok(g.finish("denoiser"))
+}
+
+/// Writes the score of a group: an estimate of clean motion and the embedding of a group → log f.
+///
+/// # Errors
+/// A configuration of which no network can be made.
+pub fn group_score(
+    config: &GroupConfig,
+    weights: &dyn Fn(ParameterId) -> Vec<f32>,
+    storage: Storage,
+) -> Result<Graph> {
+    let (score, list) = GroupScore::new(config);
+    let mut g = Builder::new(&list, weights, Form::default(), storage);
+    let x0 = g.batched_input(
+        GroupScoreNames::X0,
+        Axes::Frames,
+        "dancers",
+        config.motion_dim,
+        "clean motion, normalised, group by group and dancer by dancer",
+    );
+    let t = g.integer_input(GroupScoreNames::T, Axes::Batch, "step that each dancer is of");
+    g.name_axis(0, "dancers");
+    let w = g.input(GroupScoreNames::W, Axes::Samples, config.width, "embedding of the group");
+    let number = g.integer_input(GroupScoreNames::NUMBER, Axes::Batch, NUMBER);
+    let inputs = GroupScoreInputs { x0: &x0, t: &t, w: &w, number: &number, mask: None };
+    let y = score.forward(&mut g, &inputs)?;
+    g.output(GroupScoreNames::LOG_RATIO, y, "log of p(motion | group) / p(motion), up to a constant")?;
+    Ok(g.finish("score"))
 }

@@ -437,4 +437,119 @@ impl Graph for Builder<'_> {
         let y = self.node("Slice", &[&name, &starts, &ends, &axes, &steps], vec![]);
         Ok(self.new_last(Axes::Mask, 0, y))
     }
+
+    fn rebatch(&mut self, x: &Value, like: &Value) -> Result<Value> {
+        self.begin("rebatch", None);
+        let (name, batch) = (self.last(*x)?, self.batch_of(*like)?);
+        let rest: &[i64] = match x.axes {
+            Axes::Frames => &[-1, x.channels as i64],
+            _ => &[-1],
+        };
+        let rest = self.integers(rest);
+        let shape = self.node("Concat", &[&batch, &rest], vec![integer("axis", 0)]);
+        let y = self.node("Reshape", &[&name, &shape], vec![]);
+        Ok(self.new_last(x.axes, x.channels, y))
+    }
+
+    fn repeat_batch(&mut self, x: &Value, like: &Value) -> Result<Value> {
+        self.begin("repeat_batch", None);
+        let (name, rows) = (self.last(*x)?, self.batch_of(*like)?);
+        let batch = self.node("Shape", &[&name], vec![integer("start", 0), integer("end", 1)]);
+        let times = self.node("Div", &[&rows, &batch], vec![]);
+        let one = self.integers(&[1]);
+        // [batch, …] → [batch, 1, …] → [batch, times, …] → [rows, …]
+        let apart = self.node("Unsqueeze", &[&name, &one], vec![]);
+        let behind = self.node("Shape", &[&name], vec![integer("start", 1)]);
+        let shape =
+            self.node("Concat", &[&batch, &times, &behind], vec![integer("axis", 0)]);
+        let repeated = self.node("Expand", &[&apart, &shape], vec![]);
+        let shape = self.node("Concat", &[&rows, &behind], vec![integer("axis", 0)]);
+        let y = self.node("Reshape", &[&repeated, &shape], vec![]);
+        Ok(self.new_last(x.axes, x.channels, y))
+    }
+
+    fn concat_frames(&mut self, parts: &[&Value]) -> Result<Value> {
+        self.begin("concat_frames", None);
+        let Some(&&one) = parts.first() else {
+            return Err(GraphError::shape("concat_frames", "there is nothing to join"));
+        };
+        let axes = self.integers(&[1]);
+        let mut names = Vec::with_capacity(parts.len());
+        for part in parts {
+            let name = self.last(**part)?;
+            names.push(match part.axes {
+                Axes::Samples => self.node("Unsqueeze", &[&name, &axes], vec![]),
+                _ => name,
+            });
+        }
+        let names: Vec<&str> = names.iter().map(String::as_str).collect();
+        let y = self.node("Concat", &names, vec![integer("axis", 1)]);
+        Ok(self.new_last(Axes::Frames, one.channels, y))
+    }
+
+    fn frames(&mut self, x: &Value, first: usize, n: Option<usize>) -> Result<Value> {
+        self.begin("frames", None);
+        expect("frames", *x, Axes::Frames)?;
+        let name = self.last(*x)?;
+        let end = n.map_or(i64::MAX, |n| (first + n) as i64);
+        let [starts, ends, axes] = [first as i64, end, 1].map(|n| self.integers(&[n]));
+        let y = self.node("Slice", &[&name, &starts, &ends, &axes], vec![]);
+        Ok(self.new_last(Axes::Frames, x.channels, y))
+    }
+
+    fn token_mask(&mut self, mask: &Value, n: usize) -> Result<Value> {
+        self.begin("token_mask", None);
+        expect("token_mask", *mask, Axes::Mask)?;
+        let name = self.last(*mask)?;
+        let (pads, axes) = (self.integers(&[n as i64, 0]), self.integers(&[1]));
+        let one = self.number(1.0);
+        let y = self.node("Pad", &[&name, &pads, &one, &axes], vec![word("mode", "constant")]);
+        Ok(self.new_last(Axes::Mask, 0, y))
+    }
+
+    fn modulate(&mut self, x: &Value, film: &Value, bias: f64) -> Result<Value> {
+        self.begin("modulate", None);
+        expect("modulate", *film, Axes::Samples)?;
+        let (name, film) = (self.last(*x)?, self.last(*film)?);
+        let axes = self.integers(&[1]);
+        let film = self.node("Unsqueeze", &[&film, &axes], vec![]);
+        let halves = vec![integer("axis", -1), integer("num_outputs", 2)];
+        let halves = self.nodes_of("Split", &[&film], halves, 2);
+        let mut scale = halves[0].clone();
+        if bias != 0.0 {
+            let bias = self.number(bias);
+            scale = self.node("Add", &[&scale, &bias], vec![]);
+        }
+        let y = self.node("Mul", &[&name, &scale], vec![]);
+        let y = self.node("Add", &[&y, &halves[1]], vec![]);
+        Ok(self.new_last(Axes::Frames, x.channels, y))
+    }
+
+    fn normalize_frames(
+        &mut self,
+        x: &Value,
+        mask: Option<&Value>,
+        epsilon: f64,
+    ) -> Result<Value> {
+        self.begin("normalize_frames", None);
+        let name = self.last(*x)?;
+        let mean = self.mean_over_frames(*x, &name, mask)?;
+        let apart = self.node("Sub", &[&name, &mean], vec![]);
+        let squares = self.node("Mul", &[&apart, &apart], vec![]);
+        let variance = self.mean_over_frames(*x, &squares, mask)?;
+        let epsilon = self.number(epsilon);
+        let variance = self.node("Add", &[&variance, &epsilon], vec![]);
+        let deviation = self.node("Sqrt", &[&variance], vec![]);
+        let y = self.node("Div", &[&apart, &deviation], vec![]);
+        Ok(self.new_last(Axes::Frames, x.channels, y))
+    }
+
+    fn mean_frames(&mut self, x: &Value, mask: Option<&Value>) -> Result<Value> {
+        self.begin("mean_frames", None);
+        let name = self.last(*x)?;
+        let mean = self.mean_over_frames(*x, &name, mask)?;
+        let axes = self.integers(&[1]);
+        let y = self.node("Squeeze", &[&mean, &axes], vec![]);
+        Ok(self.new_last(Axes::Samples, x.channels, y))
+    }
 }

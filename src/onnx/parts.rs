@@ -128,6 +128,35 @@ impl Builder<'_> {
         Ok(self.node("Shape", &[&name], ends))
     }
 
+    /// Samples of a value, a vector of one number.
+    pub(super) fn batch_of(&mut self, x: Value) -> Result<String> {
+        let name = self.last(x)?;
+        Ok(self.node("Shape", &[&name], vec![integer("start", 0), integer("end", 1)]))
+    }
+
+    /// The mean of a tensor over the frames of `of` that count, \[batch, 1, channels\].
+    pub(super) fn mean_over_frames(
+        &mut self,
+        of: Value,
+        x: &str,
+        mask: Option<&Value>,
+    ) -> Result<String> {
+        let axes = self.integers(&[1]);
+        let keep = || vec![integer("keepdims", 1)];
+        let Some(mask) = mask else {
+            return Ok(self.node("ReduceMean", &[x, &axes], keep()));
+        };
+        debug_assert_eq!(of.axes, Axes::Frames);
+        let (mask, last) = (self.last(*mask)?, self.integers(&[2]));
+        let mask = self.node("Unsqueeze", &[&mask, &last], vec![]);
+        let counted = self.node("Mul", &[x, &mask], vec![]);
+        let sum = self.node("ReduceSum", &[&counted, &axes], keep());
+        let n = self.node("ReduceSum", &[&mask, &axes], keep());
+        let one = self.number(1.0);
+        let n = self.node("Max", &[&n, &one], vec![]);
+        Ok(self.node("Div", &[&sum, &n], vec![]))
+    }
+
     /// Frames that are missing up to a multiple: (m − n mod m) mod m.
     pub(super) fn n_missing(&mut self, frames: &str, multiple: usize) -> String {
         let m = self.integers(&[multiple as i64]);

@@ -380,7 +380,7 @@ impl<'a> DiffusionInputs<'a> {
 }
 
 /// Returns the condition of a batch, the clock of windows by chance all zeros: not known.
-fn without_clock(batch: &Batch, probability: f64) -> Cow<'_, [f32]> {
+pub(super) fn without_clock(batch: &Batch, probability: f64) -> Cow<'_, [f32]> {
     let window = batch.audio.len() / batch.n_windows.max(1);
     let width = window / batch.n_frames.max(1);
     let mut audio = Cow::Borrowed(batch.audio.as_slice());
@@ -460,6 +460,8 @@ mod tests {
         let batch = Batch {
             n_windows: 2,
             n_frames: frames,
+            n_slots: 1,
+            n_dancers: vec![1, 1],
             motion: vec![0.0; 2 * frames * MOTION_DIM],
             audio: (0..2 * frames * width).map(|i| 1.0 + i as f32).collect(),
             mask: vec![1.0; 2 * frames],

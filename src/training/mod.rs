@@ -15,6 +15,7 @@ mod ema;
 mod error;
 mod estimate;
 mod finetune;
+mod group;
 mod journal;
 mod learning_rate;
 mod loader;
@@ -39,6 +40,9 @@ pub use ema::{Ema, EmaConfig};
 pub use error::TrainingError;
 pub use estimate::EstimateLosses;
 pub use finetune::{EndToEndLosses, FinetuneLearner};
+pub use group::{
+    GROUP, GroupLearner, GroupLosses, GroupNetworkConfig, GroupTrainConfig, GroupTraining,
+};
 pub use journal::{Journal, RowKind};
 pub use learning_rate::{LearningRate, LearningRateSchedule};
 pub use loader::Loader;

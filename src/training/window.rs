@@ -2,12 +2,12 @@
 
 use std::sync::Arc;
 
-use ndarray::{Array2, s};
+use ndarray::{Array2, Axis, concatenate, s};
 use serde::{Deserialize, Serialize};
 
 use crate::audio::{FEATURE_DIM, FeatureScale};
 use crate::autodiff::Stream;
-use crate::model::UNetConfig;
+use crate::model::ConditionConfig;
 use crate::motion::augment::{
     mirror_x, rotate_yaw, stretch_features, stretch_motion, stretched_frames,
 };
@@ -42,7 +42,11 @@ impl Default for Augmentation {
 pub struct Batch {
     pub n_windows: usize,
     pub n_frames: usize,
-    /// Normalised motion, `[n_windows, n_frames, 25]`; beyond a phrase's end its last frame is held.
+    /// Places for dancers in every window; 1 for soloists.
+    pub n_slots: usize,
+    /// Dancers of each window, in the first of its places.
+    pub n_dancers: Vec<usize>,
+    /// Normalised motion, `[n_windows, n_slots, n_frames, 25]`, 0 in places without a dancer; beyond a phrase's end its last frame is held.
     pub motion: Vec<f32>,
     /// Features in units of their spread and, for a network that hears it, the clock, `[n_windows, n_frames,
     /// condition_dim]`, held likewise.
@@ -51,7 +55,7 @@ pub struct Batch {
     pub mask: Vec<f32>,
     /// Mean of the normalised style channels, `[n_windows, 8]`.
     pub style: Vec<f32>,
-    /// Standard normal noise, `[n_windows, n_frames, 25]`.
+    /// Standard normal noise, `[n_windows, n_slots, n_frames, 25]`.
     pub noise: Vec<f32>,
     pub chances: Vec<Chances>,
     pub phrase_ids: Vec<Arc<str>>,
@@ -71,16 +75,18 @@ pub struct Chances {
 }
 
 impl Batch {
-    fn empty(n_windows: usize, n_frames: usize, condition_dim: usize) -> Self {
+    fn empty(n_windows: usize, n_frames: usize, n_slots: usize, condition_dim: usize) -> Self {
         let zeros = |width: usize| Vec::with_capacity(n_windows * n_frames * width);
         Self {
             n_windows: 0,
             n_frames,
-            motion: zeros(MOTION_DIM),
+            n_slots,
+            n_dancers: Vec::with_capacity(n_windows),
+            motion: zeros(n_slots * MOTION_DIM),
             audio: zeros(condition_dim),
             mask: zeros(1),
             style: Vec::with_capacity(n_windows * STYLE_DIM),
-            noise: zeros(MOTION_DIM),
+            noise: zeros(n_slots * MOTION_DIM),
             chances: Vec::with_capacity(n_windows),
             phrase_ids: Vec::with_capacity(n_windows),
         }
@@ -98,6 +104,8 @@ impl Batch {
         Self {
             n_windows: range.len(),
             n_frames: self.n_frames,
+            n_slots: self.n_slots,
+            n_dancers: self.n_dancers[range.clone()].to_vec(),
             motion: part(&self.motion),
             audio: part(&self.audio),
             mask: part(&self.mask),
@@ -106,6 +114,55 @@ impl Batch {
             chances: self.chances[range.clone()].to_vec(),
             phrase_ids: self.phrase_ids[range.clone()].to_vec(),
         }
+    }
+}
+
+impl Batch {
+    /// Returns how many frames of dancers count.
+    pub(super) fn weight(&self) -> f64 {
+        let frames = self.mask.chunks_exact(self.n_frames.max(1));
+        let of_window = |(mask, &n): (&[f32], &usize)| {
+            n as f64 * mask.iter().map(|&w| f64::from(w)).sum::<f64>()
+        };
+        frames.zip(&self.n_dancers).map(of_window).sum()
+    }
+
+    /// Returns the same windows in order of their number of dancers.
+    pub(super) fn by_number_of_dancers(&self) -> Self {
+        let mut order: Vec<usize> = (0..self.n_windows).collect();
+        order.sort_by_key(|&i| self.n_dancers[i]);
+        let sorted = |values: &[f32]| -> Vec<f32> {
+            let width = values.len() / self.n_windows.max(1);
+            order.iter().flat_map(|&i| &values[i * width..][..width]).copied().collect()
+        };
+        Self {
+            n_windows: self.n_windows,
+            n_frames: self.n_frames,
+            n_slots: self.n_slots,
+            n_dancers: order.iter().map(|&i| self.n_dancers[i]).collect(),
+            motion: sorted(&self.motion),
+            audio: sorted(&self.audio),
+            mask: sorted(&self.mask),
+            style: sorted(&self.style),
+            noise: sorted(&self.noise),
+            chances: order.iter().map(|&i| self.chances[i]).collect(),
+            phrase_ids: order.iter().map(|&i| Arc::clone(&self.phrase_ids[i])).collect(),
+        }
+    }
+
+    /// Returns the same windows with as many places as the largest of their groups needs.
+    pub(super) fn without_empty_slots(self) -> Self {
+        let n_slots = self.n_dancers.iter().copied().max().unwrap_or(1).max(1);
+        if n_slots == self.n_slots {
+            return self;
+        }
+        let size = self.n_frames * MOTION_DIM;
+        let kept = |values: &[f32]| -> Vec<f32> {
+            let windows = values.chunks_exact(self.n_slots * size);
+            windows.flat_map(|window| &window[..n_slots * size]).copied().collect()
+        };
+        let (motion, noise) = (kept(&self.motion), kept(&self.noise));
+        Self { n_slots, motion, noise, ..self }
     }
 }
 
@@ -132,6 +189,8 @@ pub struct Windows {
     n_frames: usize,
     /// Whether windows have the clock beside the features.
     has_clock: bool,
+    /// Places for dancers in every window.
+    n_slots: usize,
     seed: u64,
     /// Training windows of an epoch: the phrase of each; longer phrases have several.
     train: Vec<u32>,
@@ -172,13 +231,15 @@ impl Windows {
             }
         }
         let scales = scales.into();
+        let n_dancers = dataset.phrases().iter().map(|phrase| phrase.n_dancers);
+        let n_slots = n_dancers.max().unwrap_or(1);
         let has_clock = false;
-        Self { dataset, scales, augmentation, n_frames, has_clock, seed, train, validation }
+        Self { dataset, scales, augmentation, n_frames, has_clock, n_slots, seed, train, validation }
     }
 
     /// Gives windows what a network hears: the clock too, where its configuration says so.
-    pub fn heard_by(self, config: &UNetConfig) -> Self {
-        Self { has_clock: config.clock, ..self }
+    pub fn heard_by(self, config: impl Into<ConditionConfig>) -> Self {
+        Self { has_clock: config.into().clock, ..self }
     }
 
     pub fn dataset(&self) -> &Dataset {
@@ -225,12 +286,11 @@ impl Windows {
     /// # Errors
     /// [`StoreError`] when the frames at hand cannot be read.
     pub fn train(&self, windows: &[(u64, u32)]) -> Result<Batch, StoreError> {
-        let mut batch = Batch::empty(windows.len(), self.n_frames, self.condition_dim());
+        let mut batch = Batch::empty(windows.len(), self.n_frames, self.n_slots, self.condition_dim());
         for &(number, phrase) in windows {
             let phrase = &self.dataset.phrases()[phrase as usize];
-            let (motion, audio) = self.augmented(phrase, number)?;
-            let clock = self.has_clock.then(|| phrase.clock_of(motion.view()));
-            self.push(&mut batch, phrase, motion, audio, clock);
+            let (dancers, audio) = self.augmented(phrase, number)?;
+            self.push(&mut batch, phrase, dancers, audio);
             let mut drawn = [0.0_f64; 4];
             Stream::new(self.seed, CHANCES + number).uniform(0, &mut drawn);
             let [step, no_audio, no_style, no_clock] = drawn;
@@ -252,16 +312,16 @@ impl Windows {
     /// # Panics
     /// When there are no validation windows.
     pub fn validation(&self, range: std::ops::Range<usize>) -> Result<Batch, StoreError> {
-        let mut batch = Batch::empty(range.len(), self.n_frames, self.condition_dim());
+        let mut batch = Batch::empty(range.len(), self.n_frames, self.n_slots, self.condition_dim());
         for number in range {
             let (phrase, first) = self.validation[number % self.validation.len()];
             let phrase = &self.dataset.phrases()[phrase as usize];
             let n = self.n_frames.min(phrase.n_frames - first as usize);
-            let motion = self.dataset.motion(phrase, first as usize, n)?;
+            let mut dancers = self.dancers(phrase, first as usize, n)?;
             let mut audio = self.dataset.features(phrase, first as usize, n)?;
             self.scales.features.apply(audio.view_mut());
-            let clock = self.has_clock.then(|| phrase.clock_of(motion.view()));
-            self.push(&mut batch, phrase, placed(motion), audio, clock);
+            place(&mut dancers);
+            self.push(&mut batch, phrase, dancers, audio);
             let step = ((number as f64 + 0.5) * GOLDEN).fract();
             batch.chances.push(Chances { step, no_audio: 1.0, no_style: 1.0, no_clock: 1.0 });
             push_noise(&mut batch, Stream::new(0, VALIDATION_NOISE + number as u64));
@@ -269,12 +329,24 @@ impl Windows {
         Ok(batch)
     }
 
-    /// Cuts a window by chance and changes it by chance.
+    /// Reads frames of all dancers of a phrase.
+    fn dancers(
+        &self,
+        phrase: &Phrase,
+        first: usize,
+        n: usize,
+    ) -> Result<Vec<Array2<f32>>, StoreError> {
+        (0..phrase.n_dancers)
+            .map(|dancer| self.dataset.motion_of(phrase, dancer, first, n))
+            .collect()
+    }
+
+    /// Cuts a window by chance and changes it by chance; returns its dancers and its music.
     fn augmented(
         &self,
         phrase: &Phrase,
         number: u64,
-    ) -> Result<(Array2<f32>, Array2<f32>), StoreError> {
+    ) -> Result<(Vec<Array2<f32>>, Array2<f32>), StoreError> {
         let mut drawn = [0.0_f64; 4];
         Stream::new(self.seed, CROP + number).uniform(0, &mut drawn);
         let [crop, speed, turn, side] = drawn;
@@ -289,19 +361,24 @@ impl Windows {
         };
         let n = n_wanted.min(phrase.n_frames);
         let first = (crop * (phrase.n_frames - n + 1) as f64) as usize;
-        let mut motion = self.dataset.motion(phrase, first, n)?;
+        let mut dancers = self.dancers(phrase, first, n)?;
         let mut audio = self.dataset.features(phrase, first, n)?;
-        if is_stretched && let Ok(stretched) = stretch_motion(motion.view(), rate) {
-            let n = stretched.nrows().min(self.n_frames).min(stretched_frames(n, rate));
-            motion = stretched.slice(s![..n, ..]).to_owned();
+        let stretched: Result<Vec<_>, _> =
+            dancers.iter().map(|motion| stretch_motion(motion.view(), rate)).collect();
+        if is_stretched && let Ok(stretched) = stretched {
+            let n_stretched = stretched.iter().map(|motion| motion.nrows()).min().unwrap_or(n);
+            let n = n_stretched.min(self.n_frames).min(stretched_frames(n, rate));
+            dancers = stretched.iter().map(|motion| motion.slice(s![..n, ..]).to_owned()).collect();
             audio = stretch_features(audio.view(), rate, n);
         }
-        let mut motion = placed(motion);
-        if mirror && side < 0.5 {
-            mirror_x(motion.view_mut());
-        }
-        if yaw_deg > 0.0 {
-            rotate_yaw(&mut motion, (2.0 * turn - 1.0) * yaw_deg.to_radians());
+        place(&mut dancers);
+        for motion in &mut dancers {
+            if mirror && side < 0.5 {
+                mirror_x(motion.view_mut());
+            }
+            if yaw_deg > 0.0 {
+                rotate_yaw(motion, (2.0 * turn - 1.0) * yaw_deg.to_radians());
+            }
         }
         self.scales.features.apply(audio.view_mut());
         if condition_noise > 0.0 {
@@ -311,7 +388,7 @@ impl Windows {
                 *x += condition_noise as f32 * z;
             }
         }
-        Ok((motion, audio))
+        Ok((dancers, audio))
     }
 
     /// Normalises a window and adds it to a batch, its last frame held to the end.
@@ -319,21 +396,28 @@ impl Windows {
         &self,
         batch: &mut Batch,
         phrase: &Phrase,
-        mut motion: Array2<f32>,
+        mut dancers: Vec<Array2<f32>>,
         audio: Array2<f32>,
-        clock: Option<Array2<f32>>,
     ) {
-        let n = motion.nrows();
-        self.scales.motion.normalize(motion.view_mut());
-        let rows = (0..self.n_frames).map(|t| t.min(n - 1));
-        for t in rows {
-            batch.motion.extend(motion.row(t));
+        let n = audio.nrows().min(dancers[0].nrows());
+        // Every dancer has the phase of the music.
+        let clock = self.has_clock.then(|| phrase.clock_of(dancers[0].view()));
+        for motion in &mut dancers {
+            self.scales.motion.normalize(motion.view_mut());
+            for t in (0..self.n_frames).map(|t| t.min(n - 1)) {
+                batch.motion.extend(motion.row(t));
+            }
+        }
+        let n_absent = self.n_slots - dancers.len();
+        batch.motion.extend(std::iter::repeat_n(0.0, n_absent * self.n_frames * MOTION_DIM));
+        for t in (0..self.n_frames).map(|t| t.min(n - 1)) {
             batch.audio.extend(audio.row(t));
             batch.audio.extend(clock.iter().flat_map(|clock| clock.row(t)));
         }
         batch.mask.extend((0..self.n_frames).map(|t| if t < n { 1.0 } else { 0.0 }));
-        let style = motion.slice(s![.., Channel::Style.range()]);
+        let style = dancers[0].slice(s![.., Channel::Style.range()]);
         batch.style.extend(style.columns().into_iter().map(|column| column.sum() / n as f32));
+        batch.n_dancers.push(dancers.len());
         batch.phrase_ids.push(Arc::clone(&phrase.id));
         batch.n_windows += 1;
     }
@@ -342,17 +426,20 @@ impl Windows {
 /// Adds the noise of one more window.
 fn push_noise(batch: &mut Batch, stream: Stream) {
     let first = batch.noise.len();
-    batch.noise.resize(first + batch.n_frames * MOTION_DIM, 0.0);
+    batch.noise.resize(first + batch.n_slots * batch.n_frames * MOTION_DIM, 0.0);
     stream.normal(0, &mut batch.noise[first..]);
 }
 
-/// Takes the placement of the first frame off.
-fn placed(mut motion: Array2<f32>) -> Array2<f32> {
-    if let Some(placement) = Placement::of_first(motion.view()) {
-        placement.remove(&mut motion);
+/// Puts dancers where a network expects them: a soloist at the origin, facing +Z, in the first frame. A group stays on
+/// its stage, whose middle is the origin and whose front is +Z, so that windows of one track have one place.
+fn place(dancers: &mut [Array2<f32>]) {
+    if let [soloist] = dancers
+        && let Some(placement) = Placement::of_first(soloist.view())
+    {
+        placement.remove(soloist);
     }
-    motion
 }
+
 
 /// Most frames that a normalizer is fitted to; more say nothing new.
 const MAX_FITTED_FRAMES: usize = 1 << 20;
@@ -390,7 +477,13 @@ pub fn fit_scales(
         )
     };
     let motion = gather(MOTION_DIM, MAX_FITTED_FRAMES, &|phrase, first, n| {
-        Ok(placed(dataset.motion(phrase, first, n)?))
+        let dancers = 0..phrase.n_dancers;
+        let mut dancers: Vec<_> = dancers
+            .map(|dancer| dataset.motion_of(phrase, dancer, first, n))
+            .collect::<Result<_, StoreError>>()?;
+        place(&mut dancers);
+        let views: Vec<_> = dancers.iter().map(|motion| motion.view()).collect();
+        Ok(concatenate(Axis(0), &views).expect("invariant: motions of one width"))
     })?;
     let features = gather(FEATURE_DIM, MAX_FITTED_FRAMES / 8, &|phrase, first, n| {
         dataset.features(phrase, first, n)

@@ -33,6 +33,11 @@ enum Choice {
         skip: usize,
         drop: usize,
     },
+    /// Some, from the first on, or all behind it.
+    From {
+        first: usize,
+        n: Option<usize>,
+    },
     /// Those that come later, or earlier; past the first and the last that is not spared, that one.
     Shifted {
         shift: isize,
@@ -54,6 +59,11 @@ impl TakeFrames {
     /// The first frames, as many as the second input has.
     pub fn crop() -> Self {
         Self::new("crop_frames", Choice::Crop)
+    }
+
+    /// `n` frames from the frame `first` on, or all behind it.
+    pub fn from(first: usize, n: Option<usize>) -> Self {
+        Self::new("frames", Choice::From { first, n })
     }
 
     /// All frames but the first `skip` and the last `drop`.
@@ -102,6 +112,17 @@ impl<E: Element> Operation<E> for TakeFrames {
             Choice::Shifted { shift, spare } => {
                 let last = (frames - 1).saturating_sub(spare);
                 (0..frames).map(|i| i.saturating_add_signed(shift).min(last)).collect()
+            }
+            Choice::From { first, n } if first + n.unwrap_or(1) <= frames => {
+                (first..n.map_or(frames, |n| first + n)).collect()
+            }
+            Choice::From { first, n } => {
+                let asked = match n {
+                    Some(n) => format!("{n} from frame {first} on"),
+                    None => format!("those from frame {first} on"),
+                };
+                let problem = format!("input has {frames} frames, {asked} asked for");
+                return Err(GraphError::shape(self.name, problem));
             }
             Choice::Inner { skip, drop } if skip + drop < frames => (skip..frames - drop).collect(),
             Choice::Inner { skip, drop } => {

@@ -3,7 +3,8 @@
 use serde::{Deserialize, Serialize};
 
 use crate::audio::FEATURE_DIM;
-use crate::motion::{CLOCK_DIM, MOTION_DIM};
+use crate::model::condition::ConditionConfig;
+use crate::motion::MOTION_DIM;
 
 /// The sizes of a [`UNet1D`](super::UNet1D).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -103,7 +104,7 @@ impl Preset {
 impl UNetConfig {
     /// Returns the numbers of a frame of the condition: features, then the clock.
     pub fn condition_dim(&self) -> usize {
-        self.audio_cond_dim + if self.clock { CLOCK_DIM } else { 0 }
+        ConditionConfig::from(self).dim()
     }
 
     /// Returns the heads of attention at a width.

@@ -12,7 +12,7 @@ use crate::generation::{
     FileEntry, LearnedFrom, MODEL_FORMAT, ModelCard, ModelFileName, Networks, Provenance,
     SamplingDefaults, own_channels, own_features,
 };
-use crate::model::ParameterId;
+use crate::model::{Family, ParameterId};
 use crate::motion::rates::MotionRange;
 use crate::onnx::{EncodedModel, Form, Model, ModelFile, OnnxError, check, decoder, unet};
 use crate::stages::model_files::sha256;
@@ -54,6 +54,7 @@ impl ExportedFiles {
         ];
         let mut card = ModelCard {
             format: MODEL_FORMAT,
+            family: Family::Unet,
             name: params.model.clone(),
             program: format!("{} {}", env!("CARGO_PKG_NAME"), env!("CARGO_PKG_VERSION")),
             provenance: Provenance {

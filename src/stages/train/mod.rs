@@ -1,5 +1,6 @@
 //! `train`: the UNet learns to remove noise from motion, then the decoder to make motion of latents.
 
+mod group;
 mod params;
 pub mod session;
 mod summary;
@@ -15,12 +16,12 @@ use super::trained::best;
 use super::{ClientParams, Contract, Progress, Stage, Summary};
 use crate::autodiff::{Arena, Parameters};
 use crate::diffusion::Schedule;
-use crate::model::UNet1D;
+use crate::model::{Family, UNet1D};
 use crate::motion::Normalizer;
 use crate::store::{Lease, Location};
 use crate::training::{
     Augmentation, CheckpointKind, Checkpoints, DecoderLearner, Denoiser, DiffusionLearner, Drive,
-    Journal, Learner, Loader, Plan, State, TrainConfig, TrainingEnd, TrainingError, Windows,
+    GroupLearner, Journal, Learner, Loader, Plan, State, TrainConfig, TrainingEnd, TrainingError, Windows,
 };
 use session::{
     MachineParams, ProgressWatch, check_run_name, claim, claim_path, lease_of, read_phrases, scales,
@@ -108,6 +109,9 @@ impl Stage for Train {
 
     fn run(params: Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
         check_run_name(&params.run)?;
+        if params.config.network.family == Family::Group {
+            return group::run(&params, progress);
+        }
         let config = params.config.config(params.seed);
         config.network.check()?;
         check_numbers(&params, &config)?;
@@ -118,7 +122,7 @@ impl Stage for Train {
             false => Some(lease_of(&store, &params.run, &watch)?),
         };
         let lease = lease.as_ref();
-        let mut run = Run { params: &params, config: &config, store: &store, watch: &watch, lease };
+        let mut run = Run { params: &params, store: &store, watch: &watch, lease };
         let first = run.checkpoints(DiffusionLearner::STAGE);
         ensure!(
             !params.resume || !first.steps(CheckpointKind::Step)?.is_empty(),
@@ -126,10 +130,10 @@ impl Stage for Train {
             params.run
         );
         if params.dry_run {
-            return run.dry_run(progress);
+            return run.dry_run(&config, progress);
         }
         store.sweep();
-        run.train(progress)
+        run.train(&config, progress)
     }
 }
 
@@ -188,7 +192,6 @@ fn check_numbers(params: &Params, config: &TrainConfig) -> anyhow::Result<()> {
 /// A run of the stage.
 struct Run<'a> {
     params: &'a Params,
-    config: &'a TrainConfig,
     store: &'a Location,
     watch: &'a ProgressWatch<'a>,
     lease: Option<&'a Lease>,
@@ -209,10 +212,15 @@ impl<'a> Run<'a> {
 
     /// Removes what the run has left, so that it can begin anew.
     fn clear(&mut self) -> anyhow::Result<()> {
-        for stage in [DiffusionLearner::STAGE, DecoderLearner::STAGE, "finetune"] {
+        for stage in [
+            DiffusionLearner::STAGE,
+            DecoderLearner::STAGE,
+            GroupLearner::STAGE,
+            "finetune",
+        ] {
             self.checkpoints(stage).clear()?;
         }
-        for stage in [DiffusionLearner::STAGE, DecoderLearner::STAGE] {
+        for stage in [DiffusionLearner::STAGE, DecoderLearner::STAGE, GroupLearner::STAGE] {
             self.journal(stage)?.clear()?;
         }
         Journal::open(self.store, "finetune", &self.params.run, "finetune")?.clear()?;
@@ -223,11 +231,15 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    fn dry_run(&self, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
+    fn dry_run(
+        &self,
+        config: &TrainConfig,
+        progress: &dyn Progress,
+    ) -> anyhow::Result<Box<dyn Summary>> {
         let machine = &self.params.machine;
         let phrases =
             read_phrases(self.store, Train::NAME, machine, None, progress, self.watch, true)?;
-        let n_frames = self.config.network.window_frames;
+        let n_frames = config.network.window_frames;
         let windows = Windows::new(
             phrases.dataset,
             Normalizer::identity(),
@@ -235,19 +247,23 @@ impl<'a> Run<'a> {
             n_frames,
             0,
         );
-        let (_, list) = UNet1D::new(&self.config.network.unet);
+        let (_, list) = UNet1D::new(&config.network.unet);
         Ok(Box::new(TrainDryRun {
             run: self.params.run.clone(),
             what: format!("train a UNet of {} parameters", list.n_elements()),
             n_train: windows.n_train(),
             n_validation: windows.n_validation(),
             n_left_out: phrases.left_out.len(),
-            steps_per_epoch: windows.n_train().div_ceil(self.config.diffusion.batch_size),
+            steps_per_epoch: windows.n_train().div_ceil(config.diffusion.batch_size),
         }))
     }
 
-    fn train(&mut self, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
-        let (params, config) = (self.params, self.config);
+    fn train(
+        &mut self,
+        config: &TrainConfig,
+        progress: &dyn Progress,
+    ) -> anyhow::Result<Box<dyn Summary>> {
+        let params = self.params;
         let machine = &params.machine;
         let phrases =
             read_phrases(self.store, Train::NAME, machine, None, progress, self.watch, false)?;
@@ -271,7 +287,7 @@ impl<'a> Run<'a> {
         }
         let patience = params.machine.patience();
         claim(self.store, &params.run, Train::NAME, config, patience, self.watch)?;
-        let end = self.stage(&mut learner, &augmented, &mut account)?;
+        let end = self.stage(config, self.steps_of_diffusion(config.diffusion.batch_size), &mut learner, &augmented, &mut account)?;
         if end == TrainingEnd::Interrupted {
             return Ok(Box::new(account.interrupted(&resume_command(params))));
         }
@@ -295,7 +311,7 @@ impl<'a> Run<'a> {
             params.seed,
         )
         .on(&threads);
-        let end = self.stage(&mut learner, &augmented, &mut account)?;
+        let end = self.stage(config, self.steps_of_decoder(config), &mut learner, &augmented, &mut account)?;
         if end == TrainingEnd::Interrupted {
             return Ok(Box::new(account.interrupted(&resume_command(params))));
         }
@@ -303,17 +319,23 @@ impl<'a> Run<'a> {
     }
 
     /// Trains one network, from its newest checkpoint on.
-    fn stage<L: Learner>(
+    fn stage<L, C>(
         &self,
+        config: &C,
+        steps: StageBudget,
         learner: &mut L,
         windows: &Arc<Windows>,
         account: &mut TrainSummary,
-    ) -> anyhow::Result<TrainingEnd> {
+    ) -> anyhow::Result<TrainingEnd>
+    where
+        L: Learner,
+        C: Clone + serde::Serialize + serde::de::DeserializeOwned,
+    {
         let checkpoints = self.checkpoints(L::STAGE);
-        let plan = self.plan::<L>(windows);
+        let plan = self.plan(steps, windows);
         let state = State::new(
             L::STAGE,
-            self.config.clone(),
+            config.clone(),
             windows.dataset().fingerprint(),
             windows.scales().clone(),
         );
@@ -338,18 +360,27 @@ impl<'a> Run<'a> {
         Ok(end)
     }
 
-    fn plan<L: Learner>(&self, windows: &Windows) -> Plan {
+    /// Returns how long a denoiser is trained, which has the budget but for the decoder's share.
+    fn steps_of_diffusion(&self, batch_size: usize) -> StageBudget {
+        let b = &self.params.budget;
+        let is_bounded = b.steps.is_some() || b.minutes.is_some();
+        let n_epochs = b.epochs.or_else(|| (!is_bounded).then_some(100));
+        StageBudget { n_steps: b.steps, n_epochs, share: 1.0 - DECODER_SHARE, batch_size }
+    }
+
+    fn steps_of_decoder(&self, config: &TrainConfig) -> StageBudget {
+        StageBudget {
+            n_steps: Some(self.params.budget.decoder_steps),
+            n_epochs: None,
+            share: DECODER_SHARE,
+            batch_size: config.decoder.batch_size,
+        }
+    }
+
+    fn plan(&self, steps: StageBudget, windows: &Windows) -> Plan {
         let b = &self.params.budget;
         let minutes = |m: f64| Duration::try_from_secs_f64(m * 60.0).unwrap_or(Duration::MAX);
-        let is_decoder = L::STAGE == DecoderLearner::STAGE;
-        let (n_steps, n_epochs, share, batch_size) = if is_decoder {
-            let steps = Some(b.decoder_steps);
-            (steps, None, DECODER_SHARE, self.config.decoder.batch_size)
-        } else {
-            let is_bounded = b.steps.is_some() || b.minutes.is_some();
-            let epochs = b.epochs.or_else(|| (!is_bounded).then_some(100));
-            (b.steps, epochs, 1.0 - DECODER_SHARE, self.config.diffusion.batch_size)
-        };
+        let StageBudget { n_steps, n_epochs, share, batch_size } = steps;
         Plan {
             n_steps,
             n_epochs,
@@ -365,6 +396,15 @@ impl<'a> Run<'a> {
             store_patience: self.params.machine.patience(),
         }
     }
+}
+
+/// How long a network is trained: by steps, epochs, or its share of the time.
+#[derive(Clone, Copy, Debug)]
+struct StageBudget {
+    n_steps: Option<u64>,
+    n_epochs: Option<u64>,
+    share: f64,
+    batch_size: usize,
 }
 
 /// Takes up the newest checkpoint that can be read, if there is one.

@@ -3,18 +3,22 @@
 use std::num::NonZeroUsize;
 
 use crate::diffusion::{BetaSchedule, DiffusionConfig, LossType, Prediction};
-use crate::model::{DecoderConfig, Preset, UNetConfig};
+use crate::model::{DecoderConfig, Family, GroupConfig, Preset, UNetConfig};
 use crate::motion::ChannelLimits;
 use crate::motion::style::STYLE_DIM;
 use crate::training::{
     Augmentation, ChannelWeights, DecoderTraining, DiffusionTraining, EmaConfig, EstimateLosses,
-    LearningRate, LearningRateSchedule, NetworkConfig, Objective, OptimizerConfig, TrainConfig,
+    GroupLosses, GroupNetworkConfig, GroupTrainConfig, GroupTraining, LearningRate, LearningRateSchedule, NetworkConfig, Objective, OptimizerConfig, TrainConfig,
 };
 
 /// Sizes of the networks; each wins over the preset.
 #[derive(Clone, Debug, clap::Args)]
 pub struct NetworkParams {
-    /// Size of the UNet.
+    /// Kind of the networks: a UNet and a decoder for one dancer, or a transformer and a score for groups of dancers,
+    /// which learns from phrases of two dancers and more (docs/groups.md).
+    #[arg(long, value_enum, default_value_t = Family::Unet, help_heading = "Networks")]
+    pub family: Family,
+    /// Size of the networks.
     #[arg(long, value_enum, default_value_t = Preset::Small, help_heading = "Networks")]
     pub preset: Preset,
     /// Channels of each level, 256,512,… [default: the preset's]
@@ -145,6 +149,23 @@ pub struct DiffusionParams {
     pub style_dropout: f64,
 }
 
+/// What a model of groups learns beside clean motion.
+#[derive(Clone, Debug, clap::Args)]
+pub struct GroupParams {
+    /// Weight of points fixed to each body, in 1/m².
+    #[arg(long, value_name = "X", default_value_t = GroupLosses::default().markers,
+          help_heading = "Groups")]
+    pub markers_loss: f64,
+    /// Weight of telling a group from mixed ones, by which --consistency works.
+    #[arg(long, value_name = "X", default_value_t = GroupLosses::default().contrast,
+          help_heading = "Groups")]
+    pub contrast_loss: f64,
+    /// Mixed groups beside each group.
+    #[arg(long, value_name = "N", default_value_t = GroupLosses::default().n_negatives,
+          help_heading = "Groups")]
+    pub negatives: usize,
+}
+
 /// What makes more of each phrase.
 #[derive(Clone, Debug, clap::Args)]
 pub struct AugmentationParams {
@@ -246,6 +267,8 @@ pub struct ConfigParams {
     #[command(flatten)]
     pub diffusion: DiffusionParams,
     #[command(flatten)]
+    pub group: GroupParams,
+    #[command(flatten)]
     pub augmentation: AugmentationParams,
     #[command(flatten)]
     pub optimizer: OptimizerParams,
@@ -315,7 +338,7 @@ impl NetworkParams {
 impl ConfigParams {
     /// Returns the configuration that the flags make.
     pub fn config(&self, seed: u64) -> TrainConfig {
-        let Self { network, diffusion: d, augmentation: a, optimizer: o, rare } = self;
+        let Self { network, diffusion: d, augmentation: a, optimizer: o, rare, .. } = self;
         let positive = |x: f64| (x > 0.0).then_some(x);
         let ema = EmaConfig { decay: o.ema_decay, every: o.ema_update_every };
         let beta =
@@ -385,5 +408,43 @@ impl ConfigParams {
                 sampler_steps: rare.decoder_sampler_steps,
             },
         }
+    }
+
+    /// Returns the configuration of a model of groups that the flags make; none for a preset that it does not have.
+    pub fn group_config(&self, seed: u64) -> Option<GroupTrainConfig> {
+        let sizes = GroupConfig::of(self.network.preset)?;
+        let TrainConfig { network, diffusion, .. } = self.config(seed);
+        let GroupParams { markers_loss, contrast_loss, negatives } = self.group;
+        Some(GroupTrainConfig {
+            seed,
+            network: GroupNetworkConfig {
+                group: GroupConfig {
+                    clock: !self.network.no_clock,
+                    add_audio: !self.network.attention_only,
+                    dropout: self.network.dropout.unwrap_or(sizes.dropout),
+                    n_steps: network.diffusion.n_steps,
+                    ..sizes
+                },
+                diffusion: network.diffusion,
+                window_frames: network.window_frames,
+            },
+            group: GroupTraining {
+                objective: diffusion.objective,
+                losses: GroupLosses {
+                    markers: markers_loss,
+                    contrast: contrast_loss,
+                    n_negatives: negatives,
+                },
+                augmentation: diffusion.augmentation,
+                condition_dropout: diffusion.condition_dropout,
+                clock_dropout: diffusion.clock_dropout,
+                batch_size: diffusion.batch_size,
+                accumulate: diffusion.accumulate,
+                side_by_side: diffusion.side_by_side,
+                learning_rate: diffusion.learning_rate,
+                optimizer: diffusion.optimizer,
+                ema: diffusion.ema,
+            },
+        })
     }
 }

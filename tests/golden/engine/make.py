@@ -15,6 +15,7 @@ import pathlib
 import sys
 from dataclasses import dataclass, replace
 
+import group
 import network
 import numpy as np
 import ops
@@ -81,6 +82,39 @@ def decoder_case() -> Case:
     return Case(made, {"x": drawn("input.x", 2, 13, 25)}, drawn("input.target", 2, 13, 25))
 
 
+class GroupCase(Case):
+    """Both networks of a group: the distance of the estimate, and how it is told from mixed groups."""
+
+    def loss(self) -> tuple[Tensor, Tensor]:
+        """Returns the estimate, and mean squared distance + 0.5 cross-entropy."""
+        x0, w, logits = self.network(*self.inputs.values())
+        self.more = {"w": w, "logits": logits}
+        present = self.inputs["present"][:, :, None, None]
+        squares = (present * (x0 - self.target) ** 2).sum()
+        simple = squares / (present.sum() * x0.shape[2] * x0.shape[3])
+        labels = torch.zeros(len(logits), dtype=torch.long)
+        return x0, simple + 0.5 * nn.functional.cross_entropy(logits, labels)
+
+
+def group_case() -> GroupCase:
+    config = group.GroupConfig()
+    made = group.Group(config).double().eval()
+    weights.fill(made)
+    batch, n, frames = 2, 3, 9
+    inputs = {
+        "x": drawn("input.x", batch, n, frames, config.motion_dim),
+        "t": torch.tensor([3, 750]),
+        "audio": drawn("input.audio", batch, frames, config.condition_dim),
+        "drop": torch.tensor([0.0, 1.0]).double(),
+        "number": torch.tensor([2, 1]),
+        "z": drawn("input.z", batch, config.width),
+        # The third dancer of the second group is not there.
+        "present": torch.tensor([[1, 1, 1], [1, 1, 0]]).double(),
+        "negatives": torch.tensor([[[0, 3, 2], [3, 4, 1]], [[0, 4, 5], [1, 2, 5]]]),
+    }
+    return GroupCase(made, inputs, drawn("input.target", batch, n, frames, config.motion_dim))
+
+
 def probe(name: str, tensor: Tensor) -> Tensor:
     return torch.from_numpy(weights.uniform(f"probe.{name}", tuple(tensor.shape)))
 
@@ -125,7 +159,7 @@ def check(name: str, case: Case, gradients: dict[str, Tensor]) -> None:
 def differentiated(name: str, case: Case) -> dict[str, np.ndarray]:
     """Returns output, loss and gradients of a case, and the inputs that have no rule."""
     for key, tensor in case.inputs.items():
-        if key in ("x", "audio", "style") and tensor is not None:
+        if key in ("x", "audio", "style", "z") and tensor is not None:
             tensor.requires_grad_()
     output, loss = case.loss()
     loss.backward()
@@ -140,6 +174,8 @@ def differentiated(name: str, case: Case) -> dict[str, np.ndarray]:
         "loss": loss.detach().numpy(),
         **statistics("grad", gradients),
     }
+    if isinstance(case, GroupCase):
+        found |= {key: value.detach().contiguous().numpy() for key, value in case.more.items()}
     is_large = network.count(case.network) > 10_000_000
     for key, tensor in case.inputs.items():
         if tensor is None:
@@ -218,6 +254,7 @@ def main() -> None:
         "unet_small": lambda: unet_case(small, 37, weights.steps(2)),
         "unet_base": lambda: unet_case(base, 24, [417]),
         "decoder": decoder_case,
+        "group_tiny": group_case,
     }
     for name, make in cases.items():
         case = make()

@@ -1,0 +1,282 @@
+//! Normalisation over the frames that count, means over them, and a scale and shift for each sample.
+
+use super::binary::add_assign;
+use crate::autodiff::element::Element;
+use crate::autodiff::operation::{Backward, Operation, Run, expect_axes, expect_size};
+use crate::autodiff::tensor::Tensor;
+use crate::model::{GraphError, Result};
+
+/// Refuses a mask that is not one number for each frame of `x`.
+fn check_mask<E: Element>(operation: &'static str, x: &Tensor<E>, mask: &Tensor<E>) -> Result<()> {
+    if mask.shape() == &x.shape()[..2] {
+        return Ok(());
+    }
+    let problem = format!("mask has shape {:?}, input expects {:?}", mask.shape(), &x.shape()[..2]);
+    Err(GraphError::shape(operation, problem))
+}
+
+/// y\[b, t\] = (bias + s\[b\]) x\[b, t\] + h\[b\]: with bias 1 Perez et al., "FiLM", AAAI 2018; with bias 0 the affine
+/// part of Huang and Belongie, "Arbitrary Style Transfer" (AdaIN), ICCV 2017, eq. 8.
+///
+/// # Shapes
+/// x \[batch, frames, channels\], film \[batch, 2 channels\], s then h → as x
+pub struct Modulate<E: Element> {
+    bias: f64,
+    kept: Option<[Tensor<E>; 2]>,
+}
+
+impl<E: Element> Modulate<E> {
+    /// Returns the operation.
+    pub fn new(bias: f64) -> Self {
+        Self { bias, kept: None }
+    }
+}
+
+impl<E: Element> Operation<E> for Modulate<E> {
+    fn name(&self) -> &'static str {
+        "modulate"
+    }
+
+    fn forward(&mut self, x: &[&Tensor<E>], run: &Run<E>) -> Result<Tensor<E>> {
+        let [x, film] = [x[0], x[1]];
+        expect_axes("modulate", "input", x, 3, "[batch, frames, channels]")?;
+        let (batch, channels) = (x.shape()[0], x.channels());
+        if film.shape() != [batch, 2 * channels] {
+            let wanted = [batch, 2 * channels];
+            let problem =
+                format!("scale and shift have shape {:?}, input expects {wanted:?}", film.shape());
+            return Err(GraphError::shape("modulate", problem));
+        }
+        if run.recording {
+            self.kept = Some([x.clone(), film.clone()]);
+        }
+        let (bias, sample) = (E::from_f64(self.bias), (x.len() / batch.max(1)).max(1));
+        Ok(run.tensor(x.shape(), |y| {
+            let samples = y.chunks_exact_mut(sample).zip(x.data().chunks_exact(sample));
+            for ((y, x), film) in samples.zip(film.data().chunks_exact(2 * channels)) {
+                let (s, h) = film.split_at(channels);
+                for (y, x) in y.chunks_exact_mut(channels).zip(x.chunks_exact(channels)) {
+                    for (((y, &x), &s), &h) in y.iter_mut().zip(x).zip(s).zip(h) {
+                        *y = (bias + s) * x + h;
+                    }
+                }
+            }
+        }))
+    }
+
+    /// dx = (bias + s) dy, ds = Σ_t x dy, dh = Σ_t dy.
+    fn backward(&mut self, mut dy: Tensor<E>, at: &mut Backward<E>) -> Vec<Option<Tensor<E>>> {
+        let [x, film] = self.kept.take().expect("kept by the forward");
+        let channels = x.channels();
+        let sample = (x.len() / x.shape()[0].max(1)).max(1);
+        let d_film = at.needs[1].then(|| {
+            at.tensor(film.shape(), |d| {
+                d.fill(E::ZERO);
+                let samples = x.data().chunks_exact(sample).zip(dy.data().chunks_exact(sample));
+                for (d, (x, dy)) in d.chunks_exact_mut(2 * channels).zip(samples) {
+                    let (ds, dh) = d.split_at_mut(channels);
+                    for (x, dy) in x.chunks_exact(channels).zip(dy.chunks_exact(channels)) {
+                        for ((ds, &x), &dy) in ds.iter_mut().zip(x).zip(dy) {
+                            *ds += x * dy;
+                        }
+                        add_assign(dh, dy);
+                    }
+                }
+            })
+        });
+        let dx = at.needs[0].then(|| {
+            let bias = E::from_f64(self.bias);
+            let samples = dy.data_mut().chunks_exact_mut(sample);
+            for (dy, film) in samples.zip(film.data().chunks_exact(2 * channels)) {
+                for dy in dy.chunks_exact_mut(channels) {
+                    for (dy, &s) in dy.iter_mut().zip(&film[..channels]) {
+                        *dy *= bias + s;
+                    }
+                }
+            }
+            dy
+        });
+        vec![dx, d_film]
+    }
+}
+
+/// (x − μ) / √(σ² + ε), μ and σ² of each channel over the frames of a sample that count.
+///
+/// Frames that do not count are normalised by the same numbers. Of a sample in which none counts, μ = σ² = 0.
+/// Ulyanov et al., "Instance Normalization", arXiv 1607.08022, 2016.
+///
+/// # Shapes
+/// x \[batch, frames, channels\], mask \[batch, frames\] if any → as x
+pub struct NormalizeFrames<E: Element> {
+    epsilon: f64,
+    kept: Option<(Tensor<E>, Vec<f64>)>,
+    weights: Vec<Vec<f64>>,
+}
+
+impl<E: Element> NormalizeFrames<E> {
+    /// Returns the operation.
+    pub fn new(epsilon: f64) -> Self {
+        Self { epsilon, kept: None, weights: Vec::new() }
+    }
+}
+
+/// Returns the share of every frame of each sample in its mean; all zero where none counts.
+fn shares<E: Element>(x: &Tensor<E>, mask: Option<&&Tensor<E>>) -> Vec<Vec<f64>> {
+    let (batch, frames) = (x.shape()[0], x.shape()[1]);
+    let share = |b: usize| {
+        let weights: Vec<f64> = match mask {
+            Some(mask) => {
+                mask.data()[b * frames..][..frames].iter().map(|w| w.to_f64()).collect()
+            }
+            None => vec![1.0; frames],
+        };
+        let total: f64 = weights.iter().sum();
+        let scale = if total > 0.0 { 1.0 / total } else { 0.0 };
+        weights.into_iter().map(|w| w * scale).collect()
+    };
+    (0..batch).map(share).collect()
+}
+
+/// Returns Σ_t w\[t\] f(x\[t, c\], c) of one sample, channel by channel.
+fn weighted_sums<E: Element>(
+    x: &[E],
+    channels: usize,
+    weights: &[f64],
+    f: impl Fn(f64, usize) -> f64,
+) -> Vec<f64> {
+    let mut sums = vec![0.0; channels];
+    for (x, &w) in x.chunks_exact(channels).zip(weights).filter(|(_, w)| **w != 0.0) {
+        for (c, (sum, &x)) in sums.iter_mut().zip(x).enumerate() {
+            *sum += w * f(x.to_f64(), c);
+        }
+    }
+    sums
+}
+
+impl<E: Element> Operation<E> for NormalizeFrames<E> {
+    fn name(&self) -> &'static str {
+        "normalize_frames"
+    }
+
+    fn forward(&mut self, x: &[&Tensor<E>], run: &Run<E>) -> Result<Tensor<E>> {
+        let (x, mask) = (x[0], x.get(1));
+        expect_axes("normalize_frames", "input", x, 3, "[batch, frames, channels]")?;
+        if let Some(mask) = mask {
+            check_mask("normalize_frames", x, mask)?;
+        }
+        let channels = x.channels();
+        expect_size("normalize_frames", "input", "channels", channels.min(1), "a norm", 1)?;
+        let sample = (x.shape()[1] * channels).max(1);
+        let weights = shares(x, mask);
+        let mut rates = Vec::with_capacity(weights.len() * channels);
+        let y = run.tensor(x.shape(), |y| {
+            let samples = y.chunks_exact_mut(sample).zip(x.data().chunks_exact(sample));
+            for ((y, x), weights) in samples.zip(&weights) {
+                let mean = weighted_sums(x, channels, weights, |x, _| x);
+                let variance =
+                    weighted_sums(x, channels, weights, |x, c| (x - mean[c]) * (x - mean[c]));
+                let rate: Vec<f64> =
+                    variance.iter().map(|v| 1.0 / (v + self.epsilon).sqrt()).collect();
+                for (y, x) in y.chunks_exact_mut(channels).zip(x.chunks_exact(channels)) {
+                    for (((y, &x), mean), rate) in y.iter_mut().zip(x).zip(&mean).zip(&rate) {
+                        *y = E::from_f64((x.to_f64() - mean) * rate);
+                    }
+                }
+                rates.extend(rate);
+            }
+        });
+        if run.recording {
+            self.kept = Some((y.clone(), rates));
+            self.weights = weights;
+        }
+        Ok(y)
+    }
+
+    /// With D\[t\] = dy\[t\], r the rate and p\[t\] the share of a frame in the mean:
+    /// dx\[t\] = r (D\[t\] − p\[t\] Σ D − p\[t\] y\[t\] Σ D y).
+    fn backward(&mut self, mut dy: Tensor<E>, at: &mut Backward<E>) -> Vec<Option<Tensor<E>>> {
+        let (y, rates) = self.kept.take().expect("kept by the forward");
+        let channels = y.channels();
+        let sample = (y.shape()[1] * channels).max(1);
+        let dx = at.needs[0].then(|| {
+            let samples = dy.data_mut().chunks_exact_mut(sample).zip(y.data().chunks_exact(sample));
+            for ((dy, y), (weights, rates)) in
+                samples.zip(self.weights.iter().zip(rates.chunks_exact(channels)))
+            {
+                let mut sums = vec![[0.0; 2]; channels];
+                for (dy, y) in dy.chunks_exact(channels).zip(y.chunks_exact(channels)) {
+                    for ((sums, &dy), &y) in sums.iter_mut().zip(dy).zip(y) {
+                        sums[0] += dy.to_f64();
+                        sums[1] += dy.to_f64() * y.to_f64();
+                    }
+                }
+                let rows = dy.chunks_exact_mut(channels).zip(y.chunks_exact(channels));
+                for ((dy, y), &p) in rows.zip(weights) {
+                    for (((dy, &y), sums), rate) in dy.iter_mut().zip(y).zip(&sums).zip(rates) {
+                        let of_moments = p * (sums[0] + y.to_f64() * sums[1]);
+                        *dy = E::from_f64(rate * (dy.to_f64() - of_moments));
+                    }
+                }
+            }
+            dy
+        });
+        let mut found = vec![dx];
+        found.resize_with(at.needs.len(), || None);
+        found
+    }
+}
+
+/// Σ_t w\[t\] x\[t\] / Σ w: the mean over the frames that count; 0 where none does.
+///
+/// # Shapes
+/// x \[batch, frames, channels\], mask \[batch, frames\] if any → \[batch, channels\]
+#[derive(Default)]
+pub struct MeanFrames {
+    weights: Vec<Vec<f64>>,
+}
+
+impl<E: Element> Operation<E> for MeanFrames {
+    fn name(&self) -> &'static str {
+        "mean_frames"
+    }
+
+    fn forward(&mut self, x: &[&Tensor<E>], run: &Run<E>) -> Result<Tensor<E>> {
+        let (x, mask) = (x[0], x.get(1));
+        expect_axes("mean_frames", "input", x, 3, "[batch, frames, channels]")?;
+        if let Some(mask) = mask {
+            check_mask("mean_frames", x, mask)?;
+        }
+        let (batch, channels) = (x.shape()[0], x.channels());
+        expect_size("mean_frames", "input", "channels", channels.min(1), "a mean", 1)?;
+        let sample = (x.shape()[1] * channels).max(1);
+        self.weights = shares(x, mask);
+        Ok(run.tensor(&[batch, channels], |y| {
+            y.fill(E::ZERO);
+            let samples = y.chunks_exact_mut(channels).zip(x.data().chunks_exact(sample));
+            for ((y, x), weights) in samples.zip(&self.weights) {
+                let sums = weighted_sums(x, channels, weights, |x, _| x);
+                y.iter_mut().zip(sums).for_each(|(y, sum)| *y = E::from_f64(sum));
+            }
+        }))
+    }
+
+    fn backward(&mut self, dy: Tensor<E>, at: &mut Backward<E>) -> Vec<Option<Tensor<E>>> {
+        let channels = dy.channels();
+        let frames = self.weights.first().map_or(0, Vec::len);
+        let dx = at.needs[0].then(|| {
+            at.tensor(&[dy.shape()[0], frames, channels], |dx| {
+                let samples = dx.chunks_exact_mut((frames * channels).max(1));
+                let vectors = dy.data().chunks_exact(channels).zip(&self.weights);
+                for (dx, (dy, weights)) in samples.zip(vectors) {
+                    for (dx, &w) in dx.chunks_exact_mut(channels).zip(weights) {
+                        let w = E::from_f64(w);
+                        dx.iter_mut().zip(dy).for_each(|(dx, &dy)| *dx = w * dy);
+                    }
+                }
+            })
+        });
+        let mut found = vec![dx];
+        found.resize_with(at.needs.len(), || None);
+        found
+    }
+}

@@ -1,0 +1,258 @@
+//! The engine of a model of a group: our own interpreter, and our tape where sampling is guided by the score.
+
+use std::num::NonZeroUsize;
+
+use ndarray::{Array2, Array3, ArrayView3};
+
+use crate::audio::FeatureScale;
+use crate::autodiff::op::reduce::{Over, Reduce};
+use crate::autodiff::{
+    Arena, Eager, Gradients, Interpreter, Parameters, Tape, Tensor, Threads,
+};
+use crate::diffusion::Schedule;
+use crate::generation::engine::EngineError;
+use crate::generation::pool::Pool;
+use crate::model::{
+    Graph, GroupConfig, GroupInputs, GroupNetworks, GroupScoreInputs, Result as GraphResult,
+    condition_scale,
+};
+
+/// Runs a model of a group by the interpreter that trains it.
+pub struct GroupEngine {
+    config: GroupConfig,
+    networks: GroupNetworks,
+    parameters: Parameters<f32>,
+    /// Of the condition.
+    scale: FeatureScale,
+    workers: Pool<GroupWorker>,
+}
+
+struct GroupWorker {
+    threads: Threads,
+    arena: Arena<f32>,
+}
+
+/// The inputs of an estimate of B groups of N dancers.
+#[derive(Clone, Copy, Debug)]
+pub struct GroupEngineInputs<'a> {
+    /// Noisy motion, normalised, \[B N, T, 25\].
+    pub x: ArrayView3<'a, f32>,
+    /// Step of all groups.
+    pub t: usize,
+    /// Features as the table has them, then the clock of a network that hears it, \[B, T, condition_dim\].
+    pub audio: ArrayView3<'a, f32>,
+    pub n_dancers: usize,
+    /// Noise of the group embedding, one for all groups, \[d\].
+    pub z: &'a [f32],
+    /// 1 follows the music, more exaggerates it, 0 ignores it.
+    pub guidance: f64,
+    /// Factor of ∇ log f that is added to the estimate; 0 for none. See [`consistency_factor`].
+    pub consistency: f64,
+}
+
+/// Returns by how much ∇_{x_t} log f moves the estimate of clean motion at a step.
+///
+/// The paper moves the mean of the posterior: μ̂ = μ + γ Σ ∇ log f(x_t, w) (section 4.4). With DDIM, whose code base
+/// is the published one's, the gradient goes into ε̂ (Dhariwal and Nichol, "Diffusion Models Beat GANs", NeurIPS 2021,
+/// algorithm 2): ε̂' = ε̂ − √(1−ᾱ) γ ∇ log f. Then x̂0' = (x_t − √(1−ᾱ) ε̂') / √ᾱ = x̂0 + γ (1−ᾱ)/√ᾱ ∇ log f, which
+/// every sampler can use.
+pub fn consistency_factor(schedule: &Schedule, t: usize, gamma: f64) -> f64 {
+    let level = schedule.level(Some(t));
+    gamma * level.noise * level.noise / level.signal
+}
+
+impl GroupEngine {
+    /// Makes an engine of `n_workers` that have `n_threads` each; `parameters` are those of [`GroupNetworks`],
+    /// `scale` is that of the features.
+    ///
+    /// # Errors
+    /// When the system gives no threads.
+    pub fn new(
+        config: &GroupConfig,
+        parameters: Parameters<f32>,
+        scale: &FeatureScale,
+        (n_workers, n_threads): (NonZeroUsize, NonZeroUsize),
+    ) -> std::io::Result<Self> {
+        let worker =
+            |_| Ok(GroupWorker { threads: Threads::start(n_threads)?, arena: Arena::default() });
+        let workers = (0..n_workers.get()).map(worker).collect::<std::io::Result<Vec<_>>>()?;
+        Ok(Self {
+            config: config.clone(),
+            networks: GroupNetworks::new(config).0,
+            parameters,
+            scale: condition_scale(config.condition(), scale),
+            workers: Pool::new(workers),
+        })
+    }
+
+    /// Returns the name that flags and tables use.
+    pub fn name(&self) -> &'static str {
+        "eager"
+    }
+
+    /// Returns how many calls run at once.
+    pub fn n_workers(&self) -> usize {
+        self.workers.len()
+    }
+
+    /// Returns the length of the noise of the group embedding.
+    pub fn embedding_dim(&self) -> usize {
+        self.config.width
+    }
+
+    /// Returns the sizes of the networks.
+    pub fn config(&self) -> &GroupConfig {
+        &self.config
+    }
+
+    /// Estimates clean motion, normalised: \[B N, T, 25\], moved along the gradient of the score where that is asked.
+    ///
+    /// # Errors
+    /// Shapes that do not fit.
+    pub fn predict(&self, inputs: &GroupEngineInputs) -> Result<Array3<f32>, EngineError> {
+        let (groups, frames, dim) = inputs.audio.dim();
+        let expected = [groups * inputs.n_dancers, frames, self.config.motion_dim];
+        for (what, found, expected) in [
+            ("the shape of the noisy motion", inputs.x.shape(), &expected[..]),
+            ("the numbers of a frame of music", &[dim][..], &[self.scale.centre.len()][..]),
+            ("the noise of the group", &[inputs.z.len()][..], &[self.config.width][..]),
+        ] {
+            if found != expected {
+                let (found, expected) = (found.to_vec(), expected.to_vec());
+                return Err(EngineError::Shape { what, found, expected });
+            }
+        }
+        let mut audio = inputs.audio.as_standard_layout().into_owned();
+        let rows = audio.view_mut().into_shape_with_order((groups * frames, dim));
+        self.scale.apply(rows.expect("in order"));
+        let x = inputs.x.as_standard_layout();
+        self.workers.with(|GroupWorker { threads, arena }| {
+            threads.run(|| {
+                let given = Given { inputs, audio: &audio, x: x.as_slice().expect("in order") };
+                if inputs.consistency == 0.0 {
+                    let mut g = Eager::new(&self.parameters, arena);
+                    let x = g.constant(inputs.x.shape(), given.x);
+                    let (x0, _) = self.estimate(&mut g, &given, &x)?;
+                    return Ok(to_array(&x0));
+                }
+                let mut tape = Tape::new(&self.parameters, arena, None);
+                let x = tape.input(inputs.x.shape(), given.x);
+                let (x0, w) = self.estimate(&mut tape, &given, &x)?;
+                let log_f = self.log_ratio(&mut tape, &given, &x0, &w)?;
+                let mut moved = to_array(&x0);
+                drop((x0, w));
+                let mut unused = Gradients::new(&self.parameters);
+                let found = tape.backward(log_f, &mut unused)?;
+                if let Some(gradient) = found.of(&x) {
+                    let factor = inputs.consistency as f32;
+                    moved.iter_mut().zip(gradient.data()).for_each(|(x, &g)| *x += factor * g);
+                }
+                Ok(moved)
+            })
+        })
+    }
+
+    /// Returns log f of each group of clean motion at a step, for motion of one number of dancers.
+    ///
+    /// # Errors
+    /// Shapes that do not fit.
+    pub fn score(&self, inputs: &GroupEngineInputs) -> Result<Vec<f32>, EngineError> {
+        let (groups, frames, dim) = inputs.audio.dim();
+        let mut audio = inputs.audio.as_standard_layout().into_owned();
+        let rows = audio.view_mut().into_shape_with_order((groups * frames, dim));
+        self.scale.apply(rows.expect("in order"));
+        let x = inputs.x.as_standard_layout();
+        self.workers.with(|GroupWorker { threads, arena }| {
+            threads.run(|| {
+                let given = Given { inputs, audio: &audio, x: x.as_slice().expect("in order") };
+                let mut g = Eager::new(&self.parameters, arena);
+                let x = g.constant(inputs.x.shape(), given.x);
+                let (_, w) = self.estimate(&mut g, &given, &x)?;
+                Ok(self.logits(&mut g, &given, &x, &w)?.data().to_vec())
+            })
+        })
+    }
+
+    /// Returns the guided estimate and the group embedding.
+    fn estimate<I: Interpreter<Element = f32>>(
+        &self,
+        g: &mut I,
+        given: &Given,
+        x: &Tensor<f32>,
+    ) -> GraphResult<(Tensor<f32>, Tensor<f32>)> {
+        let Given { inputs, audio, .. } = given;
+        let groups = audio.dim().0;
+        let t = g.constant(&[groups], &vec![inputs.t as f32; groups]);
+        let audio = g.constant(audio.shape(), audio.as_slice().expect("in order"));
+        let number = given.number(g, &self.config);
+        let z: Array2<f32> = Array2::from_shape_fn((groups, inputs.z.len()), |(_, i)| inputs.z[i]);
+        let z = g.constant(z.shape(), z.as_slice().expect("in order"));
+        let mut forward = |drop: f32| {
+            let drop_audio = g.constant(&[groups], &vec![drop; groups]);
+            let inputs = GroupInputs {
+                x,
+                t: &t,
+                audio: &audio,
+                drop_audio: Some(&drop_audio),
+                number: &number,
+                z: &z,
+                mask: None,
+            };
+            self.networks.denoiser.forward(g, &inputs)
+        };
+        let s = inputs.guidance;
+        if s == 0.0 || s == 1.0 {
+            let found = forward(if s == 0.0 { 1.0 } else { 0.0 })?;
+            return Ok((found.x0, found.w));
+        }
+        let (with, without) = (forward(0.0)?, forward(1.0)?);
+        let (with_x0, without_x0) = (g.scale(&with.x0, s)?, g.scale(&without.x0, 1.0 - s)?);
+        Ok((g.add(&with_x0, &without_x0)?, with.w))
+    }
+
+    /// Returns Σ log f over all groups, a scalar.
+    fn log_ratio<I: Interpreter<Element = f32>>(
+        &self,
+        g: &mut I,
+        given: &Given,
+        x0: &Tensor<f32>,
+        w: &Tensor<f32>,
+    ) -> GraphResult<Tensor<f32>> {
+        let logits = self.logits(g, given, x0, w)?;
+        g.apply(Reduce::sum(Over::All), &[&logits])
+    }
+
+    fn logits<I: Interpreter<Element = f32>>(
+        &self,
+        g: &mut I,
+        given: &Given,
+        x0: &Tensor<f32>,
+        w: &Tensor<f32>,
+    ) -> GraphResult<Tensor<f32>> {
+        let rows = x0.shape()[0];
+        let t = g.constant(&[rows], &vec![given.inputs.t as f32; rows]);
+        let number = given.number(g, &self.config);
+        let inputs = GroupScoreInputs { x0, t: &t, w, number: &number, mask: None };
+        self.networks.score.forward(g, &inputs)
+    }
+}
+
+/// Inputs whose music is scaled.
+struct Given<'a> {
+    inputs: &'a GroupEngineInputs<'a>,
+    audio: &'a Array3<f32>,
+    x: &'a [f32],
+}
+
+impl Given<'_> {
+    fn number<I: Interpreter<Element = f32>>(&self, g: &I, config: &GroupConfig) -> Tensor<f32> {
+        let groups = self.audio.dim().0;
+        let row = config.embedded_number(self.inputs.n_dancers) as f32;
+        g.constant(&[groups], &vec![row; groups])
+    }
+}
+
+fn to_array(x: &Tensor<f32>) -> Array3<f32> {
+    let [a, b, c] = x.shape() else { unreachable!("networks return three axes") };
+    Array3::from_shape_vec((*a, *b, *c), x.data().to_vec()).expect("as many as its shape says")
+}

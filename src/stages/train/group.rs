@@ -1,0 +1,143 @@
+//! `train --family group`: a transformer learns to remove noise from the motion of groups, and a score to tell groups
+//! from mixed ones.
+
+use std::sync::Arc;
+
+use anyhow::{Context as _, ensure};
+
+use super::session::{ProgressWatch, claim, lease_of, read_phrases, scales};
+use super::{Params, Run, TrainDryRun, TrainSummary, resume_command};
+use crate::model::{Family, GroupNetworks};
+use crate::motion::Normalizer;
+use crate::stages::train::Train;
+use crate::stages::{Progress, Stage as _, Summary};
+use crate::store::Location;
+use crate::training::{
+    Augmentation, CheckpointKind, GroupLearner, GroupTrainConfig, Learner as _, TrainingEnd,
+    Windows,
+};
+
+/// Runs the stage.
+///
+/// # Errors
+/// Settings of which no network can be made, and what the store says.
+pub fn run(params: &Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
+    let config = params.config.group_config(params.seed).with_context(|| {
+        format!(
+            "--preset {} is none of the family group; give tiny, small or base",
+            params.config.network.preset.name()
+        )
+    })?;
+    config.network.check()?;
+    check_numbers(&config)?;
+    let store = Location::open(&params.store, &params.client.options())?;
+    let watch = ProgressWatch(progress);
+    let lease = match params.dry_run {
+        true => None,
+        false => Some(lease_of(&store, &params.run, &watch)?),
+    };
+    let mut run = Run { params, store: &store, watch: &watch, lease: lease.as_ref() };
+    ensure!(
+        !params.resume
+            || !run.checkpoints(GroupLearner::STAGE).steps(CheckpointKind::Step)?.is_empty(),
+        "run {} has no checkpoint to resume from in {store}; leave --resume out to start it",
+        params.run
+    );
+    if params.dry_run {
+        return run.dry_run_of_group(&config, progress);
+    }
+    store.sweep();
+    run.train_group(&config, progress)
+}
+
+fn check_numbers(config: &GroupTrainConfig) -> anyhow::Result<()> {
+    let training = &config.group;
+    for (flag, x) in [
+        ("--condition-dropout", training.condition_dropout),
+        ("--clock-dropout", training.clock_dropout),
+        ("--time-stretch", training.augmentation.stretch),
+    ] {
+        ensure!((0.0..1.0).contains(&x), "{flag} {x} is no share; give a number from 0 to below 1");
+    }
+    for (flag, x) in [
+        ("--markers-loss", training.losses.markers),
+        ("--contrast-loss", training.losses.contrast),
+    ] {
+        ensure!(x.is_finite() && x >= 0.0, "{flag} {x} is no weight; give 0 or more");
+    }
+    let peak = training.learning_rate.peak;
+    ensure!(
+        peak > 0.0 && peak.is_finite(),
+        "--learning-rate {peak} is not above 0; give a positive number"
+    );
+    Ok(())
+}
+
+impl Run<'_> {
+    fn dry_run_of_group(
+        &self,
+        config: &GroupTrainConfig,
+        progress: &dyn Progress,
+    ) -> anyhow::Result<Box<dyn Summary>> {
+        let machine = &self.params.machine;
+        let dancers = Family::Group;
+        let phrases =
+            read_phrases(self.store, Train::NAME, (machine, dancers), None, progress, self.watch, true)?;
+        let windows = Windows::new(
+            phrases.dataset,
+            Normalizer::identity(),
+            Augmentation::default(),
+            config.network.window_frames,
+            0,
+        );
+        let n_elements = GroupNetworks::new(&config.network.group).1.n_elements();
+        Ok(Box::new(TrainDryRun {
+            run: self.params.run.clone(),
+            what: format!("train a denoiser and a score of groups, {n_elements} parameters"),
+            n_train: windows.n_train(),
+            n_validation: windows.n_validation(),
+            n_left_out: phrases.left_out.len(),
+            steps_per_epoch: windows.n_train().div_ceil(config.group.batch_size),
+        }))
+    }
+
+    fn train_group(
+        &mut self,
+        config: &GroupTrainConfig,
+        progress: &dyn Progress,
+    ) -> anyhow::Result<Box<dyn Summary>> {
+        let params = self.params;
+        let machine = &params.machine;
+        let dancers = Family::Group;
+        let phrases =
+            read_phrases(self.store, Train::NAME, (machine, dancers), None, progress, self.watch, false)?;
+        let threads = Arc::new(machine.start_threads()?);
+        let n_frames = config.network.window_frames;
+        let scales = scales(&phrases.dataset, n_frames, self.watch)?;
+        let windows = Windows::new(
+            Arc::clone(&phrases.dataset),
+            scales,
+            config.group.augmentation.clone(),
+            n_frames,
+            params.seed,
+        );
+        let windows = Arc::new(windows.heard_by(config.network.group.condition()));
+        let mut account = TrainSummary::new(&params.run, self.store, phrases.left_out.clone());
+        let mut learner =
+            GroupLearner::new(&config.network, &config.group, &windows, params.seed)?.on(&threads);
+        // Only now is it certain that there is something to train and to train on.
+        if params.force {
+            self.clear()?;
+        }
+        claim(self.store, &params.run, Train::NAME, config, machine.patience(), self.watch)?;
+        let steps = super::StageBudget {
+            share: 1.0,
+            ..self.steps_of_diffusion(config.group.batch_size)
+        };
+        let end = self.stage(config, steps, &mut learner, &windows, &mut account)?;
+        if end == TrainingEnd::Interrupted {
+            return Ok(Box::new(account.interrupted(&resume_command(params))));
+        }
+        Ok(Box::new(account))
+    }
+}
