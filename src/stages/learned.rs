@@ -8,6 +8,7 @@ use super::train::session::{MachineParams, ProgressWatch, read_phrases};
 use super::trained::{FinetuneData, TrainedRun};
 use super::{Progress, Stage as _, finetune::Finetune, pretrained, train::Train};
 
+use crate::model::Family;
 use crate::generation::{CardError, LearnedFrom, MAX_CARD_BYTES, ModelCard, Purpose, file_names};
 use crate::store::{Location, Patience, StoreError};
 use crate::training::{Dataset, Split};
@@ -81,6 +82,7 @@ pub fn of_run(
     is_dry_run: bool,
 ) -> anyhow::Result<Option<LearnedFrom>> {
     let learned_by = |command, data: &str, most| {
+        let machine = (machine, Family::Unet);
         of_command(store, run, command, (data, most), machine, progress, is_dry_run)
     };
     let Some(by_train) = learned_by(Train::NAME, &trained.state.data, None)? else {
@@ -96,6 +98,22 @@ pub fn of_run(
     Ok(by_finetune.map(|by_finetune| by_train.and(by_finetune)))
 }
 
+/// Returns what the weights of a run of the family `group` learned from.
+///
+/// # Errors
+/// When the store cannot be read.
+pub fn of_group(
+    store: &Location,
+    run: &str,
+    data: &str,
+    machine: &MachineParams,
+    progress: &dyn Progress,
+    is_dry_run: bool,
+) -> anyhow::Result<Option<LearnedFrom>> {
+    let machine = (machine, Family::Group);
+    of_command(store, run, Train::NAME, (data, None), machine, progress, is_dry_run)
+}
+
 /// Returns what a command learned from the data with a fingerprint: from its list, and where that is missing or has
 /// gaps from the store.
 fn of_command(
@@ -103,7 +121,7 @@ fn of_command(
     run: &str,
     command: &str,
     (data, max_train_phrases): (&str, Option<usize>),
-    machine: &MachineParams,
+    machine: (&MachineParams, Family),
     progress: &dyn Progress,
     is_dry_run: bool,
 ) -> anyhow::Result<Option<LearnedFrom>> {

@@ -15,6 +15,7 @@ mod lease;
 pub mod library;
 pub mod model;
 mod model_files;
+mod model_folder;
 mod motion_source;
 pub mod plot;
 mod pretrained;

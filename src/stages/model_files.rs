@@ -1,23 +1,21 @@
 //! A model's folder, opened to be run.
 
-use std::fmt::Write as _;
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, bail};
-use bytes::Bytes;
-use sha2::{Digest as _, Sha256};
+use anyhow::Context as _;
 
-use super::{all_threads, pretrained};
+use super::all_threads;
+pub use super::model_folder::{
+    ModelFolder, POINTER, current_folder, folder_of, is_model_name, pointer_to, sha256,
+};
 use crate::autodiff::Parameters;
-pub use crate::generation::is_name as is_model_name;
 use crate::generation::{
-    CardError, EagerEngine, Engine, FileEntry, MAX_CARD_BYTES, ModelCard, ModelFileName,
-    OnnxEngine, SessionPlan, file_names,
+    EagerEngine, Engine, ModelCard, ModelFileName, OnnxEngine, SessionPlan, file_names,
 };
 use crate::model::{MotionDecoder, ParameterList, UNet1D};
 use crate::onnx::{Device, Model, OnnxError, PINNED_VERSION, Runtime, Session, check, values_of};
-use crate::store::{Location, StoreError, prepared};
+use crate::store::{Location, prepared};
 
 /// What runs a model.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
@@ -65,63 +63,10 @@ pub fn default_model_cache() -> PathBuf {
         .unwrap_or_else(|| below(std::env::temp_dir()))
 }
 
-/// A model whose files are at hand on this machine.
+/// A model of one dancer whose files are at hand on this machine.
 pub struct OpenModel {
     pub card: ModelCard,
-    source: Source,
-    /// The name in messages.
-    place: String,
-    /// Whether the files' digests are known to be those of the card.
-    is_verified: bool,
-}
-
-/// Where a model's files are.
-enum Source {
-    Folder(PathBuf),
-    /// Within the program.
-    Pretrained,
-}
-
-/// Returns where a model lies below a store.
-pub fn folder_of(name: &str) -> String {
-    format!("models/{name}")
-}
-
-/// File beside the card of a model that was replaced, which names the folder of the model that counts.
-pub const POINTER: &str = "current.json";
-/// Digits of the name of such a folder.
-const VERSION_DIGITS: usize = 32;
-
-/// The content of [`POINTER`].
-#[derive(serde::Serialize, serde::Deserialize)]
-struct Pointer {
-    folder: String,
-}
-
-/// Returns the name of the folder of a model with that card, and the text that points there.
-pub fn pointer_to(card_text: &[u8]) -> (String, Bytes) {
-    let folder = sha256(card_text)[..VERSION_DIGITS].to_owned();
-    let text = serde_json::json!({ "folder": folder }).to_string() + "\n";
-    (folder, text.into())
-}
-
-/// Returns where the files of a model lie: below its own folder where that was replaced, else in it.
-///
-/// # Errors
-/// [`StoreError`] when the store cannot be read.
-pub fn current_folder(store: &Location, folder: &str) -> Result<String, StoreError> {
-    let below = |name: &str| match folder {
-        "" => name.to_owned(),
-        folder => format!("{folder}/{name}"),
-    };
-    let Some(bytes) = store.read_if_there(&below(POINTER))? else { return Ok(folder.to_owned()) };
-    let is_version =
-        |name: &String| name.len() == VERSION_DIGITS && name.bytes().all(|b| b.is_ascii_hexdigit());
-    match serde_json::from_slice(&bytes) {
-        Ok(Pointer { folder: version }) if is_version(&version) => Ok(below(&version)),
-        // Nothing of ours: the model is where it was before there were pointers.
-        _ => Ok(folder.to_owned()),
-    }
+    files: ModelFolder,
 }
 
 impl OpenModel {
@@ -130,44 +75,7 @@ impl OpenModel {
     /// # Errors
     /// One sentence about what is missing or of another kind.
     pub fn of_store(store: &Location, name: &str, cache: &Path) -> anyhow::Result<Self> {
-        match Self::of_store_once(store, name, cache) {
-            // It was replaced while it was read.
-            Err(e) if matches!(e.downcast_ref(), Some(StoreError::NotFound { .. })) => {
-                Self::of_store_once(store, name, cache)
-            }
-            opened => opened,
-        }
-    }
-
-    fn of_store_once(store: &Location, name: &str, cache: &Path) -> anyhow::Result<Self> {
-        let folder = current_folder(store, &folder_of(name))?;
-        let path = format!("{folder}/{}", file_names::CARD);
-        let bytes = match store.read_regular(&path, MAX_CARD_BYTES) {
-            Err(StoreError::NotFound { .. }) if name == pretrained::NAME => {
-                return Self::pretrained();
-            }
-            Err(StoreError::NotFound { .. }) => bail!(
-                "store {store} has no model \"{name}\"{}; run motiongen export --store {store} --run RUN \
-                 --model {name} first",
-                others(store)?
-            ),
-            read => read?,
-        };
-        let card = ModelCard::read(&bytes, &store.url_of(&path))?;
-        let place = store.url_of(&folder);
-        if let Some(root) = store.local_path() {
-            let source = Source::Folder(root.join(folder));
-            return Ok(Self { card, source, place, is_verified: false });
-        }
-        let key = format!("model-{}", &sha256(&bytes)[..32]);
-        let fetched = prepared(cache, &key, |into| {
-            for file in &card.files {
-                let bytes = read_listed(store, &folder, file, &place)?;
-                write_verified(into, file, &bytes, &place)?;
-            }
-            anyhow::Ok(())
-        })?;
-        Ok(Self { card, source: Source::Folder(fetched), place, is_verified: true })
+        Self::of(ModelFolder::of_store(store, name, cache)?)
     }
 
     /// Opens a model in a folder of this machine.
@@ -175,14 +83,7 @@ impl OpenModel {
     /// # Errors
     /// One sentence about what is missing or of another kind.
     pub fn of_folder(folder: &Path) -> anyhow::Result<Self> {
-        let current = current_folder(&Location::local(folder)?, "")?;
-        let folder = &folder.join(current);
-        let store = Location::local(folder)?;
-        let bytes = store.read_regular(file_names::CARD, MAX_CARD_BYTES)?;
-        let card = ModelCard::read(&bytes, &store.url_of(file_names::CARD))?;
-        let place = folder.display().to_string();
-        let source = Source::Folder(folder.to_owned());
-        Ok(Self { card, source, place, is_verified: false })
+        Self::of(ModelFolder::of_folder(folder)?)
     }
 
     /// Opens the model that ships with the program.
@@ -190,38 +91,16 @@ impl OpenModel {
     /// # Errors
     /// When the program was built without it.
     pub fn pretrained() -> anyhow::Result<Self> {
-        let Some(bytes) = pretrained::file(file_names::CARD) else {
-            bail!(
-                "this program was built without a model (feature pretrained); name one: --model NAME of a store, or \
-                 the folder of one"
-            )
-        };
-        let card = ModelCard::read(&bytes, pretrained::PLACE)?;
-        let place = pretrained::PLACE.to_owned();
-        Ok(Self { card, source: Source::Pretrained, place, is_verified: false })
+        Self::of(ModelFolder::pretrained()?)
     }
 
-    /// Returns the folder of the files; those of the program are written into the cache first.
-    fn folder(&self, cache: &Path) -> anyhow::Result<PathBuf> {
-        if let Source::Folder(folder) = &self.source {
-            return Ok(folder.clone());
-        }
-        let key = format!("model-{}", &sha256(&serde_json::to_vec(&self.card)?)[..32]);
-        prepared(cache, &key, |into| {
-            for file in &self.card.files {
-                write_verified(into, file, &self.bytes(file)?, &self.place)?;
-            }
-            anyhow::Ok(())
-        })
-    }
-
-    /// Reads a file as it is.
-    fn bytes(&self, file: &FileEntry) -> anyhow::Result<Bytes> {
-        match &self.source {
-            Source::Folder(folder) => read_listed(&Location::local(folder)?, "", file, &self.place),
-            Source::Pretrained => pretrained::file(file.name.name())
-                .with_context(|| format!("{} has no file {}", self.place, file.name)),
-        }
+    /// Reads the card of a model.
+    ///
+    /// # Errors
+    /// A card of another family, or none.
+    pub fn of(files: ModelFolder) -> anyhow::Result<Self> {
+        let card = ModelCard::read(files.card_bytes(), files.card_place())?;
+        Ok(Self { card, files })
     }
 
     /// Makes an engine: onnxruntime's or ours, and what to tell of the choice.
@@ -241,7 +120,7 @@ impl OpenModel {
         };
         // What the program has in itself needs nothing beside it.
         let needs_nothing =
-            params.engine == EngineChoice::Auto && matches!(self.source, Source::Pretrained);
+            params.engine == EngineChoice::Auto && self.files.is_pretrained();
         if params.engine == EngineChoice::Eager || needs_nothing {
             return Ok((eager()?, None));
         }
@@ -336,10 +215,10 @@ impl OpenModel {
         name: ModelFileName,
         weights_name: ModelFileName,
     ) -> anyhow::Result<(Model, String)> {
-        let bytes = self.read(name)?;
+        let bytes = self.files.read(name)?;
         let has_weights = self.card.files.iter().any(|file| file.name == weights_name);
-        let weights = if has_weights { Some(self.read(weights_name)?) } else { None };
-        let place = format!("{}/{name}", self.place);
+        let weights = if has_weights { Some(self.files.read(weights_name)?) } else { None };
+        let place = self.files.place_of(name);
         Ok((Model::read(bytes, weights.as_ref(), &place)?, place))
     }
 
@@ -347,16 +226,6 @@ impl OpenModel {
     fn check_graph(&self, name: ModelFileName, weights_name: ModelFileName) -> anyhow::Result<()> {
         let (model, place) = self.graph(name, weights_name)?;
         Ok(check(&model, &place)?)
-    }
-
-    /// Reads a file and holds it against the card.
-    fn read(&self, name: ModelFileName) -> anyhow::Result<Bytes> {
-        let entry = self.card.file(name, &self.place)?;
-        let bytes = self.bytes(entry)?;
-        if !self.is_verified {
-            verify(entry, &sha256(&bytes), &self.place)?;
-        }
-        Ok(bytes)
     }
 
     /// Makes the engine of onnxruntime; on a processor from a copy of the UNet that was optimised once.
@@ -370,20 +239,20 @@ impl OpenModel {
         cache: &Path,
     ) -> anyhow::Result<OnnxEngine> {
         let config = &self.card.unet;
-        let folder = self.folder(cache)?;
+        let folder = self.files.folder(cache)?;
         let unet = folder.join(file_names::UNET);
         let decoder = folder.join(file_names::DECODER);
         let check_unet = || self.check_graph(ModelFileName::Unet, ModelFileName::UnetWeights);
         self.check_graph(ModelFileName::Decoder, ModelFileName::DecoderWeights)?;
         // Files are looked through while onnxruntime loads what it has of them already.
         std::thread::scope(|scope| {
-            let verified = scope.spawn(|| self.verify());
+            let verified = scope.spawn(|| self.files.verify());
             let opened = (|| {
                 if plan.device != Device::Cpu {
                     check_unet()?;
                     return Ok(OnnxEngine::open(runtime, (&unet, false), &decoder, config, plan)?);
                 }
-                let entry = self.card.file(ModelFileName::Unet, &self.place)?;
+                let entry = self.files.entry(ModelFileName::Unet)?;
                 let key = format!(
                     "optimized-{}",
                     &sha256(
@@ -398,7 +267,7 @@ impl OpenModel {
                 );
                 let optimized = prepared(cache, &key, |into| {
                     // What is kept must come from the file that the card names.
-                    self.verify()?;
+                    self.files.verify()?;
                     check_unet()?;
                     Ok::<_, anyhow::Error>(Session::optimize(
                         runtime,
@@ -415,65 +284,6 @@ impl OpenModel {
         })
     }
 
-    /// Holds every file against the card.
-    fn verify(&self) -> anyhow::Result<()> {
-        if self.is_verified {
-            return Ok(());
-        }
-        for file in &self.card.files {
-            verify(file, &sha256(&self.bytes(file)?), &self.place)?;
-        }
-        Ok(())
-    }
-}
-
-/// Reads a file that a card lists, if it is a regular one of the size that the card says.
-fn read_listed(
-    location: &Location,
-    folder: &str,
-    file: &FileEntry,
-    place: &str,
-) -> anyhow::Result<Bytes> {
-    let path = match folder {
-        "" => file.name.name().to_owned(),
-        folder => format!("{folder}/{}", file.name),
-    };
-    let found = location.size_bytes(&path)?;
-    if found != file.n_bytes {
-        let place = format!("{place}/{}", file.name);
-        return Err(CardError::Size { place, found, expected: file.n_bytes }.into());
-    }
-    Ok(location.read_regular(&path, file.n_bytes)?)
-}
-
-/// Writes a file into a folder of the cache if it is what the card says.
-fn write_verified(into: &Path, file: &FileEntry, bytes: &[u8], place: &str) -> anyhow::Result<()> {
-    verify(file, &sha256(bytes), place)?;
-    let to = into.join(file.name.name());
-    crate::store::write_file(&to, |out| out.write_all(bytes))
-        .with_context(|| to.display().to_string())
-}
-
-fn verify(file: &FileEntry, found: &str, folder: &str) -> Result<(), CardError> {
-    if found == file.sha256 {
-        return Ok(());
-    }
-    Err(CardError::Digest {
-        place: format!("{folder}/{}", file.name),
-        found: found.to_owned(),
-        expected: file.sha256.clone(),
-    })
-}
-
-/// Returns the SHA-256 of bytes as hexadecimal digits.
-pub fn sha256(bytes: &[u8]) -> String {
-    Sha256::digest(bytes).iter().fold(String::with_capacity(64), |mut text, byte| {
-        // Writing to a string cannot fail.
-        let _ = write!(text, "{byte:02x}");
-        text
-    })
-}
-
 /// Returns what tells this processor from others: a model that is optimised for one may not run on another.
 fn processor() -> String {
     let known = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
@@ -484,17 +294,4 @@ fn processor() -> String {
     told.push(std::env::consts::ARCH);
     told.push(std::env::consts::OS);
     told.join("\n")
-}
-
-/// Says which models a store has.
-fn others(store: &Location) -> anyhow::Result<String> {
-    let listed = store.list("models")?;
-    let name_of = |path: &'_ str| -> Option<String> {
-        let (name, file) = path.strip_prefix("models/")?.split_once('/')?;
-        [file_names::CARD, POINTER].contains(&file).then(|| name.to_owned())
-    };
-    let names: std::collections::BTreeSet<String> =
-        listed.iter().filter_map(|listed| name_of(&listed.path)).collect();
-    let names: Vec<String> = names.into_iter().collect();
-    Ok(if names.is_empty() { String::new() } else { format!(" (it has {})", names.join(", ")) })
 }

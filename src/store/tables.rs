@@ -111,11 +111,11 @@ rows! {
 
 rows! {
     "One row per training step, epoch and validation of a run."
-    TrainingLogRow in "training_log" version 1 sorted by [segment, step]
+    TrainingLogRow in "training_log" version 2 reads 1 sorted by [segment, step]
     {
         segment: String, "", "The stretch of the log, from one checkpoint to the next: `run/stage/` and the steps done before it.";
         run: String, "", "Name of the run.";
-        stage: String, "", "`diffusion` (the UNet), `decoder` or `finetune` (both, end to end).";
+        stage: String, "", "`diffusion` (the UNet), `decoder`, `finetune` (both, end to end) or `group` (denoiser and score of groups).";
         kind: String, "", "`step`, `epoch` (means over its steps) or `validation`.";
         epoch: i32, "epochs", "Epoch, from 1.";
         step: i64, "steps", "Steps done, this one included.";
@@ -137,6 +137,8 @@ rows! {
         acceleration_error: Option<f64>, "m/s²", "Of a validation in finetune: mean |a − 30 Δv|.";
         quaternion_pass_rate: Option<f64>, "", "Of a validation in finetune: share of sampled motions whose turns from frame to frame all keep |q · q'| ≥ 0.95.";
         speed_ratio: Option<f64>, "", "Of a validation in finetune: mean speed of sampled motion, over that of the phrases; far below 1 where motion agrees with itself because it stands still.";
+        markers: Option<f64>, "m²", "Of a model of groups: mean squared error of points fixed to each body. This and `contrast` are none in rows of version 1.";
+        contrast: Option<f64>, "", "Of a model of groups: cross-entropy of telling a group from mixed ones.";
         gradient_norm: Option<f64>, "", "Norm of the gradient before it was clipped.";
         skipped: bool, "", "Whether the step was skipped because something was not finite.";
         samples_per_s: Option<f64>, "1/s", "Windows learned from per second.";

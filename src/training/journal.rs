@@ -171,6 +171,8 @@ impl<'a> Journal<'a> {
             acceleration_error: part("acceleration_error"),
             quaternion_pass_rate: part("quaternion_pass_rate"),
             speed_ratio: part("speed_ratio"),
+            markers: part("markers"),
+            contrast: part("contrast"),
             gradient_norm: entry.taken.and_then(|taken| finite(taken.gradient_norm)),
             skipped: entry.is_skipped,
             samples_per_s: entry.samples_per_s,

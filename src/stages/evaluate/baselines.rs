@@ -154,7 +154,8 @@ fn of_columns(row: &GenerationRow, card: &ModelCard) -> anyhow::Result<MotionSet
         style: None,
         overlap_frames: OVERLAP_FRAMES.min(card.window_frames - 1),
         prime: None,
-        postprocess: PostProcessParams::usual().config(card)?,
+        postprocess: PostProcessParams::usual()
+                .config((card.motion_range, card.fusion_variances()))?,
         constraints: None,
         constraint_strength: 1.0,
         soft: false,

@@ -3,7 +3,7 @@
 use std::num::NonZeroUsize;
 use std::time::Instant;
 
-use anyhow::Context as _;
+use anyhow::{Context as _, bail};
 use ndarray::{Array3, ArrayView3, Axis, s};
 
 use super::Params;
@@ -31,7 +31,7 @@ const GUIDANCE: f64 = 2.5;
 const N_PHRASES: usize = 16;
 
 /// f32 of another order of summation: 2e-5 at most was seen over a forward of the largest preset.
-const FORWARD_TOLERANCE: f64 = 1e-4;
+pub(super) const FORWARD_TOLERANCE: f64 = 1e-4;
 /// Twenty forwards, each fed by the one before.
 const SAMPLE_TOLERANCE: f64 = 1e-3;
 /// Accelerations that are derived are 900 times second differences of positions: of 2 m the last digit in f32 is
@@ -54,22 +54,46 @@ pub struct CheckResults {
     pub runtime: String,
 }
 
-/// How far two answers are apart.
-#[derive(Clone, Copy)]
-struct Difference {
-    max_abs: f64,
-    rms: f64,
+impl CheckResults {
+    /// Refuses a model that failed a check.
+    ///
+    /// # Errors
+    /// One sentence about the first that failed.
+    pub fn require(&self, model: &str) -> anyhow::Result<()> {
+        let Some(failed) = self.rows.iter().find(|row| !row.passed) else { return Ok(()) };
+        bail!(
+            "model {model} was not written: check {} on {} × {} frames differs by {:.2e}, {:.0e} is allowed; \
+             all checks are in the table onnx_checks",
+            failed.check,
+            failed.n_samples,
+            failed.n_frames,
+            if failed.check == ROUNDING { failed.rms } else { failed.max_abs },
+            failed.tolerance
+        );
+    }
 }
 
-fn difference(a: ArrayView3<f32>, b: ArrayView3<f32>) -> Difference {
-    let (mut max_abs, mut squares) = (0.0_f64, 0.0);
-    for (a, b) in a.iter().zip(b) {
+/// How far two answers are apart.
+#[derive(Clone, Copy)]
+pub(super) struct Difference {
+    pub max_abs: f64,
+    pub rms: f64,
+}
+
+/// Returns how far two lists of numbers are apart.
+pub(super) fn difference<'a>(
+    a: impl IntoIterator<Item = &'a f32>,
+    b: impl IntoIterator<Item = &'a f32>,
+) -> Difference {
+    let (mut max_abs, mut squares, mut n) = (0.0_f64, 0.0, 0);
+    for (a, b) in a.into_iter().zip(b) {
         let d = f64::from(a - b).abs();
         // NaN stays: f64::max would drop it.
         max_abs = if d > max_abs || d.is_nan() { d } else { max_abs };
         squares += d * d;
+        n += 1;
     }
-    Difference { max_abs, rms: (squares / a.len().max(1) as f64).sqrt() }
+    Difference { max_abs, rms: (squares / f64::from(n.max(1))).sqrt() }
 }
 
 /// A batch that both engines are asked about.
@@ -252,7 +276,7 @@ impl ExportChecks<'_> {
         };
         let (a, onnx_s) = timed(|| onnx.predict(&inputs))?;
         let (b, eager_s) = timed(|| eager.predict(&inputs))?;
-        let row = self.row("forward", case, difference(a.view(), b.view()));
+        let row = self.row("forward", case, difference(&a, &b));
         Ok(OnnxCheckRow { onnx_s: Some(onnx_s), eager_s, ..row })
     }
 
@@ -279,7 +303,7 @@ impl ExportChecks<'_> {
         };
         let (a, onnx_s) = timed(|| run(onnx))?;
         let (b, eager_s) = timed(|| run(eager))?;
-        let difference = difference(a.view(), b.view());
+        let difference = difference(&a, &b);
         let (tolerance, found) = match check == ROUNDING {
             true => (ROUNDING_TOLERANCE, difference.rms),
             false => (SAMPLE_TOLERANCE, difference.max_abs),
@@ -312,7 +336,7 @@ impl ExportChecks<'_> {
             }
         }
         let (n_samples, n_frames, _) = latent.dim();
-        let difference = difference(a.view(), b.view());
+        let difference = difference(&a, &b);
         let row = self.row("decode", &Case { n_samples, n_frames }, difference);
         let fuses = self.trained.state.config.network.decoder.fusion.is_some();
         let tolerance = if fuses { DERIVED_TOLERANCE } else { FORWARD_TOLERANCE };
@@ -337,7 +361,7 @@ pub fn eager(
     engine.context("while starting threads")
 }
 
-fn timed<T, E>(work: impl FnOnce() -> Result<T, E>) -> Result<(T, f64), E> {
+pub(super) fn timed<T, E>(work: impl FnOnce() -> Result<T, E>) -> Result<(T, f64), E> {
     let started = Instant::now();
     let made = work()?;
     Ok((made, started.elapsed().as_secs_f64()))

@@ -2,12 +2,14 @@
 
 mod checks;
 mod files;
+mod group;
 mod report;
 mod tuning;
 
 use std::path::PathBuf;
 
 use anyhow::{bail, ensure};
+use bytes::Bytes;
 
 use self::checks::{CheckResults, ExportChecks, eager};
 use self::files::ExportedFiles;
@@ -17,7 +19,8 @@ use super::model_files::{POINTER, current_folder, folder_of, is_model_name, poin
 use super::train::session::{MachineParams, ProgressWatch, check_run_name, read_phrases};
 use super::trained::{TrainedRun, WeightsChoice};
 use super::{ClientParams, Contract, Progress, Stage, Summary, lease};
-use crate::generation::file_names;
+use crate::generation::{ModelFileName, file_names};
+use crate::model::Family;
 use crate::motion::rates::MotionRange;
 use crate::onnx::{Runtime, Storage};
 use crate::store::tables::OnnxCheckRow;
@@ -89,12 +92,15 @@ impl Stage for Export {
         check_run_name(&params.run)?;
         check_model_name(&params.model)?;
         let store = Location::open(&params.store, &params.client.options())?;
+        if group::is_of_group(&store, &params.run)? {
+            return group::run(&params, &store, progress);
+        }
         let mut trained = TrainedRun::read(&store, &params.run, params.weights)?;
         let machine = &params.machine;
         let watch = ProgressWatch(progress);
         let (most, is_dry_run) = (Some(MAX_TRAIN_PHRASES), params.dry_run);
         let phrases =
-            read_phrases(&store, Self::NAME, machine, most, progress, &watch, is_dry_run)?;
+            read_phrases(&store, Self::NAME, (machine, Family::Unet), most, progress, &watch, is_dry_run)?;
         let learned_from =
             learned::of_run(&store, &params.run, &trained, machine, progress, is_dry_run)?;
         if learned_from.is_none() {
@@ -143,22 +149,11 @@ impl Stage for Export {
         let results = checking.run(&runtime, progress)?;
         // From here on a signal is left until the model is whole.
         progress.is_interrupted();
-        record(&store, &params, &files, &results)?;
+        record(&store, &params, &files.card_text, &results)?;
         checkpoint(&store, &[Self::NAME]);
-        if let Some(failed) = results.rows.iter().find(|row| !row.passed) {
-            bail!(
-                "model {} was not written: check {} on {} × {} frames differs by {:.2e}, {:.0e} is allowed; \
-                 all checks are in the table onnx_checks",
-                params.model,
-                failed.check,
-                failed.n_samples,
-                failed.n_frames,
-                if failed.check == checks::ROUNDING { failed.rms } else { failed.max_abs },
-                failed.tolerance
-            );
-        }
+        results.require(&params.model)?;
         lease.check()?;
-        publish(&store, &params.model, &files)?;
+        publish(&store, &params.model, (&files.bytes, &files.card_text))?;
         Ok(Box::new(ExportSummary::written(&params, &store, &files, results)))
     }
 }
@@ -187,11 +182,15 @@ fn card_path(store: &Location, model: &str) -> Result<String, StoreError> {
 
 /// Puts the files in place. A model that is there is replaced by a folder of its own and, once that is whole, by one
 /// pointer: at any moment there is the old model or the new one. Its card comes last, without which there is none.
-fn publish(store: &Location, model: &str, files: &ExportedFiles) -> Result<(), StoreError> {
+fn publish(
+    store: &Location,
+    model: &str,
+    (files, card_text): (&[(ModelFileName, Bytes)], &Bytes),
+) -> Result<(), StoreError> {
     let folder = folder_of(model);
     let before = current_folder(store, &folder)?;
     let is_there = store.read_if_there(&format!("{before}/{}", file_names::CARD))?.is_some();
-    let (version, pointer) = pointer_to(&files.card_text);
+    let (version, pointer) = pointer_to(card_text);
     let into = if is_there { format!("{folder}/{version}") } else { folder.clone() };
     let is_within =
         |path: &str, folder: &str| path.strip_prefix(folder).is_some_and(|p| p.starts_with('/'));
@@ -199,10 +198,10 @@ fn publish(store: &Location, model: &str, files: &ExportedFiles) -> Result<(), S
     for listed in store.list(&into)?.into_iter().filter(|_| into != before || !is_there) {
         store.remove(&listed.path)?;
     }
-    for (name, bytes) in &files.bytes {
+    for (name, bytes) in files {
         store.put_new(&format!("{into}/{name}"), bytes.clone())?;
     }
-    store.put_new(&format!("{into}/{}", file_names::CARD), files.card_text.clone())?;
+    store.put_new(&format!("{into}/{}", file_names::CARD), card_text.clone())?;
     if !is_there {
         return Ok(());
     }
@@ -224,7 +223,7 @@ fn publish(store: &Location, model: &str, files: &ExportedFiles) -> Result<(), S
 fn record(
     store: &Location,
     params: &Params,
-    files: &ExportedFiles,
+    card_text: &Bytes,
     results: &CheckResults,
 ) -> Result<(), StoreError> {
     let ledger = Ledger::read(store, Export::NAME)?;
@@ -233,7 +232,7 @@ fn record(
     let rows: Vec<OnnxCheckRow> =
         results.rows.iter().map(|row| OnnxCheckRow { time, ..row.clone() }).collect();
     commit.part(OnnxCheckRow::schema().name, OnnxCheckRow::schema)?.write_rows(&rows)?;
-    let known = format!("{}\n{}", sha256(&files.card_text), results.runtime);
+    let known = format!("{}\n{}", sha256(card_text), results.runtime);
     let input_hash = digest(known.as_bytes())[..32].to_owned();
     let id = params.model.clone();
     commit.settle(Item { id, fingerprint: input_hash.clone(), input_hash, failure: None }, &ledger);
@@ -243,7 +242,7 @@ fn record(
 #[cfg(all(test, feature = "pretrained"))]
 mod tests {
     use super::*;
-    use crate::generation::{ModelCard, ModelFileName};
+    use crate::generation::ModelCard;
     use crate::stages::pretrained;
     use crate::store::ClientOptions;
 
@@ -277,6 +276,10 @@ mod tests {
         Some(found)
     }
 
+    fn published(store: &Location, files: &ExportedFiles) -> Result<(), StoreError> {
+        publish(store, "m", (&files.bytes, &files.card_text))
+    }
+
     fn stores() -> (tempfile::TempDir, [Location; 2]) {
         let folder = tempfile::tempdir().expect("a folder");
         let local = Location::local(folder.path()).expect("a location");
@@ -293,17 +296,17 @@ mod tests {
             };
             // What an export that was killed left behind is no part of a model.
             store.put_new("models/m/unet.onnx", "half".into()).expect("written");
-            publish(store, "m", &files(1)).expect("published");
+            published(store, &files(1)).expect("published");
             let plain = ["models/m/decoder.onnx", "models/m/model.json", "models/m/unet.onnx"];
             assert_eq!(paths(), plain);
             assert_eq!(version(store).as_deref(), Some(" of 1"));
-            publish(store, "m", &files(2)).expect("published");
+            published(store, &files(2)).expect("published");
             assert_eq!(version(store).as_deref(), Some(" of 2"));
             assert_eq!(paths().len(), 4, "three files and the pointer: {:?}", paths());
-            publish(store, "m", &files(3)).expect("published");
+            published(store, &files(3)).expect("published");
             assert_eq!(version(store).as_deref(), Some(" of 3"));
             assert_eq!(paths().len(), 7, "the one before stays for its readers");
-            publish(store, "m", &files(2)).expect("published");
+            published(store, &files(2)).expect("published");
             assert_eq!((version(store).as_deref(), paths().len()), (Some(" of 2"), 7));
         }
     }
@@ -312,8 +315,8 @@ mod tests {
     fn there_is_a_whole_model_at_any_moment() {
         let (_folder, stores) = stores();
         for store in &stores {
-            publish(store, "m", &files(0)).expect("published");
-            publish(store, "m", &files(1)).expect("published");
+            published(store, &files(0)).expect("published");
+            published(store, &files(1)).expect("published");
             let is_done = std::sync::atomic::AtomicBool::new(false);
             let order = std::sync::atomic::Ordering::SeqCst;
             std::thread::scope(|scope| {
@@ -327,7 +330,7 @@ mod tests {
                     n_read
                 });
                 for i in 2..120 {
-                    publish(store, "m", &files(i)).expect("published");
+                    published(store, &files(i)).expect("published");
                     std::thread::sleep(std::time::Duration::from_millis(1));
                 }
                 is_done.store(true, order);
@@ -339,7 +342,7 @@ mod tests {
     #[test]
     fn a_pointer_of_others_is_passed_over() {
         let (_folder, [store, _]) = stores();
-        publish(&store, "m", &files(1)).expect("published");
+        published(&store, &files(1)).expect("published");
         let digits = "0123456789abcdef0123456789abcdef";
         for text in ["", "{}", r#"{"folder": "../../../etc"}"#, r#"{"folder": "/etc"}"#, digits] {
             store.replace("models/m/current.json", text.to_owned().into()).expect("written");

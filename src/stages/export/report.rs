@@ -42,32 +42,38 @@ impl ExportSummary {
     }
 }
 
+/// Writes the table of checks; nothing where there are none.
+pub(super) fn write_checks(out: &mut dyn Write, checks: &[OnnxCheckRow]) -> io::Result<()> {
+    if !checks.is_empty() {
+        writeln!(
+            out,
+            "{:<14} {:>7} {:>7} {:>9} {:>9} {:>9}  {:>8} {:>8}",
+            "check", "samples", "frames", "max", "rms", "allowed", "onnx", "eager"
+        )?;
+    }
+    for row in checks.iter() {
+        let seconds = |s: f64| format!("{:.0} ms", 1000.0 * s);
+        writeln!(
+            out,
+            "{:<14} {:>7} {:>7} {:>9.1e} {:>9.1e} {:>9.0e}  {:>8} {:>8}{}",
+            row.check,
+            row.n_samples,
+            row.n_frames,
+            row.max_abs,
+            row.rms,
+            row.tolerance,
+            row.onnx_s.map_or_else(|| "-".to_owned(), seconds),
+            seconds(row.eager_s),
+            if row.check == ROUNDING { "  (rms counts)" } else { "" }
+        )?;
+    }
+    Ok(())
+}
+
 impl Summary for ExportSummary {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
         let Self { card, place, checks, is_up_to_date } = self;
-        if !checks.is_empty() {
-            writeln!(
-                out,
-                "{:<14} {:>7} {:>7} {:>9} {:>9} {:>9}  {:>8} {:>8}",
-                "check", "samples", "frames", "max", "rms", "allowed", "onnx", "eager"
-            )?;
-        }
-        for row in checks.iter() {
-            let seconds = |s: f64| format!("{:.0} ms", 1000.0 * s);
-            writeln!(
-                out,
-                "{:<14} {:>7} {:>7} {:>9.1e} {:>9.1e} {:>9.0e}  {:>8} {:>8}{}",
-                row.check,
-                row.n_samples,
-                row.n_frames,
-                row.max_abs,
-                row.rms,
-                row.tolerance,
-                row.onnx_s.map_or_else(|| "-".to_owned(), seconds),
-                seconds(row.eager_s),
-                if row.check == ROUNDING { "  (rms counts)" } else { "" }
-            )?;
-        }
+        write_checks(out, checks)?;
         writeln!(
             out,
             "model {}{} → {place}",

@@ -14,19 +14,24 @@ use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
 use crate::evaluation::body::{poses, turn_rates};
 use crate::evaluation::coupling::{CoupledPassage, Coupling, CouplingSums, Harmonics, Template};
 use crate::evaluation::window_range::Posture;
-use crate::generation::{Engine, RUN_WINDOWS, Sampling, SamplingDefaults, sample};
+use crate::generation::{
+    Engine, EngineError, GroupEngine, GroupGenerator, GroupTrack, RUN_WINDOWS, Sampling,
+    SamplingDefaults, sample,
+};
 use crate::model::condition;
 use crate::motion::clock::is_known;
 use crate::motion::kinematics::forward_differences;
 use crate::motion::phase::unwrapped;
 use crate::motion::postprocess::{Coherence, FusionVariances, PostProcessConfig, process};
-use crate::motion::{Channel, MOTION_DIM};
+use crate::motion::{Channel, MOTION_DIM, Normalizer};
 use crate::stages::Progress;
-use crate::training::{Dataset, NetworkConfig, Phrase, Split};
+use crate::training::{Dataset, GroupNetworkConfig, NetworkConfig, Phrase, Split};
 use crate::units::FPS;
 
 /// Most windows that are sampled for each guidance.
 const N_WINDOWS: usize = 32;
+/// Most groups that are sampled for each guidance.
+const N_GROUPS: usize = 8;
 /// Most phrases from which it is learned what motion owes to the bar.
 const MAX_FITTED_PHRASES: usize = 400;
 /// Guidances that are tried, until motion is locked to the bar as far as real motion is.
@@ -65,6 +70,16 @@ pub fn sampling_defaults(
     progress: &dyn Progress,
 ) -> anyhow::Result<Option<SamplingDefaults>> {
     let windows = windows(network, dataset)?;
+    tuned(&windows, dataset, progress, |guidance| decoded(engine, network, guidance, &windows))
+}
+
+/// Measures how a model is best sampled whose motion for the windows `decoded` makes, with some guidance.
+fn tuned(
+    windows: &[Window],
+    dataset: &Dataset,
+    progress: &dyn Progress,
+    mut decoded: impl FnMut(f64) -> anyhow::Result<Vec<Array2<f32>>>,
+) -> anyhow::Result<Option<SamplingDefaults>> {
     if windows.is_empty() {
         return Ok(None);
     }
@@ -73,10 +88,10 @@ pub fn sampling_defaults(
     let mut tried: Vec<(f64, f64)> = Vec::new();
     let mut variances = FusionVariances::default();
     for guidance in GUIDANCES {
-        let decoded = decoded(engine, network, guidance, &windows)?;
-        variances = variances_of(&windows, &decoded);
+        let decoded = decoded(guidance)?;
+        variances = variances_of(windows, &decoded);
         progress.advance(1);
-        let Some(locked) = locked(&couplings, &windows, &fused(&decoded, variances)) else { break };
+        let Some(locked) = locked(&couplings, windows, &fused(&decoded, variances)) else { break };
         tried.push((guidance, locked));
         if locked >= 1.0 {
             break;
@@ -208,6 +223,78 @@ fn windows(network: &NetworkConfig, dataset: &Dataset) -> anyhow::Result<Vec<Win
         .collect()
 }
 
+/// Measures how a model of groups is best sampled; none without validation phrases as long as a window.
+///
+/// As [`sampling_defaults`], dancer by dancer.
+///
+/// # Errors
+/// When the frames cannot be read, or what the engine says.
+pub fn group_sampling_defaults(
+    engine: &GroupEngine,
+    network: &GroupNetworkConfig,
+    normalizer: &Normalizer,
+    dataset: &Dataset,
+    progress: &dyn Progress,
+) -> anyhow::Result<Option<SamplingDefaults>> {
+    let n_frames = network.window_frames;
+    let is_fit =
+        |p: &&Phrase| p.split == Split::Validation && p.n_frames >= n_frames && p.n_dancers > 1;
+    let phrases: Vec<&Phrase> = dataset.phrases().iter().filter(is_fit).collect();
+    let n = phrases.len().min(N_GROUPS);
+    let mut groups: Vec<(usize, Array2<f32>)> = Vec::new();
+    let mut windows: Vec<Window> = Vec::new();
+    for i in 0..n {
+        let phrase = phrases[i * phrases.len() / n];
+        let features = dataset.features(phrase, 0, n_frames)?;
+        let motions = (0..phrase.n_dancers).map(|dancer| dataset.motion_of(phrase, dancer, 0, n_frames));
+        let motions = motions.collect::<Result<Vec<_>, _>>()?;
+        let clock = phrase.clock_of(motions[0].view());
+        let heard = condition(network.group.condition(), features.view(), Some(clock.view()));
+        groups.push((phrase.n_dancers, heard.clone()));
+        windows.extend(motions.into_iter().map(|motion| Window {
+            song: song_of(phrase),
+            beats_per_bar: phrase.beats_per_bar,
+            motion,
+            heard: heard.clone(),
+        }));
+    }
+    let schedule = Schedule::new(&network.diffusion)?;
+    let sampler = usual_sampler(&schedule);
+    tuned(&windows, dataset, progress, |guidance| {
+        let mut made = Vec::new();
+        for (i, (n_dancers, heard)) in groups.iter().enumerate() {
+            let generator = GroupGenerator {
+                engine,
+                sampler: &sampler,
+                schedule: &schedule,
+                guidance,
+                consistency: 0.0,
+                normalizer,
+                window_frames: n_frames,
+                overlap_frames: 0,
+            };
+            let seed = SEED + i as u64;
+            let track =
+                GroupTrack { condition: heard.view(), phase: None, seed, n_dancers: *n_dancers };
+            generator.run(&track, |motion| -> Result<(), EngineError> {
+                made.extend(motion.outer_iter().map(|dancer| dancer.to_owned()));
+                Ok(())
+            })?;
+        }
+        Ok(made)
+    })
+}
+
+/// Returns how models are sampled unless the user says otherwise.
+fn usual_sampler(schedule: &Schedule) -> SamplerConfig {
+    SamplerConfig {
+        sampler: Sampler::DpmSolver,
+        n_steps: Sampler::DpmSolver.usual_steps(schedule.len()),
+        spacing: Spacing::Trailing,
+        clip: true,
+    }
+}
+
 /// Samples and decodes motion for windows, each from its own noise.
 fn decoded(
     engine: &dyn Engine,
@@ -216,12 +303,7 @@ fn decoded(
     windows: &[Window],
 ) -> anyhow::Result<Vec<Array2<f32>>> {
     let schedule = Schedule::new(&network.diffusion)?;
-    let config = SamplerConfig {
-        sampler: Sampler::DpmSolver,
-        n_steps: Sampler::DpmSolver.usual_steps(schedule.len()),
-        spacing: Spacing::Trailing,
-        clip: true,
-    };
+    let config = usual_sampler(&schedule);
     let sampling = Sampling { config: &config, schedule: &schedule, guidance };
     let (frames, width) = (network.window_frames, network.unet.condition_dim());
     let mut made = Vec::with_capacity(windows.len());
@@ -250,7 +332,8 @@ fn couplings(dataset: &Dataset) -> anyhow::Result<BTreeMap<Arc<str>, Coupling>> 
     let mut songs: BTreeMap<Arc<str>, Harmonics> = BTreeMap::new();
     let validation = dataset.phrases().iter().filter(|phrase| phrase.split == Split::Validation);
     for phrase in validation.take(MAX_FITTED_PHRASES) {
-        let motion = dataset.motion(phrase, 0, phrase.n_frames)?;
+        // Of a group the first dancer, whose bar is that of all.
+        let motion = dataset.motion_of(phrase, 0, 0, phrase.n_frames)?;
         let phase = phase_of(&motion);
         if is_known(&phase, phrase.beats_per_bar) {
             let (rise, bars) = (rise_m_s(&motion), unwrapped(&phase));

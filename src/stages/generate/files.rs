@@ -9,7 +9,7 @@ use anyhow::{Context as _, bail};
 use ndarray::ArrayView2;
 
 use super::GenerateTally;
-use super::maker::{GeneratedMotion, Maker, PhraseMusic};
+use super::maker::{GeneratedMotion, MotionMaker, PhraseMusic};
 use super::outputs::{self, MotionFormat, MotionOutput};
 use super::receipt::{Receipt, digest_of_song};
 use crate::motion::exchange::{csv_header, write_csv_rows};
@@ -54,7 +54,7 @@ type FeaturesAndBeats = Result<(ExtractedFeatures, Option<Beats>), Failure>;
 /// # Errors
 /// When the folder cannot be written; files that cannot be danced to are part of what was done.
 pub fn run(
-    maker: &Maker,
+    maker: &dyn MotionMaker,
     target: &FolderTarget,
     progress: &dyn Progress,
 ) -> anyhow::Result<GenerateTally> {
@@ -215,7 +215,7 @@ fn told(name: &str, made: &GeneratedMotion) -> String {
     let score = row.and_then(|row| row.score).map_or("none".to_owned(), |x| format!("{x:.3}"));
     let checks = row
         .map_or(String::new(), |row| format!("{} of {} checks", row.checks_passed, row.n_checks));
-    let duration_s = crate::units::frames_to_s(made.frames.nrows());
+    let duration_s = crate::units::frames_to_s(made.n_frames());
     let factor = made.seconds / duration_s.max(f64::MIN_POSITIVE);
     format!(
         "{name}: {duration_s:.1} s of motion in {:.1} s ({factor:.2} × real time), score {score}, {checks}",

@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use ndarray::{Array2, ArrayView2, Axis, concatenate};
+use ndarray::{Array2, Array3, ArrayView2, Axis, concatenate};
 
 use super::params::Settings;
 use crate::evaluation::{Score, derivative_error, score};
@@ -35,18 +35,57 @@ pub struct PhraseMusic<'a> {
 /// A motion that was kept, and what is known of all its candidates.
 #[derive(Debug)]
 pub struct GeneratedMotion {
-    /// \[T, 25\]
-    pub frames: Array2<f32>,
-    /// The same motion as it was decoded, before post-processing, \[T, 25\].
-    pub decoded: Array2<f32>,
+    /// Dancer by dancer, \[N, T, 25\].
+    pub frames: Array3<f32>,
+    /// The same motion as it was decoded, before post-processing, \[N, T, 25\].
+    pub decoded: Array3<f32>,
     pub rows: Vec<GenerationRow>,
     /// How far fusion moved its poses, where they were fused.
     pub displacement: Option<Displacement>,
     pub seconds: f64,
 }
 
-/// Generates motions: samples candidates, scores them, and keeps the best.
-pub struct Maker<'a> {
+impl GeneratedMotion {
+    /// Returns the number of frames of each dancer.
+    pub fn n_frames(&self) -> usize {
+        self.frames.len_of(Axis(1))
+    }
+}
+
+/// Makes motions of one model with some settings.
+pub trait MotionMaker: Sync {
+    /// Name of the model, as the user typed it.
+    fn model(&self) -> &str;
+
+    /// Digest of the model's weights.
+    fn weights(&self) -> &str;
+
+    /// Name of the generation.
+    fn run(&self) -> &str;
+
+    /// The user's seed.
+    fn seed(&self) -> u64;
+
+    /// The settings as receipts have them: JSON, of constraints the digest.
+    fn settings(&self) -> serde_json::Value;
+
+    /// Digest of everything but the music that determines motions.
+    fn settings_digest(&self) -> String;
+
+    /// Makes one sample; `watch` sees the frames of its first candidate as they are final.
+    ///
+    /// # Errors
+    /// A [`Failure`] that names the phrase's music.
+    fn make(
+        &self,
+        music: &PhraseMusic,
+        sample: usize,
+        watch: &mut dyn FnMut(ArrayView2<f32>) -> std::io::Result<()>,
+    ) -> Result<GeneratedMotion, Failure>;
+}
+
+/// Generates motions of one dancer: samples candidates, scores them, and keeps the best.
+pub struct SoloistMaker<'a> {
     pub generator: Generator<'a>,
     pub card: &'a ModelCard,
     /// Name of the model, as the user typed it.
@@ -79,12 +118,32 @@ struct TrackConditions<'a> {
     phase: Option<&'a [f64]>,
 }
 
-impl Maker<'_> {
-    /// Makes one sample; `watch` sees the frames of its first candidate as they are final.
-    ///
-    /// # Errors
-    /// A [`Failure`] that names the phrase's music.
-    pub fn make(
+impl MotionMaker for SoloistMaker<'_> {
+    fn model(&self) -> &str {
+        self.model
+    }
+
+    fn weights(&self) -> &str {
+        self.weights
+    }
+
+    fn run(&self) -> &str {
+        self.run
+    }
+
+    fn seed(&self) -> u64 {
+        self.settings.seed
+    }
+
+    fn settings(&self) -> serde_json::Value {
+        serde_json::to_value(self.settings.to_row()).expect("invariant: numbers and texts become JSON")
+    }
+
+    fn settings_digest(&self) -> String {
+        self.settings.digest(self.weights)
+    }
+
+    fn make(
         &self,
         music: &PhraseMusic,
         sample: usize,
@@ -92,7 +151,9 @@ impl Maker<'_> {
     ) -> Result<GeneratedMotion, Failure> {
         guarded(music.source, || self.candidates(music, sample, watch))
     }
+}
 
+impl SoloistMaker<'_> {
     fn candidates(
         &self,
         music: &PhraseMusic,
@@ -175,6 +236,7 @@ impl Maker<'_> {
             best.expect("at least one candidate is sampled");
         rows[candidate].selected = true;
         let seconds = started.elapsed().as_secs_f64();
+        let [frames, decoded] = [frames, decoded].map(|motion| motion.insert_axis(Axis(0)));
         Ok(GeneratedMotion { frames, decoded, rows, displacement, seconds })
     }
 

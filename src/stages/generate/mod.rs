@@ -2,6 +2,7 @@
 
 mod constraints_file;
 mod files;
+mod group;
 mod maker;
 mod outputs;
 mod params;
@@ -18,15 +19,18 @@ use std::time::Instant;
 use anyhow::bail;
 
 use super::failure::Failure;
-use super::model_files::{EngineChoice, EngineParams, OpenModel, POINTER, is_model_name, sha256};
+use super::model_files::{
+    EngineChoice, EngineParams, ModelFolder, OpenModel, POINTER, is_model_name, sha256,
+};
 use super::retrieval::Primer;
 use super::{Contract, Progress, Stage, Summary};
 use crate::diffusion::Schedule;
 use crate::generation::{Engine, Generator, ModelCard, Sampling, file_names};
+use crate::model::Family;
 use crate::store::{Location, Shard};
 use crate::units::frames_to_s;
 
-use maker::{GeneratedMotion, Maker};
+use maker::{GeneratedMotion, MotionMaker, SoloistMaker};
 use params::Settings;
 pub use params::{Params, SamplerName, Tracks};
 use report::{GeneratePlace, GenerateSummary};
@@ -59,7 +63,12 @@ impl Stage for Generate {
             Some(url) => Some(Location::open(url, &params.client.options())?),
             None => None,
         };
-        let model = open_model(&params, store.as_ref())?;
+        let files = open_model(&params, store.as_ref())?;
+        if files.family() == Family::Group {
+            return group::run(&params, store.as_ref(), files, progress);
+        }
+        let model = OpenModel::of(files)?;
+        group::refuse_for_soloists(&params, &model.card.name)?;
         let mut settings = Settings::new(&params, &model.card)?;
         let primer = match (params.prime, &store) {
             (None, _) => None,
@@ -74,7 +83,7 @@ impl Stage for Generate {
                 Some(primer)
             }
         };
-        let name = name_of_model(&params, &model.card);
+        let name = name_of_model(&params, &model.card.name);
         let run = params.run.clone().unwrap_or_else(|| name.clone());
         super::train::session::check_run_name(&run)?;
         // A single track is fastest with all threads in one worker; many keep a worker each busy.
@@ -98,7 +107,7 @@ impl Stage for Generate {
             schedule: &schedule,
             guidance: settings.guidance,
         };
-        let maker = Maker {
+        let maker = SoloistMaker {
             generator: Generator {
                 engine: &*engine,
                 sampling,
@@ -113,38 +122,8 @@ impl Stage for Generate {
             settings: &settings,
             primer: primer.as_ref(),
         };
-        let n_samples = params.samples.get();
-        let (place, done) = match (&params.output, &store) {
-            (Some(folder), _) => {
-                let target = files::FolderTarget {
-                    audio: &params.audio,
-                    folder,
-                    formats: &params.format,
-                    stream: params.stream.as_deref(),
-                    n_samples,
-                    dry_run: params.dry_run,
-                    force: params.force,
-                };
-                (GeneratePlace::Folder(folder.clone()), files::run(&maker, &target, progress)?)
-            }
-            (None, Some(store)) => {
-                let target = tracks::TrackTarget {
-                    store,
-                    shard: Shard::parse(&params.shard, |name| std::env::var(name).ok())?,
-                    params_hash: &settings.digest(&weights),
-                    force: params.force,
-                    dry_run: params.dry_run,
-                    tracks: params.tracks,
-                    split: params.split.as_deref(),
-                    phrases: &params.phrase,
-                    n_samples,
-                    n_workers: NonZeroUsize::new(engine.n_workers()).unwrap_or(NonZeroUsize::MIN),
-                };
-                let place = GeneratePlace::Store { store: store.to_string(), run: run.clone() };
-                (place, tracks::run(&maker, &target, progress)?)
-            }
-            (None, None) => bail!("nothing to do: give --store, or --audio with --output"),
-        };
+        let (place, done) =
+            make_all(&params, store.as_ref(), &maker, engine.n_workers(), progress)?;
         let took_s = started.elapsed().as_secs_f64();
         let by_card = match name == card.name {
             true => String::new(),
@@ -169,15 +148,58 @@ impl Stage for Generate {
     }
 }
 
+/// Makes every motion that is asked for, in files or in tables.
+fn make_all(
+    params: &Params,
+    store: Option<&Location>,
+    maker: &dyn MotionMaker,
+    n_workers: usize,
+    progress: &dyn Progress,
+) -> anyhow::Result<(GeneratePlace, GenerateTally)> {
+    let n_samples = params.samples.get();
+    match (&params.output, store) {
+        (Some(folder), _) => {
+            let target = files::FolderTarget {
+                audio: &params.audio,
+                folder,
+                formats: &params.format,
+                stream: params.stream.as_deref(),
+                n_samples,
+                dry_run: params.dry_run,
+                force: params.force,
+            };
+            Ok((GeneratePlace::Folder(folder.clone()), files::run(maker, &target, progress)?))
+        }
+        (None, Some(store)) => {
+            let target = tracks::TrackTarget {
+                store,
+                shard: Shard::parse(&params.shard, |name| std::env::var(name).ok())?,
+                params_hash: &maker.settings_digest(),
+                force: params.force,
+                dry_run: params.dry_run,
+                tracks: params.tracks,
+                split: params.split.as_deref(),
+                phrases: &params.phrase,
+                n_samples,
+                n_workers: NonZeroUsize::new(n_workers).unwrap_or(NonZeroUsize::MIN),
+            };
+            let run = maker.run().to_owned();
+            let place = GeneratePlace::Store { store: store.to_string(), run };
+            Ok((place, tracks::run(maker, &target, progress)?))
+        }
+        (None, None) => bail!("nothing to do: give --store, or --audio with --output"),
+    }
+}
+
 /// Opens the model of a store, or in a folder.
-fn open_model(params: &Params, store: Option<&Location>) -> anyhow::Result<OpenModel> {
-    let Some(model) = &params.model else { return OpenModel::pretrained() };
+fn open_model(params: &Params, store: Option<&Location>) -> anyhow::Result<ModelFolder> {
+    let Some(model) = &params.model else { return ModelFolder::pretrained() };
     let folder = Path::new(model);
     if [file_names::CARD, POINTER].iter().any(|name| folder.join(name).is_file()) {
-        return OpenModel::of_folder(folder);
+        return ModelFolder::of_folder(folder);
     }
     match store {
-        Some(store) => OpenModel::of_store(store, model, &params.engine.cache()),
+        Some(store) => ModelFolder::of_store(store, model, &params.engine.cache()),
         None => bail!(
             "there is no model in the folder {}; name the folder of a model (STORE/models/NAME), or give \
              --store beside its name",
@@ -187,8 +209,8 @@ fn open_model(params: &Params, store: Option<&Location>) -> anyhow::Result<OpenM
 }
 
 /// Returns what a model is called: as the user typed it, whatever its card says; a folder by its own name.
-fn name_of_model(params: &Params, card: &ModelCard) -> String {
-    let Some(typed) = &params.model else { return card.name.clone() };
+fn name_of_model(params: &Params, name_of_card: &str) -> String {
+    let Some(typed) = &params.model else { return name_of_card.to_owned() };
     let folder = Path::new(typed);
     if !folder.join(file_names::CARD).is_file() {
         return typed.clone();
@@ -196,7 +218,7 @@ fn name_of_model(params: &Params, card: &ModelCard) -> String {
     let absolute = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
     let name = absolute.file_name().map(|name| name.to_string_lossy().into_owned());
     // A folder may be called what no model can be.
-    name.filter(|name| is_model_name(name)).unwrap_or_else(|| card.name.clone())
+    name.filter(|name| is_model_name(name)).unwrap_or_else(|| name_of_card.to_owned())
 }
 
 /// Returns one digest for both networks of a model.
@@ -231,14 +253,15 @@ struct GenerateTally {
 impl GenerateTally {
     fn add_made(&mut self, made: &GeneratedMotion) {
         self.n_made += 1;
-        self.n_frames += made.frames.nrows() as u64;
-        self.made_s += frames_to_s(made.frames.nrows());
+        self.n_frames += (made.frames.dim().0 * made.n_frames()) as u64;
+        self.made_s += frames_to_s(made.n_frames());
         self.n_candidates += made.rows.len() as u64;
         let failed = made.rows.iter().any(|row| row.selected && row.checks_passed < row.n_checks);
         self.n_checks_failed += u64::from(failed);
         if let Some(moved) = made.displacement {
-            self.n_fused += made.frames.nrows() as u64;
-            self.fused_mm2 += made.frames.nrows() as f64 * moved.position_rms_mm.powi(2);
+            let n_frames = made.frames.dim().0 * made.n_frames();
+            self.n_fused += n_frames as u64;
+            self.fused_mm2 += n_frames as f64 * moved.position_rms_mm.powi(2);
             self.fused_max_mm = self.fused_max_mm.max(moved.position_max_mm);
         }
     }

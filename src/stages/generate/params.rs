@@ -12,7 +12,10 @@ use super::outputs::MotionFormat;
 use super::settings::{MotionSettings, OUTPUT_VERSION};
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
 use crate::generation::{ModelCard, OVERLAP_FRAMES};
-use crate::motion::postprocess::{Coherence, Hemisphere, PostProcessConfig, SavitzkyGolay};
+use crate::motion::postprocess::{
+    Coherence, FusionVariances, Hemisphere, PostProcessConfig, SavitzkyGolay,
+};
+use crate::motion::rates::MotionRange;
 use crate::motion::style::STYLE_DIM;
 use crate::motion::{Channel, ChannelLimits};
 use crate::stages::ClientParams;
@@ -117,6 +120,16 @@ pub struct Params {
     /// alone: the share of it that is kept, 0 to 1; needs --store with a library.
     #[arg(long, value_name = "X", help_heading = "Sampling")]
     pub prime: Option<f64>,
+    /// Dancers, for a model of the family group [default: 3]
+    #[arg(long, value_name = "N", help_heading = "Groups")]
+    pub dancers: Option<usize>,
+    /// How alike dancers move, from -1 (each in a way of their own) to 1 (in unison), for a model of the family
+    /// group; other than 0 it takes three times as long [default: 0]
+    #[arg(long, value_name = "GAMMA", allow_hyphen_values = true, help_heading = "Groups")]
+    pub consistency: Option<f64>,
+    /// Let bodies touch where they were sampled so, instead of moving them apart.
+    #[arg(long, help_heading = "Groups")]
+    pub no_separation: bool,
     /// Frames that neighbouring windows of a long track share.
     #[arg(long, value_name = "N", default_value_t = OVERLAP_FRAMES, help_heading = "Sampling")]
     pub overlap: usize,
@@ -194,8 +207,10 @@ impl PostProcessParams {
     ///
     /// # Errors
     /// A window that is even or an order that is too high, in a sentence.
-    pub fn config(&self, card: &ModelCard) -> anyhow::Result<PostProcessConfig> {
-        let (range, measured) = (card.motion_range, card.fusion_variances());
+    pub fn config(
+        &self,
+        (range, measured): (Option<MotionRange>, Option<FusionVariances>),
+    ) -> anyhow::Result<PostProcessConfig> {
         // Of a model whose errors were not measured, as those of release 0.1, velocities are derived.
         let usual = if measured.is_some() { Coherence::Fuse } else { Coherence::Derive };
         let coherence = self.coherence.unwrap_or(usual);
@@ -305,7 +320,7 @@ impl Settings {
             style: style(&params.style, card)?,
             overlap_frames: params.overlap,
             prime: None,
-            postprocess: params.postprocess.config(card)?,
+            postprocess: params.postprocess.config((card.motion_range, card.fusion_variances()))?,
             constraints,
             constraint_strength: strength,
             soft: params.soft,

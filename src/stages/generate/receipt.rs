@@ -8,9 +8,8 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
 
-use super::maker::Maker;
+use super::maker::MotionMaker;
 use super::outputs::MotionFormat;
-use super::settings::MotionSettings;
 use crate::store::{digest_of, digest_texts, write_file};
 
 /// Raised when generate writes other files for the same motion.
@@ -31,25 +30,25 @@ pub struct Receipt {
     sample: usize,
     /// Digest of the song, and of the beat list beside it.
     song: String,
-    settings: MotionSettings,
+    settings: serde_json::Value,
     /// Digests of the files, by the ends of their names.
     files: BTreeMap<String, String>,
 }
 
 impl Receipt {
     /// Returns the receipt of a motion that is not made yet.
-    pub fn new(maker: &Maker, stem: &str, song: &str, sample: usize) -> Self {
-        let settings = maker.settings.digest(maker.weights);
+    pub fn new(maker: &dyn MotionMaker, stem: &str, song: &str, sample: usize) -> Self {
+        let settings = maker.settings_digest();
         let number = sample.to_string();
-        let key = [FILES_VERSION, maker.model, &settings, stem, song, &number];
+        let key = [FILES_VERSION, maker.model(), &settings, stem, song, &number];
         Self {
             key: digest_texts(key),
-            model: maker.model.to_owned(),
-            weights: maker.weights.to_owned(),
-            seed: maker.settings.seed,
+            model: maker.model().to_owned(),
+            weights: maker.weights().to_owned(),
+            seed: maker.seed(),
             sample,
             song: song.to_owned(),
-            settings: maker.settings.to_row(),
+            settings: maker.settings(),
             files: BTreeMap::new(),
         }
     }

@@ -11,7 +11,7 @@ use std::sync::Mutex;
 use anyhow::{bail, ensure};
 use ndarray::Array2;
 
-use super::maker::{GeneratedMotion, Maker, PhraseMusic, generation_id};
+use super::maker::{GeneratedMotion, MotionMaker, PhraseMusic, generation_id};
 use super::params::Tracks;
 use super::{Generate, GenerateTally};
 use crate::stages::beats::{self, BeatSource, PhraseBeats};
@@ -83,7 +83,7 @@ type TrackOutcome = Result<GeneratedMotion, Failure>;
 /// # Errors
 /// When the store cannot be read or written; what was committed stays.
 pub fn run(
-    maker: &Maker,
+    maker: &dyn MotionMaker,
     target: &TrackTarget,
     progress: &dyn Progress,
 ) -> anyhow::Result<GenerateTally> {
@@ -92,8 +92,8 @@ pub fn run(
         return Ok(planned.done);
     }
     let shard = target.shard.to_string().replace('/', "-of-");
-    let name = format!("{}/{}/{shard}", Generate::NAME, maker.run);
-    let what = format!("run {}", maker.run);
+    let name = format!("{}/{}/{shard}", Generate::NAME, maker.run());
+    let what = format!("run {}", maker.run());
     let (lease, has_waited) = lease::take(target.store, &name, &what, &|text| progress.note(text))?;
     if has_waited {
         // The other process may have made some of the motions.
@@ -135,7 +135,7 @@ struct TrackPlan {
 }
 
 impl TrackPlan {
-    fn new(maker: &Maker, target: &TrackTarget) -> anyhow::Result<Self> {
+    fn new(maker: &dyn MotionMaker, target: &TrackTarget) -> anyhow::Result<Self> {
         let snapshot = StoreSnapshot::take(target.store)?;
         let ledger = snapshot.ledger(Generate::NAME)?;
         let mut done = GenerateTally::default();
@@ -197,7 +197,7 @@ impl MusicAhead {
 
 /// Returns the phrases that lack motions, in the order in which they are made.
 fn plan(
-    maker: &Maker,
+    maker: &dyn MotionMaker,
     target: &TrackTarget,
     snapshot: &StoreSnapshot,
     ledger: &Ledger,
@@ -256,7 +256,7 @@ fn plan(
         task.batch = batch_of(id, n_batches);
         let is_missing = |sample: &usize| {
             target.force
-                || !ledger.get(&generation_id(maker.run, id, *sample)).is_some_and(|known| {
+                || !ledger.get(&generation_id(maker.run(), id, *sample)).is_some_and(|known| {
                     known.params_hash == target.params_hash
                         && known.item.succeeded()
                         && known.item.input_hash == task.row.content_hash
@@ -273,7 +273,7 @@ fn plan(
 
 /// Makes the phrases of a batch side by side.
 fn make_batch(
-    maker: &Maker,
+    maker: &dyn MotionMaker,
     target: &TrackTarget,
     tasks: &[TrackTask],
     ahead: &MusicAhead,
@@ -311,7 +311,7 @@ fn make_batch(
                 None => Err(without_features(&task.row, target.store, ahead.unknown.as_deref())),
             };
             progress.advance(frames_to_s(task.n_frames).round() as u64);
-            lock(&outcomes).insert(generation_id(maker.run, id, sample), outcome);
+            lock(&outcomes).insert(generation_id(maker.run(), id, sample), outcome);
             Ok(())
         },
     )?;
@@ -350,7 +350,7 @@ fn with_old_features(row: &PhraseRow, store: &Location) -> Failure {
 
 /// Writes a batch: its motions, what is known of them, and what failed.
 fn commit(
-    maker: &Maker,
+    maker: &dyn MotionMaker,
     target: &TrackTarget,
     ledger: &Ledger,
     tasks: &[TrackTask],
@@ -360,7 +360,7 @@ fn commit(
         .iter()
         .flat_map(|task| task.samples.iter().map(move |&sample| (task, sample)))
         .map(|(task, sample)| {
-            (generation_id(maker.run, &task.row.phrase_id, sample), (task, sample))
+            (generation_id(maker.run(), &task.row.phrase_id, sample), (task, sample))
         })
         .collect();
     let mut commit = Commit::new(target.store, Generate::NAME, target.params_hash, ITEMS_FROM);
@@ -382,14 +382,14 @@ fn commit(
         match outcome {
             Ok(made) => {
                 let labels = [
-                    Label::Text(maker.run.to_owned()),
+                    Label::Text(maker.run().to_owned()),
                     Label::Text(row.phrase_id.clone()),
                     Label::Number(sample as i32),
                 ];
                 let part = commit.part(tables::GENERATED, tables::generated)?;
-                part.write_labelled_frames(&id, &labels, made.frames.view())?;
+                part.write_labelled_group(&id, &labels, made.frames.view())?;
                 let part = commit.part(tables::DECODED, tables::decoded)?;
-                part.write_labelled_frames(&id, &labels, made.decoded.view())?;
+                part.write_labelled_group(&id, &labels, made.decoded.view())?;
                 generations.extend(made.rows);
             }
             Err(failure) => failures.push(FailureRow {

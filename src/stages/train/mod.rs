@@ -238,7 +238,7 @@ impl<'a> Run<'a> {
     ) -> anyhow::Result<Box<dyn Summary>> {
         let machine = &self.params.machine;
         let phrases =
-            read_phrases(self.store, Train::NAME, machine, None, progress, self.watch, true)?;
+            read_phrases(self.store, Train::NAME, (machine, Family::Unet), None, progress, self.watch, true)?;
         let n_frames = config.network.window_frames;
         let windows = Windows::new(
             phrases.dataset,
@@ -266,7 +266,7 @@ impl<'a> Run<'a> {
         let params = self.params;
         let machine = &params.machine;
         let phrases =
-            read_phrases(self.store, Train::NAME, machine, None, progress, self.watch, false)?;
+            read_phrases(self.store, Train::NAME, (machine, Family::Unet), None, progress, self.watch, false)?;
         let threads = Arc::new(params.machine.start_threads()?);
         let n_frames = config.network.window_frames;
         let scales = scales(&phrases.dataset, n_frames, self.watch)?;

@@ -10,6 +10,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::autodiff::Threads;
+use crate::model::Family;
 use crate::stages::{Progress, all_threads, lease};
 use crate::store::tables::FailureRow;
 use crate::store::{
@@ -136,7 +137,7 @@ pub struct TrainingPhrases {
 pub fn read_phrases(
     store: &Location,
     command: &'static str,
-    machine: &MachineParams,
+    (machine, family): (&MachineParams, Family),
     max_train_phrases: Option<usize>,
     progress: &dyn Progress,
     watch: &ProgressWatch,
@@ -147,6 +148,7 @@ pub fn read_phrases(
         n_threads: machine.threads,
         patience: machine.patience(),
         max_train_phrases,
+        family,
     };
     let is_begun = Mutex::new(false);
     let count = |_: usize, n_parts: usize| {

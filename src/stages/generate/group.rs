@@ -1,0 +1,372 @@
+//! Motion of groups: a model of the family `group`, its settings, and how its motions are made.
+
+use std::num::NonZeroUsize;
+use std::time::Instant;
+
+use anyhow::{Context as _, bail, ensure};
+use ndarray::{Array2, Array3, ArrayView2, Axis, concatenate};
+use serde::{Deserialize, Serialize};
+
+use super::maker::{GeneratedMotion, MotionMaker, PhraseMusic, generation_id, seed_of};
+use super::params::{Params, SamplerName};
+use super::report::GenerateSummary;
+use super::settings::OUTPUT_VERSION;
+use super::{make_all, name_of_model};
+use crate::autodiff::Parameters;
+use crate::diffusion::{Sampler, SamplerConfig, Schedule};
+use crate::evaluation::{derivative_error, score};
+use crate::generation::{
+    EngineError, GroupCard, GroupEngine, GroupGenerator, GroupTrack, ModelFileName,
+};
+use crate::model::{GroupNetworks, MAX_DANCERS, Parameter, condition};
+use crate::motion::group::{BODY_RADIUS_M, separate};
+use crate::motion::postprocess::{PostProcessConfig, process};
+use crate::motion::{Channel, bar_phase, clock};
+use crate::onnx::{Model, values_of};
+use crate::stages::failure::{Failure, FailureKind, guarded};
+use crate::stages::model_folder::ModelFolder;
+use crate::stages::train::session::check_run_name;
+use crate::stages::{Progress, Summary};
+use crate::store::tables::GenerationRow;
+use crate::store::{Location, TimestampUs, digest};
+use crate::units::frames_to_s;
+
+/// Dancers, unless the user says otherwise.
+const DEFAULT_DANCERS: usize = 3;
+
+/// Refuses what only groups know, for a model of one dancer.
+///
+/// # Errors
+/// One sentence.
+pub fn refuse_for_soloists(params: &Params, model: &str) -> anyhow::Result<()> {
+    let is_group = "is of the family unet, which makes one dancer; name one of the family group with --model";
+    if let Some(n) = params.dancers.filter(|&n| n != 1) {
+        bail!("--dancers {n}: model {model} {is_group}, or leave --dancers out");
+    }
+    if let Some(gamma) = params.consistency {
+        bail!("--consistency {gamma}: model {model} {is_group}, or leave --consistency out");
+    }
+    Ok(())
+}
+
+/// The settings that determine a motion of a group beside its music and its sample: the column `settings` of
+/// `generations`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct GroupSettings {
+    /// The version of what generate writes.
+    output_version: u32,
+    n_dancers: usize,
+    /// γ: how alike dancers move.
+    consistency: f64,
+    sampler: SamplerConfig,
+    /// 1 follows the music, more exaggerates it, 0 ignores it.
+    guidance: f64,
+    /// Frames that neighbouring windows share.
+    overlap_frames: usize,
+    postprocess: PostProcessConfig,
+    /// Whether bodies are moved apart where they would touch.
+    separation: bool,
+    /// Whether the clock is withheld from a network that hears it.
+    no_clock: bool,
+}
+
+impl GroupSettings {
+    fn new(params: &Params, card: &GroupCard) -> anyhow::Result<Self> {
+        let only_soloists = [
+            ("--constraints", params.constraints.is_some()),
+            ("--prime", params.prime.is_some()),
+            ("--style", !params.style.is_empty()),
+            ("--stream", params.stream.is_some()),
+            ("--best-of", params.best_of.get() > 1),
+        ];
+        for (flag, _) in only_soloists.into_iter().filter(|(_, is_given)| *is_given) {
+            bail!(
+                "{flag}: model {} is of the family group, which does not know it; leave it out, or name a model of \
+                 the family unet",
+                card.name
+            );
+        }
+        let n_dancers = params.dancers.unwrap_or(DEFAULT_DANCERS);
+        ensure!(
+            (1..=MAX_DANCERS).contains(&n_dancers),
+            "--dancers {n_dancers} is none of 1 to {MAX_DANCERS}; make larger groups of several"
+        );
+        let consistency = params.consistency.unwrap_or(0.0);
+        ensure!(
+            (-1.0..=1.0).contains(&consistency),
+            "--consistency {consistency} is not from -1 to 1; give -1 for dancers who go each a way of their own, 1 \
+             for unison"
+        );
+        let schedule = Schedule::new(&card.diffusion)?;
+        let sampler = match params.sampler {
+            SamplerName::Ddpm => Sampler::Ddpm,
+            SamplerName::Ddim => Sampler::Ddim { eta: params.eta },
+            SamplerName::DpmSolver => Sampler::DpmSolver,
+        };
+        let n_steps = params.steps.unwrap_or_else(|| sampler.usual_steps(schedule.len()));
+        let sampler = SamplerConfig { sampler, n_steps, spacing: params.spacing, clip: true };
+        sampler.check(schedule.len())?;
+        let guidance = params.guidance.unwrap_or_else(|| card.guidance());
+        ensure!(
+            guidance >= 0.0 && guidance.is_finite(),
+            "--guidance {guidance} is below 0; give 1 to follow the music, more to exaggerate it"
+        );
+        ensure!(
+            params.overlap < card.window_frames,
+            "--overlap {} is not below the {} frames of a window of model {}; give a smaller number",
+            params.overlap,
+            card.window_frames,
+            card.name
+        );
+        Ok(Self {
+            output_version: OUTPUT_VERSION,
+            n_dancers,
+            consistency,
+            sampler,
+            guidance,
+            overlap_frames: params.overlap,
+            postprocess: params.postprocess.config((card.motion_range, card.fusion_variances()))?,
+            separation: !params.no_separation && !params.postprocess.raw,
+            no_clock: params.no_clock,
+        })
+    }
+
+    fn to_json(&self) -> serde_json::Value {
+        serde_json::to_value(self).expect("invariant: numbers and texts become JSON")
+    }
+}
+
+/// Runs the stage with a model of groups.
+///
+/// # Errors
+/// Settings that the model does not know, and what files or the store say.
+pub fn run(
+    params: &Params,
+    store: Option<&Location>,
+    files: ModelFolder,
+    progress: &dyn Progress,
+) -> anyhow::Result<Box<dyn Summary>> {
+    let started = Instant::now();
+    let card = GroupCard::read(files.card_bytes(), files.card_place())?;
+    let settings = GroupSettings::new(params, &card)?;
+    let name = name_of_model(params, &card.name);
+    let run = params.run.clone().unwrap_or_else(|| name.clone());
+    check_run_name(&run)?;
+    let is_single = params.audio.len() == 1 || params.phrase.len() == 1;
+    let threads = params.engine.threads;
+    let n_workers = if is_single { NonZeroUsize::MIN } else { threads };
+    let n_threads =
+        NonZeroUsize::new(threads.get() / n_workers.get()).unwrap_or(NonZeroUsize::MIN);
+    let parameters = parameters(&files, &card)?;
+    let workers = (n_workers, n_threads);
+    let engine = GroupEngine::new(&card.group, parameters, &card.feature_scale, workers)
+        .context("while starting threads")?;
+    let schedule = Schedule::new(&card.diffusion)?;
+    let maker = GroupMaker {
+        generator: GroupGenerator {
+            engine: &engine,
+            sampler: &settings.sampler,
+            schedule: &schedule,
+            guidance: settings.guidance,
+            consistency: settings.consistency,
+            normalizer: &card.normalizer,
+            window_frames: card.window_frames,
+            overlap_frames: settings.overlap_frames,
+        },
+        card: &card,
+        model: &name,
+        run: &run,
+        seed: params.seed,
+        settings: &settings,
+    };
+    let (place, done) = make_all(params, store, &maker, engine.n_workers(), progress)?;
+    let made_with = format!(
+        "model {name} (family group), {} dancers, consistency {}, {} ({}), {} in {} steps, guidance {}",
+        settings.n_dancers,
+        settings.consistency,
+        engine.name(),
+        engine.n_workers(),
+        settings.sampler.sampler.name(),
+        settings.sampler.n_steps,
+        settings.guidance
+    );
+    let (dry_run, took_s) = (params.dry_run, started.elapsed().as_secs_f64());
+    Ok(Box::new(GenerateSummary { place, done, model: name, made_with, dry_run, took_s }))
+}
+
+/// Reads the weights of both networks.
+fn parameters(files: &ModelFolder, card: &GroupCard) -> anyhow::Result<Parameters<f32>> {
+    let model = |name| -> anyhow::Result<(Model, String)> {
+        let place = files.place_of(name);
+        Ok((Model::read(files.read(name)?, None, &place)?, place))
+    };
+    let models = [model(ModelFileName::Denoiser)?, model(ModelFileName::Score)?];
+    let (_, list) = GroupNetworks::new(&card.group);
+    let values = |parameter: &Parameter| {
+        let (is_denoiser, name) = GroupNetworks::own_name(&parameter.name);
+        let own = Parameter { name: name.to_owned(), ..parameter.clone() };
+        let (model, place) = &models[usize::from(!is_denoiser)];
+        values_of(model, &own, place)
+    };
+    // Looked up first, since filling cannot fail.
+    for (_, parameter) in list.iter() {
+        values(parameter)?;
+    }
+    Ok(Parameters::from_fn(list, |parameter| values(parameter).expect("looked up before")))
+}
+
+/// Generates motions of groups.
+struct GroupMaker<'a> {
+    generator: GroupGenerator<'a>,
+    card: &'a GroupCard,
+    model: &'a str,
+    run: &'a str,
+    seed: u64,
+    settings: &'a GroupSettings,
+}
+
+impl MotionMaker for GroupMaker<'_> {
+    fn model(&self) -> &str {
+        self.model
+    }
+
+    fn weights(&self) -> &str {
+        &self.card.weights_sha256
+    }
+
+    fn run(&self) -> &str {
+        self.run
+    }
+
+    fn seed(&self) -> u64 {
+        self.seed
+    }
+
+    fn settings(&self) -> serde_json::Value {
+        self.settings.to_json()
+    }
+
+    fn settings_digest(&self) -> String {
+        let text = format!("{}\n{}\n{}", self.settings.to_json(), self.weights(), self.seed);
+        digest(text.as_bytes())
+    }
+
+    fn make(
+        &self,
+        music: &PhraseMusic,
+        sample: usize,
+        _watch: &mut dyn FnMut(ArrayView2<f32>) -> std::io::Result<()>,
+    ) -> Result<GeneratedMotion, Failure> {
+        guarded(music.source, || self.sample(music, sample))
+    }
+}
+
+impl GroupMaker<'_> {
+    fn sample(&self, music: &PhraseMusic, sample: usize) -> Result<GeneratedMotion, Failure> {
+        let started = Instant::now();
+        let n_frames = music.features.nrows();
+        let phase = music.beats.as_ref().map(|beats| {
+            let times_s: Vec<f64> = (0..n_frames).map(frames_to_s).collect();
+            bar_phase(&times_s, beats)
+        });
+        let bars = phase.as_deref().filter(|_| music.has_downbeats);
+        let known = bars.filter(|_| !self.settings.no_clock).zip(music.beats.as_ref());
+        let clock = known.map(|(bars, beats)| clock(bars, beats.beats_per_bar()));
+        let clock = clock.as_ref().map(|clock| clock.view());
+        let hears = self.card.group.condition();
+        let heard = condition(hears, music.features, clock);
+        let seed = seed_of(self.seed, music.phrase_id, sample, 0);
+        let track = GroupTrack {
+            condition: heard.view(),
+            phase: bars.filter(|_| hears.clock && clock.is_some()),
+            seed,
+            n_dancers: self.settings.n_dancers,
+        };
+        let mut parts: Vec<Array3<f32>> = Vec::new();
+        let emit = |frames| -> Result<(), EngineError> {
+            parts.push(frames);
+            Ok(())
+        };
+        self.generator
+            .run(&track, emit)
+            .map_err(|e| Failure::new(FailureKind::Engine, music.source, e))?;
+        let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
+        let decoded = concatenate(Axis(1), &views).expect("invariant: parts of one group");
+        let mut frames = decoded.clone();
+        for mut dancer in frames.outer_iter_mut() {
+            let mut motion: Array2<f32> = dancer.to_owned();
+            process(&self.settings.postprocess, &mut motion, bars);
+            dancer.assign(&motion);
+        }
+        if self.settings.separation {
+            frames = separate(frames.view(), BODY_RADIUS_M)
+                .map_err(|e| Failure::new(FailureKind::NonFinite, music.source, e))?;
+        }
+        let seconds = started.elapsed().as_secs_f64();
+        let row = self.row(music, sample, seed, (&frames, &decoded), bars, seconds);
+        Ok(GeneratedMotion { frames, decoded, rows: vec![row], displacement: None, seconds })
+    }
+
+    fn row(
+        &self,
+        music: &PhraseMusic,
+        sample: usize,
+        seed: u64,
+        (frames, decoded): (&Array3<f32>, &Array3<f32>),
+        bars: Option<&[f64]>,
+        generate_s: f64,
+    ) -> GenerationRow {
+        let settings = self.settings;
+        let (n_dancers, n_frames, _) = frames.dim();
+        let errors = decoded.outer_iter().map(|dancer| {
+            derivative_error(dancer, Channel::Position, Channel::Velocity)
+        });
+        let velocity_error = errors.sum::<f64>() / n_dancers as f64;
+        let limits = settings.postprocess.limits;
+        let scores: Vec<_> = frames
+            .outer_iter()
+            .map(|dancer| score(dancer, limits, bars, velocity_error))
+            .collect();
+        let mean = |values: Vec<Option<f64>>| {
+            let values: Option<Vec<f64>> = values.into_iter().collect();
+            values.map(|values| values.iter().sum::<f64>() / n_dancers as f64)
+        };
+        let sum = |of: fn(&crate::evaluation::Score) -> usize| scores.iter().map(of).sum::<usize>();
+        GenerationRow {
+            generation: generation_id(self.run, music.phrase_id, sample),
+            run: self.run.to_owned(),
+            phrase_id: music.phrase_id.to_owned(),
+            sample: sample as i32,
+            candidate: 0,
+            selected: true,
+            seed: seed as i64,
+            model: self.model.to_owned(),
+            weights: self.card.weights_sha256.clone(),
+            engine: self.generator.engine.name().to_owned(),
+            sampler: settings.sampler.sampler.name().to_owned(),
+            n_steps: settings.sampler.n_steps as i32,
+            guidance: settings.guidance,
+            eta: match settings.sampler.sampler {
+                Sampler::Ddim { eta } => Some(eta),
+                Sampler::Ddpm | Sampler::DpmSolver => None,
+            },
+            primed_by: None,
+            n_frames: n_frames as i64,
+            n_windows: self.generator.windows(n_frames).len() as i32,
+            score: mean(scores.iter().map(|score| score.total).collect()),
+            checks_passed: sum(|score| score.n_passed) as i32,
+            n_checks: sum(|score| score.n_checks) as i32,
+            locking: mean(scores.iter().map(|score| score.locking).collect()),
+            velocity_error,
+            control_error_mm: None,
+            control_error_deg: None,
+            generate_s,
+            real_time_factor: generate_s / frames_to_s(n_frames).max(f64::MIN_POSITIVE),
+            settings: Some(settings.to_json().to_string()),
+            content_hash: Some(music.content_hash.to_owned()),
+            n_dancers: Some(n_dancers as i32),
+            consistency: Some(settings.consistency),
+            time: TimestampUs::now(),
+        }
+    }
+}
