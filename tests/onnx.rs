@@ -2,6 +2,7 @@
 
 mod export;
 mod files;
+mod group;
 mod networks;
 mod operations;
 

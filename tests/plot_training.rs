@@ -51,6 +51,8 @@ fn row(run: &str, stage: &str, kind: RowKind, epoch: i32, step: i64) -> Training
         acceleration_error: None,
         quaternion_pass_rate: None,
         speed_ratio: None,
+        markers: None,
+        contrast: None,
         gradient_norm: None,
         skipped: false,
         samples_per_s: None,
