@@ -24,7 +24,6 @@ pub use graph::{
 };
 pub use group::{
     GroupConfig, GroupDenoiser, GroupInputs, GroupNetworks, GroupPrediction, GroupScore, GroupScoreInputs,
-    MAX_DANCERS,
 };
 pub use layers::{AttentionBlock, Conv1d, GroupNorm, LayerNorm, Linear, ResBlock};
 pub use outline::{ActivationCounts, Layer, Outline};

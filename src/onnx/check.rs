@@ -13,7 +13,7 @@ use super::proto::{AttributeType, DataType, Graph, Model, Node, Tensor};
 /// The operators that are written: name, fewest and most inputs, attributes.
 ///
 /// Versions: the newest of each up to opset 21 (<https://onnx.ai/onnx/operators>).
-const OPERATORS: [(&str, usize, usize, &[&str]); 40] = [
+const OPERATORS: [(&str, usize, usize, &[&str]); 44] = [
     ("Add", 2, 2, &[]),
     ("Cast", 1, 1, &["to"]),
     ("Concat", 1, usize::MAX, &["axis"]),
@@ -22,6 +22,7 @@ const OPERATORS: [(&str, usize, usize, &[&str]); 40] = [
     ("DequantizeLinear", 2, 3, &["axis"]),
     ("Div", 2, 2, &[]),
     ("Equal", 2, 2, &[]),
+    ("Expand", 2, 2, &[]),
     ("Gather", 2, 2, &["axis"]),
     ("Gelu", 1, 1, &["approximate"]),
     ("Greater", 2, 2, &[]),
@@ -39,6 +40,8 @@ const OPERATORS: [(&str, usize, usize, &[&str]); 40] = [
     ("Pad", 2, 4, &["mode"]),
     ("Range", 3, 3, &[]),
     ("ReduceL2", 1, 2, &["keepdims"]),
+    ("ReduceMean", 1, 2, &["keepdims"]),
+    ("ReduceSum", 1, 2, &["keepdims"]),
     ("Relu", 1, 1, &[]),
     ("Reshape", 2, 2, &[]),
     ("Resize", 1, 4, &["mode", "coordinate_transformation_mode", "nearest_mode"]),
@@ -48,6 +51,7 @@ const OPERATORS: [(&str, usize, usize, &[&str]); 40] = [
     ("Slice", 3, 5, &[]),
     ("Softmax", 1, 1, &["axis"]),
     ("Split", 1, 2, &["axis", "num_outputs"]),
+    ("Sqrt", 1, 1, &[]),
     ("Squeeze", 1, 2, &[]),
     ("Sub", 2, 2, &[]),
     ("Tanh", 1, 1, &[]),

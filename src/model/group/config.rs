@@ -6,9 +6,8 @@ use crate::audio::FEATURE_DIM;
 use crate::model::condition::ConditionConfig;
 use crate::model::unet::{ConfigError, MAX_BLOCKS, MAX_WIDTH, Preset};
 use crate::motion::MOTION_DIM;
+use crate::motion::group::MAX_DANCERS;
 
-/// Dancers that a group may have.
-pub const MAX_DANCERS: usize = 16;
 /// Layers of the mapping from noise and music to the group embedding.
 pub const MAPPING_LAYERS: usize = 8;
 

@@ -18,7 +18,7 @@ use std::sync::Arc;
 use ndarray::Array2;
 
 use self::block::GroupBlock;
-pub use self::config::{GroupConfig, MAX_DANCERS};
+pub use self::config::GroupConfig;
 use self::embedding::GroupEmbedding;
 use self::layers::{EncoderLayer, Memory};
 pub use self::score::{GroupScore, GroupScoreInputs};

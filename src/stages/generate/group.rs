@@ -18,8 +18,8 @@ use crate::evaluation::{derivative_error, score};
 use crate::generation::{
     EngineError, GroupCard, GroupEngine, GroupGenerator, GroupTrack, ModelFileName,
 };
-use crate::model::{GroupNetworks, MAX_DANCERS, Parameter, condition};
-use crate::motion::group::{BODY_RADIUS_M, separate};
+use crate::model::{GroupNetworks, Parameter, condition};
+use crate::motion::group::{MAX_DANCERS, RADIUS_M, separate};
 use crate::motion::postprocess::{PostProcessConfig, process};
 use crate::motion::{Channel, bar_phase, clock};
 use crate::onnx::{Model, values_of};
@@ -299,7 +299,7 @@ impl GroupMaker<'_> {
             dancer.assign(&motion);
         }
         if self.settings.separation {
-            frames = separate(frames.view(), BODY_RADIUS_M)
+            frames = separate(frames.view(), RADIUS_M)
                 .map_err(|e| Failure::new(FailureKind::NonFinite, music.source, e))?;
         }
         let seconds = started.elapsed().as_secs_f64();
