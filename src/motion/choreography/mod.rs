@@ -13,6 +13,7 @@ pub mod accent;
 pub mod activity;
 pub mod beat_grid;
 pub mod floor;
+pub mod group;
 mod joining;
 pub mod primitive;
 pub mod selection;
