@@ -51,7 +51,7 @@ const MAY_USE: [(&str, &[&str]); 20] = [
 ];
 
 /// Crates that only one place may name: crate, where.
-const KEPT_TO: [(&str, &str); 18] = [
+const KEPT_TO: [(&str, &str); 19] = [
     ("polars", "store/query"),
     ("sqlparser", "store/sql.rs"),
     ("object_store", "store/"),
@@ -69,6 +69,7 @@ const KEPT_TO: [(&str, &str); 18] = [
     ("safetensors", "weights.rs"),
     ("ort", "onnx/"),
     ("rustysynth", "music/"),
+    ("pathfinding", "motion/group/"),
     ("prost", "onnx/"),
 ];
 

@@ -4,10 +4,10 @@
 //! what networks are trained on. What two neighbours share is therefore the same motion only after the
 //! earlier one's part is placed like a window of its own.
 
-use ndarray::{Array2, ArrayView2, ArrayViewMut2, s};
+use ndarray::{Array2, ArrayView2, s};
 
-use crate::motion::quaternion::{Quaternion, dot, slerp};
-use crate::motion::{Channel, MOTION_DIM, Placement};
+use crate::motion::blend::{align_signs, blend};
+use crate::motion::{MOTION_DIM, Placement};
 
 /// Makes a window and the next agree on what they share; both in metres, `[T, 25]`.
 ///
@@ -15,9 +15,9 @@ use crate::motion::{Channel, MOTION_DIM, Placement};
 /// the later window in it and from the earlier one in that. `shift` frames of the earlier window come
 /// before the later one's first.
 pub fn agree(earlier: &mut Array2<f32>, later: &mut Array2<f32>, shift: usize) {
-    let (blend, placement) = blended(earlier.view(), later.view(), shift);
-    later.slice_mut(s![..blend.nrows(), ..]).assign(&blend);
-    let mut back = blend;
+    let (shared, placement) = blended(earlier.view(), later.view(), shift);
+    later.slice_mut(s![..shared.nrows(), ..]).assign(&shared);
+    let mut back = shared;
     placement.restore(&mut back);
     let sign_of = earlier.slice(s![shift..shift + 1, ..]).to_owned();
     align_signs(sign_of.view(), &mut back.view_mut());
@@ -26,8 +26,8 @@ pub fn agree(earlier: &mut Array2<f32>, later: &mut Array2<f32>, shift: usize) {
 
 /// Brings the beginning of a window to the end of one that does not change any more.
 pub fn follow(earlier: ArrayView2<f32>, later: &mut Array2<f32>, shift: usize) {
-    let (blend, _) = blended(earlier, later.view(), shift);
-    later.slice_mut(s![..blend.nrows(), ..]).assign(&blend);
+    let (shared, _) = blended(earlier, later.view(), shift);
+    later.slice_mut(s![..shared.nrows(), ..]).assign(&shared);
 }
 
 /// Returns the frames that two windows share, placed as the later one is, and where the earlier one has
@@ -41,75 +41,19 @@ fn blended(
     let placement = Placement::of_first(a.view()).unwrap_or_default();
     placement.remove(&mut a);
     let n = a.nrows().min(later.nrows());
-    let blend = cross_fade(a.slice(s![..n, ..]), later.slice(s![..n, ..]));
-    (blend, placement)
+    (cross_fade(a.slice(s![..n, ..]), later.slice(s![..n, ..])), placement)
 }
 
 /// Fades one motion into another, `[T, 25]` each: all of the first at the first frame, all of the second
 /// behind the last.
 ///
-/// The weight is 3u² − 2u³, u = t / T, so that both ends join smoothly. Orientations are turned along the
-/// shorter arc, phases round the shorter way of the bar.
+/// The weight is 3u² − 2u³, u = t / T, so that both ends join smoothly.
 pub fn cross_fade(a: ArrayView2<f32>, b: ArrayView2<f32>) -> Array2<f32> {
     let n = a.nrows();
-    let mut blend = a.to_owned();
-    for (t, (mut row, b)) in blend.rows_mut().into_iter().zip(b.rows()).enumerate() {
+    blend(a, b, |t| {
         let u = t as f64 / n.max(1) as f64;
-        let w = u * u * (3.0 - 2.0 * u);
-        let at = |i: usize| f64::from(b[i]);
-        for channel in Channel::ALL {
-            match channel {
-                Channel::Quaternion => {
-                    let first = channel.range().start;
-                    let from: Quaternion = std::array::from_fn(|i| f64::from(row[first + i]));
-                    let to: Quaternion = std::array::from_fn(|i| at(first + i));
-                    for (i, x) in channel.range().zip(between(from, to, w)) {
-                        row[i] = x as f32;
-                    }
-                }
-                Channel::Phase => {
-                    let i = channel.range().start;
-                    let from = f64::from(row[i]);
-                    // The shorter way, which may lead over a downbeat. Where it does not nothing is wrapped:
-                    // estimates on their way to a phase may lie outside [0, 1).
-                    let n_bars = (at(i) - from).round();
-                    let x = from + w * (at(i) - from - n_bars);
-                    row[i] = if n_bars == 0.0 { x } else { x.rem_euclid(1.0) } as f32;
-                }
-                _ => {
-                    for i in channel.range() {
-                        let from = f64::from(row[i]);
-                        row[i] = (from + w * (at(i) - from)) as f32;
-                    }
-                }
-            }
-        }
-    }
-    blend
-}
-
-/// Turns from one orientation to another along the shorter arc; lengths, which estimates have, are blended
-/// apart.
-fn between(from: Quaternion, to: Quaternion, w: f64) -> Quaternion {
-    let (a, b) = (dot(from, from).sqrt(), dot(to, to).sqrt());
-    if !(a > 1e-9 && b > 1e-9) {
-        return std::array::from_fn(|i| from[i] + w * (to[i] - from[i]));
-    }
-    let length = a + w * (b - a);
-    slerp(from.map(|x| x / a), to.map(|x| x / b), w).map(|x| x * length)
-}
-
-/// Gives all orientations the sign that is nearer to the first frame of what they follow.
-fn align_signs(like: ArrayView2<f32>, frames: &mut ArrayViewMut2<f32>) {
-    let columns = Channel::Quaternion.range();
-    let (Some(a), Some(b)) = (like.rows().into_iter().next(), frames.rows().into_iter().next())
-    else {
-        return;
-    };
-    let sum: f32 = columns.clone().map(|i| a[i] * b[i]).sum();
-    if sum < 0.0 {
-        frames.slice_mut(s![.., columns]).mapv_inplace(|x| -x);
-    }
+        u * u * (3.0 - 2.0 * u)
+    })
 }
 
 /// Puts the windows of a track one after another, as they are finished.
@@ -155,6 +99,7 @@ mod tests {
     use super::*;
     use crate::generation::walk::walk;
     use crate::generation::windows::Windows;
+    use crate::motion::Channel;
     use ndarray::{Axis, concatenate};
 
     fn windows_of(track: &Array2<f32>, windows: &Windows) -> Vec<Array2<f32>> {

@@ -13,7 +13,9 @@
 //! Everything here is pure: text and numbers in, numbers or a named error out.
 
 pub mod augment;
+mod banded;
 mod beat_list;
+pub mod blend;
 pub mod bvh;
 pub mod capture;
 pub mod channels;
@@ -21,6 +23,7 @@ pub mod choreography;
 pub mod clock;
 pub mod exchange;
 pub mod formats;
+pub mod group;
 pub mod kinematics;
 pub mod locking;
 pub mod lowpass;

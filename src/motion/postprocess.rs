@@ -9,7 +9,6 @@
 //! so that the checks find it. Neither are derived values held within limits: held, they would no longer
 //! be differences. It is poses that are held, where a range says how fast they may change.
 
-mod banded;
 mod config;
 mod fusion;
 #[cfg(test)]

@@ -21,9 +21,9 @@
 
 use ndarray::Array2;
 
-use super::banded::{Equation, SPAN, Solution};
 use super::turning::Turning;
 use super::variances::{AxisVariances, FusionVariances};
+use crate::motion::banded::{Equation, SPAN, Solution};
 use crate::motion::quaternion::{Quaternion, angular_velocity, normalize};
 use crate::units::FPS;
 

@@ -2,9 +2,9 @@
 
 use std::f64::consts::TAU;
 
-use super::banded::{Equation, SPAN, Solution};
 use super::fusion::{FusionMeasurements, HeldPoses, size};
 use super::variances::{AxisVariances, FusionVariances};
+use crate::motion::banded::{Equation, SPAN, Solution};
 use crate::motion::quaternion::{
     Quaternion, angular_velocity, dot, from_rotation_vector, mul, normalize,
 };

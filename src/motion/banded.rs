@@ -25,14 +25,15 @@ impl Equation {
 
 /// The lower half of a symmetric matrix A, `[n, n]`, with `A[i, j] = 0` where `i - j > bandwidth`.
 #[derive(Clone, Debug)]
-struct BandedMatrix {
+pub struct BandedMatrix {
     bandwidth: usize,
     /// `A[i, i - k]` at `i (bandwidth + 1) + k`.
     entries: Vec<f64>,
 }
 
 impl BandedMatrix {
-    fn zeros(n: usize, bandwidth: usize) -> Self {
+    /// A = 0.
+    pub fn zeros(n: usize, bandwidth: usize) -> Self {
         Self { bandwidth, entries: vec![0.0; n * (bandwidth + 1)] }
     }
 
@@ -45,8 +46,23 @@ impl BandedMatrix {
         self.entries[i.max(j) * (self.bandwidth + 1) + i.abs_diff(j)]
     }
 
-    fn at_mut(&mut self, i: usize, j: usize) -> &mut f64 {
+    /// The one place in which both are.
+    pub fn at_mut(&mut self, i: usize, j: usize) -> &mut f64 {
         &mut self.entries[i.max(j) * (self.bandwidth + 1) + i.abs_diff(j)]
+    }
+
+    /// `A[i, i]`, `A[i, i - 1]` and so on.
+    fn row(&self, i: usize) -> &[f64] {
+        &self.entries[i * (self.bandwidth + 1)..(i + 1) * (self.bandwidth + 1)]
+    }
+
+    /// Puts x of `A x = b` in the place of b; A is positive definite. O(n bandwidth²).
+    ///
+    /// Source: Golub and Van Loan, Matrix Computations, section 4.3.5 (band Cholesky; here without
+    /// square roots).
+    pub fn solve(mut self, b: &mut [f64]) {
+        factor(&mut self);
+        substitute(&self, b);
     }
 }
 
@@ -59,8 +75,7 @@ pub struct Solution {
 
 impl Solution {
     /// Solves `A x = b`, `A = Σ c cᵀ / σ²`, `b = Σ c y / σ²`, over the unknowns that are free; the others
-    /// are 0. Source: Golub and Van Loan, Matrix Computations, section 4.3.5 (band Cholesky; here
-    /// without square roots). O(n bandwidth²).
+    /// are 0. O(n bandwidth²).
     ///
     /// Every free unknown needs an equation of its own, else A is singular and x not finite.
     pub fn new(
@@ -84,8 +99,7 @@ impl Solution {
         for i in (0..is_free.len()).filter(|i| !is_free[*i]) {
             *a.at_mut(i, i) = 1.0;
         }
-        factor(&mut a);
-        substitute(&a, &mut x);
+        a.solve(&mut x);
         Self { x }
     }
 }
@@ -96,7 +110,9 @@ fn factor(a: &mut BandedMatrix) {
         let first = i.saturating_sub(a.bandwidth);
         // L[i, j] D[j] first, of which L[i, j] and D[i] follow.
         for j in first..i {
-            let known: f64 = (first..j).map(|k| a.at(i, k) * a.at(j, k)).sum();
+            // Σ over k from `first` to j - 1 of A[i, k] A[j, k]; rows hold them backwards.
+            let (here, above) = (&a.row(i)[i - j + 1..=i - first], &a.row(j)[1..=j - first]);
+            let known: f64 = here.iter().zip(above).rev().map(|(x, y)| x * y).sum();
             *a.at_mut(i, j) -= known;
         }
         for j in first..i {
