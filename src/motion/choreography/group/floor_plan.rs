@@ -1,13 +1,12 @@
 //! Where every dancer's place is at every moment, and how far from it a dancer may step.
 
+use super::super::super::group::RADIUS_M;
 use super::super::super::placement::Placement;
 use super::super::super::style::Window;
 use super::formation::{least_distance_m, pairs};
 use super::plan::GroupSpan;
 use crate::units::frames_to_s;
 
-/// Radius of a dancer's body, m.
-pub const BODY_RADIUS_M: f64 = 0.35;
 /// Kept between two bodies beyond their radii, m.
 const MARGIN_M: f64 = 0.02;
 /// Furthest that a dancer steps from its place, m.
@@ -55,7 +54,7 @@ pub fn leeway_m(spans: &[GroupSpan], n_poses: usize) -> Vec<f64> {
 }
 
 fn leeway_of(least_m: f64) -> f64 {
-    ((least_m - 2.0 * BODY_RADIUS_M - MARGIN_M) / 2.0).clamp(0.0, MAX_LEEWAY_M)
+    ((least_m - 2.0 * RADIUS_M - MARGIN_M) / 2.0).clamp(0.0, MAX_LEEWAY_M)
 }
 
 /// Returns the least distance of two dancers who go straight from place to place in the same time, m.

@@ -7,7 +7,6 @@
 //!   leeway that keeps any two bodies apart at every moment ([`floor_plan`]).
 //! * Everybody rises and falls with the bar as a soloist does, and all channels follow from the poses.
 
-mod assignment;
 mod floor_plan;
 mod formation;
 mod plan;
@@ -22,6 +21,7 @@ use std::ops::RangeInclusive;
 use ndarray::{Array3, ArrayView2, Axis, s};
 
 use super::super::channels::{Channel, MOTION_DIM};
+use super::super::group::MAX_DANCERS;
 use super::super::kinematics::Poses;
 use super::super::phase::bar_phase;
 use super::super::placement::Placement;
@@ -32,8 +32,6 @@ use super::primitive::UP;
 use super::{DIFFERENCED_FRAMES, Repertoire, STEPS_STREAM, Song, channels, floor, selection};
 use crate::chance::Chance;
 use crate::units::frames_to_s;
-pub use assignment::least_cost_assignment;
-pub use floor_plan::BODY_RADIUS_M;
 pub use formation::{Formation, MIN_SPACING_M};
 pub use plan::{GroupSpan, MIN_SPAN_S};
 pub use unison::{Part, Timing, Unison};
@@ -41,7 +39,7 @@ pub use unison::{Part, Timing, Unison};
 use voice::Voice;
 
 /// Sizes of a group.
-pub const GROUP_SIZES: RangeInclusive<usize> = 1..=16;
+pub const GROUP_SIZES: RangeInclusive<usize> = 1..=MAX_DANCERS;
 /// Half the time in which a dancer goes over from one part to the next, about a border of spans, s.
 const HALF_CHANGE_S: f64 = 0.5;
 /// Stream of chance of the plan, and that of the first voice but one.
@@ -83,7 +81,7 @@ pub struct GroupPhrase {
 ///
 /// Dancer 0 has the steps that [`super::choreograph`] chooses with the same seed. Poses are made for the song
 /// and two frames more, and every other channel follows from them. Any two dancers are at least
-/// `2 · 0.35 m` apart on the floor at every frame.
+/// `2 ·` [`RADIUS_M`](super::super::group::RADIUS_M) apart on the floor at every frame.
 ///
 /// # Panics
 /// When the number of dancers is outside [`GROUP_SIZES`].

@@ -2,9 +2,9 @@
 
 use ndarray::Array2;
 
+use super::super::super::group::assign;
 use super::super::super::placement::Placement;
 use super::super::beat_grid::BeatGrid;
-use super::assignment::least_cost_assignment;
 use super::formation::{Formation, distance_m};
 use super::unison::{Part, Unison};
 use crate::chance::Chance;
@@ -149,7 +149,7 @@ fn has_canon(grid: &BeatGrid, first_beat: usize, n_dancers: usize) -> bool {
 fn taken(from: &[Placement], to: &[Placement]) -> Vec<Placement> {
     let squared = |(i, j): (usize, usize)| distance_m(&from[i], &to[j]).powi(2);
     let cost = Array2::from_shape_fn((from.len(), to.len()), squared);
-    least_cost_assignment(&cost).into_iter().map(|j| to[j]).collect()
+    assign(cost.view()).into_iter().map(|j| to[j]).collect()
 }
 
 /// Returns the downbeat on which the slowest way allowed ends, s.

@@ -5,6 +5,7 @@ use ndarray::Array2;
 use super::super::choreograph;
 use super::super::tests::{Music, SONGS, column, repertoire};
 use super::*;
+use crate::motion::group::RADIUS_M;
 use crate::motion::locking::bar_locking;
 use crate::motion::quaternion::{angular_velocity, normalize};
 use crate::motion::trajectory::{ChannelLimits, Trajectory};
@@ -85,7 +86,7 @@ fn no_two_dancers_touch() {
                 let dance = choreograph_group(&song, &repertoire, &rules(n, seed));
                 assert_eq!(dance.frames.dim(), (n, 2400, 25));
                 let least = least_separation_m(&dance.frames);
-                assert!(least >= 2.0 * BODY_RADIUS_M, "{tempo_bpm} {n} {seed}: {least}");
+                assert!(least >= 2.0 * RADIUS_M, "{tempo_bpm} {n} {seed}: {least}");
                 n_dances += 1;
             }
         }
@@ -281,7 +282,7 @@ fn phrases_lie_about_the_origin_and_tell_their_kinds() {
         let mean = |i: usize| (0..3).map(|k| phrase.frames[[k, 0, i]]).sum::<f32>() / 3.0;
         assert!(mean(0).abs() < 1e-6 && mean(2).abs() < 1e-6, "{} {}", mean(0), mean(2));
         let least = least_separation_m(&phrase.frames);
-        assert!(least >= 2.0 * BODY_RADIUS_M, "{least}");
+        assert!(least >= 2.0 * RADIUS_M, "{least}");
         for k in 0..3 {
             // Nothing is turned, and everybody is moved alike.
             for i in (1..9).chain(13..25).filter(|&i| i != 2) {
