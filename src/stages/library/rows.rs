@@ -45,6 +45,10 @@ pub fn phrase_row(song: &Song, music: &SongMusic, phrase: &ConstructedPhrase) ->
         tempo_source: Some(music.tempo_source().to_owned()),
         beats_per_bar: Some(music.beats.beats_per_bar() as i32),
         beats_per_bar_source: Some(music.beats_per_bar_source().to_owned()),
+        n_dancers: Some(1),
+        formation: None,
+        unison: None,
+        style_name: None,
     }
 }
 
