@@ -50,8 +50,8 @@ rows! {
         beats_per_bar: Option<i32>, "beats", "Beats in a bar.";
         beats_per_bar_source: Option<String>, "", "Where that came from: `beats_file` (numbered beats), `composed` (the song was played from a score), `tracker` (found in the audio) or `default`.";
         n_dancers: Option<i32>, "dancers", "Dancers in the motion, 1 of a soloist. None without motion, and in rows of versions before 5, where motion is a soloist's.";
-        formation: Option<String>, "", "Of a constructed group: the shape that its dancers stand in, such as `line` or `circle`; none otherwise.";
-        unison: Option<String>, "", "Of a constructed group: how its dancers' steps are related: `same`, `mirrored`, `canon`, `call_and_response` or `free`; none otherwise.";
+        formation: Option<String>, "", "Of a constructed group: the shape that its dancers stand in: `line`, `v`, `circle`, `rows` or `scatter`; none where no shape holds three quarters of the phrase, and otherwise.";
+        unison: Option<String>, "", "Of a constructed group: how its dancers' steps are related: `same`, `mirrored`, `canon`, `call_and_response` or `free`; none where no kind holds three quarters of the phrase, and otherwise.";
         style_name: Option<String>, "", "Name of the style of the motion, such as a dance genre; none where nobody named one.";
     }
 }

@@ -45,9 +45,9 @@ pub fn phrase_row(song: &Song, music: &SongMusic, phrase: &ConstructedPhrase) ->
         tempo_source: Some(music.tempo_source().to_owned()),
         beats_per_bar: Some(music.beats.beats_per_bar() as i32),
         beats_per_bar_source: Some(music.beats_per_bar_source().to_owned()),
-        n_dancers: Some(1),
-        formation: None,
-        unison: None,
+        n_dancers: Some(phrase.n_dancers() as i32),
+        formation: phrase.formation.map(|formation| formation.name().to_owned()),
+        unison: phrase.unison.map(|unison| unison.name().to_owned()),
         style_name: None,
     }
 }
