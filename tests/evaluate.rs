@@ -184,6 +184,8 @@ fn put(store: &Path, name: &str, motions: &[Motion]) {
             real_time_factor: 0.01,
             settings: None,
             content_hash: None,
+            n_dancers: Some(1),
+            consistency: None,
             time: TimestampUs(1_700_000_000_000_000),
         });
         // As rows of older versions: the commit alone says what the motion was made for.

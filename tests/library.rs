@@ -3,6 +3,7 @@
 
 mod bad_input;
 mod coupling;
+mod groups;
 mod kill;
 mod made;
 mod output;

@@ -94,6 +94,8 @@ fn generation(run: &str, phrase: &str, sample: i32, candidate: i32) -> Generatio
         real_time_factor: 0.5,
         settings: None,
         content_hash: Some(String::new()),
+        n_dancers: Some(1),
+        consistency: None,
         time: TimestampUs(0),
     }
 }

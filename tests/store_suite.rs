@@ -5,6 +5,7 @@ mod catalogue;
 mod commits;
 mod compaction;
 mod faults;
+mod groups;
 mod leases;
 mod objects;
 mod parts;

@@ -1,4 +1,5 @@
-//! Compaction: parts that hold dead rows or are small are written anew, whole.
+//! Compaction: parts that hold dead rows, are small, or are older than a column that is not null are written anew,
+//! whole.
 //!
 //! The live rows do not change, so other processes need not wait: a compaction repeats the latest settlement of each
 //! item under the rank of the commit that settled it. A commit that settles an item meanwhile outranks it, and of
@@ -129,10 +130,17 @@ fn plan(log: StageLog, done: &mut Compaction) -> Result<Option<Plan>, StoreError
         let is_known = |part: &super::Part| {
             schema_of(&part.table).is_some_and(|schema| schema.reads(part.schema_version))
         };
+        // Other engines cannot know what older parts do not say.
+        let lacks_values = |part: &super::Part| {
+            schema_of(&part.table).is_some_and(|schema| schema.lacks_values(part.schema_version))
+        };
         if !commit.parts.iter().all(is_known) {
             done.n_unknown += commit.parts.len() as u64;
-        } else if !commit.dead.is_empty() || is_small(commit) {
-            n_dirty += usize::from(!commit.dead.is_empty());
+            continue;
+        }
+        let is_dirty = !commit.dead.is_empty() || commit.parts.iter().any(lacks_values);
+        if is_dirty || is_small(commit) {
+            n_dirty += usize::from(is_dirty);
             commits.insert(commit.key.to_string(), commit.clone());
         }
     }

@@ -4,11 +4,11 @@ use std::collections::BTreeSet;
 use std::fs::File;
 use std::sync::{Mutex, PoisonError};
 
-use arrow_array::{Array as _, Float32Array, Int32Array, RecordBatch, StringArray};
-use ndarray::Array2;
+use ndarray::{Array2, Array3, Axis};
 use parquet::errors::ParquetError;
 
 use super::StoreError;
+use super::frame_rows::{FrameColumns, GatheredFrames};
 use super::reader::Snapshot;
 
 impl Snapshot {
@@ -24,33 +24,52 @@ impl Snapshot {
     }
 
     /// Calls `visit` with the frames of each item of a frame table that is among `wanted`, in the order
-    /// in which they lie; row groups without any are not read.
+    /// in which they lie; row groups without any are not read. Of a table with dancers the items are soloists;
+    /// [`Snapshot::visit_groups`] reads groups, too.
     ///
     /// # Shapes
     /// - frames: `[n_frames, n_channels]`
     ///
     /// # Errors
-    /// [`StoreError`] when a part cannot be read, has other columns, or an item's frames are not 0, 1, 2
-    /// and so on; and whatever `visit` returns.
+    /// As [`Snapshot::visit_groups`], and when an item has several dancers.
     pub fn visit_items<E: From<StoreError>>(
         &self,
         wanted: &BTreeSet<String>,
         mut visit: impl FnMut(&str, Array2<f32>) -> Result<(), E>,
     ) -> Result<(), E> {
-        let n_channels = self.schema.columns.len() - self.schema.frame_column() - 1;
+        self.visit_groups(wanted, |item, frames| match frames.len_of(Axis(0)) {
+            1 => visit(item, frames.index_axis_move(Axis(0), 0)),
+            n => Err(self.broken(item, several_dancers(n)).into()),
+        })
+    }
+
+    /// Calls `visit` with the frames of all dancers of each item of a frame table that is among `wanted`, in the
+    /// order in which they lie; row groups without any are not read. Soloists are groups of one, and so are the
+    /// items of a table without dancers.
+    ///
+    /// # Shapes
+    /// - frames: `[n_dancers, n_frames, n_channels]`
+    ///
+    /// # Errors
+    /// [`StoreError`] when a part cannot be read, has other columns, an item's dancers or a dancer's frames are not
+    /// 0, 1, 2 and so on, or a dancer has more or fewer frames than another; and whatever `visit` returns.
+    pub fn visit_groups<E: From<StoreError>>(
+        &self,
+        wanted: &BTreeSet<String>,
+        mut visit: impl FnMut(&str, Array3<f32>) -> Result<(), E>,
+    ) -> Result<(), E> {
         let mut item = String::new();
-        let mut values: Vec<f32> = Vec::new();
-        let mut finish = |item: &str, values: Vec<f32>| {
-            if values.is_empty() {
+        let mut gathered = GatheredFrames::new(self.schema.n_frame_channels());
+        let mut finish = |item: &str, gathered: GatheredFrames| -> Result<(), E> {
+            if gathered.is_empty() {
                 return Ok(());
             }
-            let frames = Array2::from_shape_vec((values.len() / n_channels, n_channels), values)
-                .expect("invariant: whole rows were gathered");
-            visit(item, frames)
+            visit(item, gathered.into_group().map_err(|what| self.broken(item, what))?)
         };
         for batch in self.batches_of(wanted)? {
             let batch = batch?;
-            let columns = FrameColumns::of(&batch, self)?;
+            let columns = FrameColumns::of(&batch, &self.schema)
+                .map_err(|what| self.broken("a batch", what))?;
             let mut row = 0;
             while row < batch.num_rows() {
                 let name = columns.items.value(row);
@@ -58,16 +77,17 @@ impl Snapshot {
                     .find(|&i| columns.items.value(i) != name)
                     .unwrap_or(batch.num_rows());
                 if name != item {
-                    finish(&item, std::mem::take(&mut values))?;
+                    let next = GatheredFrames::new(self.schema.n_frame_channels());
+                    finish(&item, std::mem::replace(&mut gathered, next))?;
                     item = name.to_owned();
                 }
                 if wanted.contains(name) {
-                    columns.copy(row..end, &mut values).map_err(|what| self.broken(name, what))?;
+                    gathered.take(&columns, row..end).map_err(|what| self.broken(name, what))?;
                 }
                 row = end;
             }
         }
-        finish(&item, values)
+        finish(&item, gathered)
     }
 
     fn broken(&self, item: &str, what: String) -> StoreError {
@@ -81,45 +101,9 @@ impl Snapshot {
     }
 }
 
-/// The columns of a batch of a frame table.
-struct FrameColumns<'a> {
-    items: &'a StringArray,
-    numbers: &'a Int32Array,
-    channels: Vec<&'a Float32Array>,
-}
-
-impl<'a> FrameColumns<'a> {
-    fn of(batch: &'a RecordBatch, table: &Snapshot) -> Result<Self, StoreError> {
-        let column = |i: usize| batch.column_by_name(&table.schema.columns[i].name);
-        let missing = || table.broken("a batch", "has no columns of frames".to_owned());
-        let items = column(0).and_then(|c| c.as_any().downcast_ref()).ok_or_else(missing)?;
-        let frame = table.schema.frame_column();
-        let numbers = column(frame).and_then(|c| c.as_any().downcast_ref()).ok_or_else(missing)?;
-        let channels = (frame + 1..table.schema.columns.len())
-            .map(|i| column(i).and_then(|c| c.as_any().downcast_ref()).ok_or_else(missing))
-            .collect::<Result<_, _>>()?;
-        Ok(Self { items, numbers, channels })
-    }
-
-    /// Appends rows to those of the same item that came before.
-    fn copy(&self, rows: std::ops::Range<usize>, values: &mut Vec<f32>) -> Result<(), String> {
-        let (n_channels, n_rows) = (self.channels.len(), rows.len());
-        let first = values.len() / n_channels;
-        for (number, expected) in self.numbers.values()[rows.clone()].iter().zip(first..) {
-            if usize::try_from(*number) != Ok(expected) {
-                return Err(format!("has frame {number} where frame {expected} should be"));
-            }
-        }
-        let start = values.len();
-        values.resize(start + n_rows * n_channels, 0.0);
-        for (channel, column) in self.channels.iter().enumerate() {
-            let targets = values[start + channel..].iter_mut().step_by(n_channels);
-            for (target, value) in targets.zip(&column.values()[rows.clone()]) {
-                *target = *value;
-            }
-        }
-        Ok(())
-    }
+/// Says of an item that it is a group where a soloist is read.
+pub(super) fn several_dancers(n_dancers: usize) -> String {
+    format!("has {n_dancers} dancers where one is read")
 }
 
 /// Rows of numbers of one width, appended in any order and read at random: in memory, or in a file of

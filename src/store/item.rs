@@ -2,11 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use arrow_array::{Array as _, Float32Array, Int32Array, RecordBatch};
-use ndarray::Array2;
+use ndarray::{Array2, Array3, Axis};
 use parquet::errors::ParquetError;
 
 use super::StoreError;
+use super::frame_rows::{FrameColumns, GatheredFrames};
+use super::frames::several_dancers;
 use super::location::Location;
 use super::reader::Snapshot;
 use super::schema::{Row, TableSchema};
@@ -48,58 +49,43 @@ impl ItemTables {
         self.snapshot(R::schema())?.rows()
     }
 
-    /// Returns the item's frames of a frame table; `None` if it has none.
+    /// Returns the item's frames of a frame table; `None` if it has none. Of a table with dancers the item is a
+    /// soloist; [`ItemTables::group`] reads groups, too.
     ///
     /// # Shapes
     /// - returns: `[n_frames, n_channels]`
     ///
     /// # Errors
-    /// [`StoreError`] when a part cannot be read, is of another version or has other columns, or
-    /// when its frames are not 0, 1, 2 and so on.
+    /// As [`ItemTables::group`], and when the item has several dancers.
     pub fn frames(&self, table: TableSchema) -> Result<Option<Array2<f32>>, StoreError> {
-        let n_channels = table.columns.len() - table.frame_column() - 1;
-        let batches: Vec<RecordBatch> =
-            self.snapshot(table.clone())?.batches().collect::<Result<_, _>>()?;
-        let n_frames = batches.iter().map(RecordBatch::num_rows).sum();
-        if n_frames == 0 {
-            return Ok(None);
+        let Some(group) = self.group(table.clone())? else { return Ok(None) };
+        match group.len_of(Axis(0)) {
+            1 => Ok(Some(group.index_axis_move(Axis(0), 0))),
+            n => Err(self.broken(&table, &several_dancers(n))),
         }
-        let mut frames = Array2::zeros((n_frames, n_channels));
-        let mut first = 0;
-        for batch in batches {
-            self.fill(&mut frames, first, &table, &batch)?;
-            first += batch.num_rows();
-        }
-        Ok(Some(frames))
     }
 
-    /// Copies the rows of `batch` to the frames from `first` on.
-    fn fill(
-        &self,
-        frames: &mut Array2<f32>,
-        first: usize,
-        table: &TableSchema,
-        batch: &RecordBatch,
-    ) -> Result<(), StoreError> {
-        let broken = |what: String| self.broken(table, what);
-        let column = |i: usize| batch.column_by_name(&table.columns[i].name);
-        let numbers = column(table.frame_column())
-            .and_then(|c| c.as_any().downcast_ref::<Int32Array>())
-            .ok_or_else(|| broken("has no frame numbers".to_owned()))?;
-        for (number, expected) in numbers.values().iter().zip(first..) {
-            if usize::try_from(*number) != Ok(expected) {
-                return Err(broken(format!("has frame {number} where frame {expected} should be")));
-            }
+    /// Returns the frames of all the item's dancers of a frame table; `None` if it has none. A soloist is a group of
+    /// one, and so is an item of a table without dancers.
+    ///
+    /// # Shapes
+    /// - returns: `[n_dancers, n_frames, n_channels]`
+    ///
+    /// # Errors
+    /// [`StoreError`] when a part cannot be read, is of another version or has other columns, when its dancers or a
+    /// dancer's frames are not 0, 1, 2 and so on, or a dancer has more or fewer frames than another.
+    pub fn group(&self, table: TableSchema) -> Result<Option<Array3<f32>>, StoreError> {
+        let broken = |what: String| self.broken(&table, &what);
+        let mut gathered = GatheredFrames::new(table.n_frame_channels());
+        for batch in self.snapshot(table.clone())?.batches() {
+            let batch = batch?;
+            let columns = FrameColumns::of(&batch, &table).map_err(broken)?;
+            gathered.take(&columns, 0..batch.num_rows()).map_err(broken)?;
         }
-        for (mut to, i) in frames.columns_mut().into_iter().zip(table.frame_column() + 1..) {
-            let from = column(i)
-                .and_then(|c| c.as_any().downcast_ref::<Float32Array>())
-                .ok_or_else(|| broken(format!("has no numbers in {}", table.columns[i].name)))?;
-            for (to, from) in to.iter_mut().skip(first).zip(from.values()) {
-                *to = *from;
-            }
+        if gathered.is_empty() {
+            return Ok(None);
         }
-        Ok(())
+        gathered.into_group().map(Some).map_err(broken)
     }
 
     fn snapshot(&self, table: TableSchema) -> Result<Snapshot, StoreError> {
@@ -107,7 +93,7 @@ impl ItemTables {
         Snapshot::new(&self.store, table, parts, Some(self.item.clone()))
     }
 
-    fn broken(&self, table: &TableSchema, what: String) -> StoreError {
+    fn broken(&self, table: &TableSchema, what: &str) -> StoreError {
         let parts = self.parts.get(table.name).into_iter().flatten();
         let places: Vec<_> = parts.map(|live| self.store.url_of(&live.part.path)).collect();
         StoreError::Parquet {

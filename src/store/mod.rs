@@ -13,6 +13,7 @@ mod currency;
 mod delta;
 mod digest;
 mod error;
+mod frame_rows;
 mod frames;
 mod item;
 mod lease;

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use arrow_array::builder::StringBuilder;
 use arrow_array::{ArrayRef, Float32Array, Int32Array, RecordBatch};
 use arrow_schema::SchemaRef;
+use ndarray::{Axis, s};
 use parquet::arrow::ArrowWriter;
 use parquet::basic::{Compression, ZstdLevel};
 use parquet::errors::ParquetError;
@@ -33,8 +34,9 @@ pub struct PartWriter {
 /// Rows of a frame table that wait for their row group.
 #[derive(Default)]
 struct FrameBuffer {
-    /// Items, what else names them, and how many frames each has here.
+    /// Items, what else names them, and how many rows each has here.
     items: Vec<(String, Vec<Label>, usize)>,
+    dancer: Vec<i32>,
     frame: Vec<i32>,
     channels: Vec<Vec<f32>>,
 }
@@ -83,8 +85,8 @@ impl PartWriter {
         }
         let writer = ArrowWriter::try_new(file, Arc::clone(&schema), Some(properties.build()))
             .map_err(|e| failed(&table, e))?;
-        let n_channels = table.columns.len().saturating_sub(table.frame_column() + 1);
-        let frames = FrameBuffer { channels: vec![Vec::new(); n_channels], ..Default::default() };
+        let channels = vec![Vec::new(); table.n_frame_channels()];
+        let frames = FrameBuffer { channels, ..Default::default() };
         Ok(Self { table, schema, writer, frames, n_rows: 0 })
     }
 
@@ -115,7 +117,7 @@ impl PartWriter {
         failed(&self.table, source)
     }
 
-    /// Appends the frames of one item to a frame table.
+    /// Appends the frames of one item to a frame table; in one with dancers they are a soloist's, dancer 0.
     ///
     /// Row groups hold whole items as long as an item is shorter than a row group.
     ///
@@ -135,7 +137,11 @@ impl PartWriter {
         self.write_labelled_frames(item, &[], frames)
     }
 
-    /// Appends the frames of one item to a frame table that has labels, given in the order of its columns.
+    /// Appends the frames of one item to a frame table that has labels, given in the order of its columns; in one
+    /// with dancers they are a soloist's, dancer 0.
+    ///
+    /// # Shapes
+    /// - `frames`: `[n_frames, n_channels]`
     ///
     /// # Errors
     /// [`StoreError::Parquet`].
@@ -148,23 +154,70 @@ impl PartWriter {
         labels: &[Label],
         frames: ndarray::ArrayView2<f32>,
     ) -> Result<(), StoreError> {
-        assert_eq!(frames.ncols(), self.frames.channels.len(), "channels of {}", self.table.name);
-        assert_eq!(labels.len() + 1, self.table.frame_column(), "labels of {}", self.table.name);
+        self.write_labelled_group(item, labels, frames.insert_axis(Axis(0)))
+    }
+
+    /// Appends the frames of the dancers of one item to a frame table, dancer by dancer.
+    ///
+    /// # Shapes
+    /// - `frames`: `[n_dancers, n_frames, n_channels]`
+    ///
+    /// # Errors
+    /// [`StoreError::Parquet`].
+    ///
+    /// # Panics
+    /// When `frames` has another number of channels than the table, or several dancers where the table has none.
+    pub fn write_group(
+        &mut self,
+        item: &str,
+        frames: ndarray::ArrayView3<f32>,
+    ) -> Result<(), StoreError> {
+        self.write_labelled_group(item, &[], frames)
+    }
+
+    /// Appends the frames of the dancers of one item to a frame table that has labels, given in the order of its
+    /// columns.
+    ///
+    /// # Shapes
+    /// - `frames`: `[n_dancers, n_frames, n_channels]`
+    ///
+    /// # Errors
+    /// [`StoreError::Parquet`].
+    ///
+    /// # Panics
+    /// When there are more or fewer labels or channels than the table has, or several dancers where it has none.
+    pub fn write_labelled_group(
+        &mut self,
+        item: &str,
+        labels: &[Label],
+        frames: ndarray::ArrayView3<f32>,
+    ) -> Result<(), StoreError> {
+        let (n_dancers, n_frames, n_channels) = frames.dim();
+        let table = &self.table;
+        assert_eq!(n_channels, self.frames.channels.len(), "channels of {}", table.name);
+        assert_eq!(labels.len(), table.n_labels(), "labels of {}", table.name);
+        assert!(n_dancers <= 1 || table.dancer_column().is_some(), "{} has no dancers", table.name);
         let waiting = self.frames.frame.len();
-        if waiting > 0 && waiting + frames.nrows() > ROW_GROUP_ROWS {
+        if waiting > 0 && waiting + n_dancers * n_frames > ROW_GROUP_ROWS {
             self.flush_frames()?;
         }
-        for (start, piece) in frames.axis_chunks_iter(ndarray::Axis(0), ROW_GROUP_ROWS).enumerate()
-        {
-            let first = start * ROW_GROUP_ROWS;
-            let buffer = &mut self.frames;
-            buffer.items.push((item.to_owned(), labels.to_vec(), piece.nrows()));
-            buffer.frame.extend((first..first + piece.nrows()).map(|i| i as i32));
-            for (channel, values) in buffer.channels.iter_mut().zip(piece.columns()) {
-                channel.extend(values);
-            }
-            if buffer.frame.len() >= ROW_GROUP_ROWS {
-                self.flush_frames()?;
+        for (dancer, frames) in frames.outer_iter().enumerate() {
+            let mut first = 0;
+            while first < n_frames {
+                let buffer = &mut self.frames;
+                let room = ROW_GROUP_ROWS - buffer.frame.len();
+                let end = n_frames.min(first + room);
+                let piece = frames.slice(s![first..end, ..]);
+                buffer.items.push((item.to_owned(), labels.to_vec(), piece.nrows()));
+                buffer.dancer.extend(std::iter::repeat_n(dancer as i32, piece.nrows()));
+                buffer.frame.extend((first..end).map(|i| i as i32));
+                for (channel, values) in buffer.channels.iter_mut().zip(piece.columns()) {
+                    channel.extend(values);
+                }
+                if buffer.frame.len() >= ROW_GROUP_ROWS {
+                    self.flush_frames()?;
+                }
+                first = end;
             }
         }
         Ok(())
@@ -179,10 +232,14 @@ impl PartWriter {
         let items: Vec<(String, Vec<Label>, usize)> = buffer.items.drain(..).collect();
         let mut columns: Vec<ArrayRef> =
             vec![repeated(items.iter().map(|(name, _, n)| (name.as_str(), *n)), n_rows)];
-        for label in 0..self.table.frame_column() - 1 {
+        for label in 0..self.table.n_labels() {
             let label_and_count =
                 move |(_, labels, n): &(String, Vec<Label>, usize)| (labels[label].clone(), *n);
             columns.push(labels_of(items.iter().map(label_and_count), n_rows));
+        }
+        let dancer = std::mem::take(&mut buffer.dancer);
+        if self.table.dancer_column().is_some() {
+            columns.push(Arc::new(Int32Array::from(dancer)));
         }
         columns.push(Arc::new(Int32Array::from(std::mem::take(&mut buffer.frame))));
         for channel in &mut buffer.channels {

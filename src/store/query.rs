@@ -247,7 +247,8 @@ fn scan(
     }
 }
 
-/// Returns the rows of parts of a version that is read, with nulls in the nullable columns that are newer.
+/// Returns the rows of parts of a version that is read, with the columns that are newer: null where they may be,
+/// else what they say that older parts have.
 fn completed(
     mut frame: LazyFrame,
     schema: &TableSchema,
@@ -259,10 +260,11 @@ fn completed(
     let found = frame.collect_schema().map_err(|e| StoreError::Query(first_line(&e)))?;
     let column = |column: &TableColumn| {
         let name = column.name.as_ref();
-        if found.contains(name) || !column.nullable {
-            col(name)
-        } else {
-            lit(NULL).cast(data_type(column.column_type)).alias(name)
+        match column.absent {
+            _ if found.contains(name) => col(name),
+            Some(value) => lit(value).cast(data_type(column.column_type)).alias(name),
+            None if column.nullable => lit(NULL).cast(data_type(column.column_type)).alias(name),
+            None => col(name),
         }
     };
     Ok(frame.select(schema.columns.iter().map(column).collect::<Vec<_>>()))

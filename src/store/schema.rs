@@ -15,8 +15,8 @@ pub struct TableSchema {
     pub name: &'static str,
     /// Raised when a column changes; parts of versions that are not read are refused, not guessed at.
     pub version: u32,
-    /// The oldest version that is read: since then only nullable columns were added, which are null in older
-    /// parts.
+    /// The oldest version that is read: since then only columns were added that are null in older parts, or have
+    /// the value there that they name.
     pub oldest_version: u32,
     /// The meaning of one row.
     pub description: &'static str,
@@ -31,6 +31,8 @@ pub struct Column {
     pub name: Cow<'static, str>,
     pub column_type: ColumnType,
     pub nullable: bool,
+    /// Of a column that is not nullable and newer than its table: what it is in all rows of older parts.
+    pub absent: Option<i32>,
     /// Unit of the values; empty for names, flags and other unitless text.
     pub unit: &'static str,
     pub description: Cow<'static, str>,
@@ -77,8 +79,11 @@ impl ColumnType {
     }
 }
 
-/// The column that counts the frames of an item.
+/// The column that counts the frames of a dancer, or of an item without dancers.
 pub const FRAME_COLUMN: &str = "frame";
+
+/// The column that counts the dancers of an item.
+pub const DANCER_COLUMN: &str = "dancer";
 
 impl TableSchema {
     /// Returns the column that names the item which a row belongs to: the first that rows are sorted by.
@@ -86,10 +91,27 @@ impl TableSchema {
         self.sorted_by[0]
     }
 
-    /// Returns the place of the column that counts the frames of a frame table. Before it are the item and what
-    /// else names it (labels), behind it the channels.
+    /// Returns the place of the column that counts the frames of a frame table. Before it are the item, what else
+    /// names it (labels) and the dancer if the table has dancers, behind it the channels.
     pub fn frame_column(&self) -> usize {
         self.columns.iter().position(|column| column.name == FRAME_COLUMN).unwrap_or(0)
+    }
+
+    /// Returns the place of the column that counts the dancers of a frame table, which is just before the frame;
+    /// none where the table has no dancers.
+    pub fn dancer_column(&self) -> Option<usize> {
+        self.columns.iter().position(|column| column.name == DANCER_COLUMN)
+    }
+
+    /// Returns how many channels each frame of a frame table has.
+    pub fn n_frame_channels(&self) -> usize {
+        self.columns.len().saturating_sub(self.frame_column() + 1)
+    }
+
+    /// Returns how many columns of a frame table name an item beside the item column.
+    pub fn n_labels(&self) -> usize {
+        let n_named = self.dancer_column().unwrap_or(self.frame_column());
+        n_named.saturating_sub(1)
     }
 
     /// Returns whether parts of a version are read.
@@ -106,22 +128,34 @@ impl TableSchema {
         }
     }
 
-    /// Returns a batch of a part of a version that is read, with nulls in the nullable columns that are newer
-    /// than the part. A column that is missing for another reason stays missing.
+    /// Returns whether parts of a version that is read lack a column which is not null in them.
+    pub(super) fn lacks_values(&self, version: u32) -> bool {
+        version < self.version && self.columns.iter().any(|column| column.absent.is_some())
+    }
+
+    /// Returns a batch of a part of a version that is read, with the columns that are newer than the part: null
+    /// where they may be, else what they say that older parts have. A column that is missing for another reason
+    /// stays missing.
     pub(super) fn completed(&self, batch: RecordBatch, version: u32) -> RecordBatch {
         if version >= self.version {
             return batch;
         }
         let (mut fields, mut columns) =
             (batch.schema().fields().to_vec(), batch.columns().to_vec());
-        for field in self.arrow().fields() {
-            if field.is_nullable() && batch.column_by_name(field.name()).is_none() {
-                columns.push(new_null_array(field.data_type(), batch.num_rows()));
-                fields.push(Arc::clone(field));
+        for (column, field) in self.columns.iter().zip(self.arrow().fields()) {
+            if batch.column_by_name(field.name()).is_some() {
+                continue;
             }
+            let values: ArrayRef = match column.absent {
+                Some(value) => Arc::new(Int32Array::from(vec![value; batch.num_rows()])),
+                None if column.nullable => new_null_array(field.data_type(), batch.num_rows()),
+                None => continue,
+            };
+            columns.push(values);
+            fields.push(Arc::clone(field));
         }
         RecordBatch::try_new(Arc::new(Schema::new(fields)), columns)
-            .expect("invariant: a whole batch, and nulls of its length")
+            .expect("invariant: a whole batch, and columns of its length")
     }
 
     /// Returns the Arrow schema of the table's parts.
@@ -285,6 +319,7 @@ macro_rules! rows {
                         name: stringify!($field).into(),
                         column_type: <$type as Cell>::TYPE,
                         nullable: <$type as Cell>::NULLABLE,
+                        absent: None,
                         unit: $unit,
                         description: $meaning.into(),
                     },)+],
@@ -358,6 +393,20 @@ mod tests {
             |id: &str, length_m| NewRow { id: id.into(), colour: None, length_m, weight_kg: None };
         let rows = NewRow::from_batch(&new.completed(batch.clone(), 2));
         assert_eq!(rows, Some(vec![row("a", 1.5), row("b", -2.0)]));
+        assert!(!new.lacks_values(2) && !new.lacks_values(4));
+        // A column that is not null is what it says that older parts have.
+        let mut counted = new.clone();
+        counted.columns[2] = Column {
+            name: "dancer".into(),
+            column_type: ColumnType::Int32,
+            absent: Some(7),
+            ..counted.columns[2].clone()
+        };
+        assert!(counted.lacks_values(2) && !counted.lacks_values(4));
+        let filled = counted.completed(batch.clone(), 2);
+        let dancer = filled.column_by_name("dancer").and_then(|c| c.as_any().downcast_ref());
+        assert_eq!(dancer, Some(&Int32Array::from(vec![7, 7])));
+        assert!(counted.completed(batch.clone(), 4).column_by_name("dancer").is_none());
         // A part of this version has all its columns, or is broken.
         assert_eq!(NewRow::from_batch(&new.completed(batch.clone(), 4)), None);
         // What may not be null is not made up.

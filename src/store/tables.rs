@@ -2,7 +2,9 @@
 
 use std::borrow::Cow;
 
-use super::schema::{Column, ColumnType, Row, TableSchema, TimestampUs, rows};
+use super::schema::{
+    Column, ColumnType, DANCER_COLUMN, FRAME_COLUMN, Row, TableSchema, TimestampUs, rows,
+};
 use crate::audio::feature_names;
 use crate::motion::{CHANNEL_NAMES, channel_unit};
 
@@ -11,7 +13,7 @@ const ITEM_COLUMN: &str = "phrase_id";
 
 rows! {
     "One row per phrase that ingest accepted or library constructed."
-    PhraseRow in "phrases" version 4 reads 2 sorted by [phrase_id]
+    PhraseRow in "phrases" version 5 reads 2 sorted by [phrase_id]
     {
         phrase_id: String, "", "Name of the phrase: its folder in a phrase layout, its relative path in a music library; of a constructed one `SONG.tTAKE.NUMBER`.";
         source: String, "URL", "The source it came from; of a constructed phrase, the song.";
@@ -47,6 +49,10 @@ rows! {
         tempo_source: Option<String>, "", "Where the tempo came from: `beats_file`, `features`, or, of constructed phrases, `beat_tracker` or `composed` (the song was played from a score).";
         beats_per_bar: Option<i32>, "beats", "Beats in a bar.";
         beats_per_bar_source: Option<String>, "", "Where that came from: `beats_file` (numbered beats), `composed` (the song was played from a score), `tracker` (found in the audio) or `default`.";
+        n_dancers: Option<i32>, "dancers", "Dancers in the motion, 1 of a soloist. None without motion, and in rows of versions before 5, where motion is a soloist's.";
+        formation: Option<String>, "", "Of a constructed group: the shape that its dancers stand in: `line`, `v`, `circle`, `rows` or `scatter`; none where no shape holds three quarters of the phrase, and otherwise.";
+        unison: Option<String>, "", "Of a constructed group: how its dancers' steps are related: `same`, `mirrored`, `canon`, `call_and_response` or `free`; none where no kind holds three quarters of the phrase, and otherwise.";
+        style_name: Option<String>, "", "Name of the style of the motion, such as a dance genre; none where nobody named one.";
     }
 }
 
@@ -57,6 +63,12 @@ impl PhraseRow {
     /// Returns whether library constructed the phrase.
     pub fn is_constructed(&self) -> bool {
         self.motion_format.as_deref() == Some(CONSTRUCTED)
+    }
+
+    /// Returns how many dancers the motion has: 0 without motion, 1 where the row is older than groups.
+    pub fn count_dancers(&self) -> usize {
+        let n_dancers = self.n_dancers.unwrap_or(i32::from(self.has_motion));
+        usize::try_from(n_dancers).unwrap_or(0)
     }
 }
 
@@ -174,7 +186,7 @@ rows! {
 
 rows! {
     "One row per motion that generate sampled, kept or not; measured times differ from run to run, nothing else does."
-    GenerationRow in "generations" version 3 reads 1 sorted by [generation, candidate]
+    GenerationRow in "generations" version 4 reads 1 sorted by [generation, candidate]
     {
         generation: String, "", "The motion: `RUN/PHRASE/SAMPLE`.";
         run: String, "", "Name of the generation (--run), by default that of the model.";
@@ -204,6 +216,8 @@ rows! {
         real_time_factor: f64, "", "That time over the length of the motion.";
         settings: Option<String>, "JSON", "What determines the motion beside its music, the model's weights and the seed: sampler, guidance, candidates, style, overlap, priming, post-processing, and of constraints the digest. None where release 0.1 made it.";
         content_hash: Option<String>, "BLAKE3", "`content_hash` of the phrase that it was made for, as it was then; where `phrases` has another, the motion is for music that was replaced. None in rows of versions 1 and 2.";
+        n_dancers: Option<i32>, "dancers", "Dancers in the motion, 1 of a soloist. None in rows of versions before 4, where it is 1.";
+        consistency: Option<f64>, "", "γ, the guidance towards consistency (above 0) or diversity (below 0), from -1 to 1; none where it was not asked for.";
         time: TimestampUs, "", "When it was made.";
     }
 }
@@ -289,14 +303,15 @@ rows! {
 /// Name of the table of generated motion.
 pub const GENERATED: &str = "generated";
 
-/// Returns the schema of `generated`: one row per frame, named by run, phrase and sample.
+/// Returns the schema of `generated`: one row per dancer and frame, named by run, phrase and sample.
 pub fn generated() -> TableSchema {
     let mut table = TableSchema { name: GENERATED, ..motion() };
-    table.description = "One row per frame of generated motion at 30 fps.";
+    table.description = "One row per dancer and frame of generated motion at 30 fps.";
     let column = |name: &'static str, column_type, unit, meaning: &'static str| Column {
         name: name.into(),
         column_type,
         nullable: false,
+        absent: None,
         unit,
         description: meaning.into(),
     };
@@ -312,7 +327,7 @@ pub fn generated() -> TableSchema {
         column("sample", ColumnType::Int32, "samples", "Number of the motion among the phrase's."),
     ];
     table.columns.splice(1..1, labels);
-    table.sorted_by = &["generation", "frame"];
+    table.sorted_by = &["generation", DANCER_COLUMN, FRAME_COLUMN];
     table
 }
 
@@ -322,7 +337,7 @@ pub const DECODED: &str = "decoded";
 /// Returns the schema of `decoded`: the columns of [`generated`].
 pub fn decoded() -> TableSchema {
     let description =
-        "One row per frame of a kept motion as it was decoded, before post-processing.";
+        "One row per dancer and frame of a kept motion as it was decoded, before post-processing.";
     TableSchema { name: DECODED, description, ..generated() }
 }
 
@@ -335,6 +350,7 @@ pub fn features() -> TableSchema {
         name,
         column_type: ColumnType::Float32,
         nullable: false,
+        absent: None,
         unit: "",
         description: Cow::Borrowed(block.meaning),
     });
@@ -345,16 +361,29 @@ pub fn features() -> TableSchema {
 /// Name of the motion table.
 pub const MOTION: &str = "motion";
 
-/// Returns the schema of `motion`: one row per frame, one column per channel.
+/// Returns the schema of `motion`: one row per dancer and frame, one column per channel.
 pub fn motion() -> TableSchema {
     let channels = CHANNEL_NAMES.iter().enumerate().map(|(i, name)| Column {
         name: Cow::Borrowed(*name),
         column_type: ColumnType::Float32,
         nullable: false,
+        absent: None,
         unit: channel_unit(i).unwrap_or_default(),
         description: Cow::Owned(format!("Channel {i} of the frame.")),
     });
-    frame_table(MOTION, "One row per motion frame at 30 fps.", channels)
+    let description = "One row per dancer and motion frame at 30 fps; all dancers of a phrase have as many frames.";
+    let mut table = frame_table(MOTION, description, channels);
+    let dancer = Column {
+        name: DANCER_COLUMN.into(),
+        column_type: ColumnType::Int32,
+        nullable: false,
+        // Parts of version 1 hold soloists.
+        absent: Some(0),
+        unit: "dancers",
+        description: "Number of the dancer in the group, from 0; 0 of a soloist.".into(),
+    };
+    table.columns.insert(1, dancer);
+    TableSchema { version: 2, sorted_by: &[ITEM_COLUMN, DANCER_COLUMN, FRAME_COLUMN], ..table }
 }
 
 /// Builds the schema of a table with one row per frame and one named column per channel.
@@ -367,13 +396,14 @@ fn frame_table(
         name: name.into(),
         column_type,
         nullable: false,
+        absent: None,
         unit,
         description: meaning.into(),
     };
     let ids = [
         id(ITEM_COLUMN, ColumnType::Utf8, "", "The phrase, as in `phrases`."),
         id(
-            "frame",
+            FRAME_COLUMN,
             ColumnType::Int32,
             "frames",
             "Index within the phrase, from 0; time is frame / 30 s.",
@@ -385,7 +415,7 @@ fn frame_table(
         oldest_version: 1,
         description,
         columns: ids.into_iter().chain(channels).collect(),
-        sorted_by: &["phrase_id", "frame"],
+        sorted_by: &[ITEM_COLUMN, FRAME_COLUMN],
     }
 }
 
@@ -411,58 +441,4 @@ pub fn all() -> Vec<TableSchema> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn rows_survive_the_way_through_a_batch() {
-        let rows = vec![
-            FailureRow {
-                stage: "ingest".into(),
-                phrase_id: "a b/ü".into(),
-                source: "file:///x".into(),
-                kind: "shape".into(),
-                message: "m".into(),
-                time: TimestampUs(1_700_000_000_123_456),
-            },
-            FailureRow {
-                stage: "ingest".into(),
-                phrase_id: "c".into(),
-                source: String::new(),
-                kind: String::new(),
-                message: String::new(),
-                time: TimestampUs(-1),
-            },
-        ];
-        assert_eq!(FailureRow::from_batch(&FailureRow::to_batch(&rows)), Some(rows));
-    }
-
-    #[test]
-    fn a_batch_of_another_table_is_no_row() {
-        let row = FailureRow {
-            stage: "ingest".into(),
-            phrase_id: "a".into(),
-            source: String::new(),
-            kind: String::new(),
-            message: String::new(),
-            time: TimestampUs(0),
-        };
-        assert_eq!(PhraseRow::from_batch(&FailureRow::to_batch(&[row])), None);
-    }
-
-    #[test]
-    fn column_names_are_unique_and_sort_columns_exist() {
-        for table in all() {
-            let mut names: Vec<_> = table.columns.iter().map(|c| c.name.as_ref()).collect();
-            for sort in table.sorted_by {
-                assert!(names.contains(sort), "{}: {sort}", table.name);
-            }
-            let item = table.columns.iter().find(|c| c.name == table.item_column());
-            assert_eq!(item.map(|c| c.column_type), Some(ColumnType::Utf8), "{}", table.name);
-            let n = names.len();
-            names.sort_unstable();
-            names.dedup();
-            assert_eq!(names.len(), n, "{}", table.name);
-        }
-    }
-}
+mod tests;

@@ -140,7 +140,7 @@ fn a_query_without_sql_or_with_an_unknown_format_is_refused() {
 #[test]
 fn a_part_of_another_schema_version_is_refused_with_what_to_do() {
     for (version, remedy) in
-        [(2, "install a newer motiongen"), (0, "run the stage that wrote it again with --force")]
+        [(3, "install a newer motiongen"), (0, "run the stage that wrote it again with --force")]
     {
         let dir = Dir::new();
         let store = Location::local(&dir.at("store")).expect("a location");
@@ -153,7 +153,8 @@ fn a_part_of_another_schema_version_is_refused_with_what_to_do() {
         commit.publish().expect("published");
         let part = store.list("motion").expect("a listing").remove(0).path;
         let expected = format!(
-            "table motion: {} has schema version {version}, this program reads version 1; {remedy}",
+            "table motion: {} has schema version {version}, this program reads versions 1 to 2; \
+             {remedy}",
             store.url_of(&part)
         );
         assert_eq!(refusal(&dir.at("store"), "select count(*) from motion"), expected);

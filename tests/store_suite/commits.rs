@@ -242,7 +242,7 @@ fn what_is_no_manifest_is_left_alone() {
 /// Commits three frames of a phrase under a schema.
 fn commit_motion(location: &Location, schema: TableSchema) -> String {
     let mut commit = Commit::new(location, STAGE, "rules", "file:///source");
-    let n_channels = schema.columns.len() - 2;
+    let n_channels = schema.n_frame_channels();
     let part = commit.part("motion", || schema).expect("a temporary file");
     part.write_frames("a", Array2::zeros((3, n_channels)).view()).expect("frames");
     commit.settle(item("a", "1"), &Ledger::default());
@@ -254,14 +254,14 @@ fn commit_motion(location: &Location, schema: TableSchema) -> String {
 #[test]
 fn a_part_of_another_schema_version_is_refused_with_what_to_do() {
     for (version, remedy) in
-        [(2, "install a newer motiongen"), (0, "run the stage that wrote it again with --force")]
+        [(3, "install a newer motiongen"), (0, "run the stage that wrote it again with --force")]
     {
         for backend in backends("version") {
             let location = &backend.location;
             let part = commit_motion(location, TableSchema { version, ..motion() });
             let error = Snapshot::take(location, motion()).expect_err("another version");
             let expected = format!(
-                "table motion: {} has schema version {version}, this program reads version 1; \
+                "table motion: {} has schema version {version}, this program reads versions 1 to 2; \
                  {remedy}",
                 location.url_of(&part)
             );
@@ -283,13 +283,13 @@ fn first_error(location: &Location) -> StoreError {
 fn a_part_with_other_columns_than_its_version_says_is_refused_with_both() {
     for backend in backends("columns") {
         let mut columns = motion().columns;
-        columns.truncate(3);
-        columns[2].name = "position_u".into();
+        columns.truncate(4);
+        columns[3].name = "position_u".into();
         let part = commit_motion(&backend.location, TableSchema { columns, ..motion() });
         let text = first_error(&backend.location).to_string();
         let place = backend.location.url_of(&part);
         let start = format!("table motion: {place} lacks columns [\"position_x: Float32\", ");
-        let end = "it has [\"phrase_id: Utf8\", \"frame: Int32\", \"position_u: Float32\"]";
+        let end = "it has [\"phrase_id: Utf8\", \"dancer: Int32\", \"frame: Int32\", \"position_u: Float32\"]";
         assert!(text.starts_with(&start) && text.ends_with(end), "{backend}: {text}");
     }
 }

@@ -88,7 +88,7 @@ fn row_groups_hold_whole_phrases_unless_a_phrase_exceeds_one() {
         .iter()
         .filter_map(|kv| Some((kv.key.strip_prefix("motiongen.")?, kv.value.as_deref()?)))
         .collect();
-    assert_eq!(key_values["schema_version"], "1");
+    assert_eq!(key_values["schema_version"], "2");
     assert_eq!(key_values["table"], "motion");
     assert_eq!(key_values["params_hash"], "rules");
     assert_eq!(key_values["program"], format!("motiongen {}", env!("CARGO_PKG_VERSION")));
@@ -104,11 +104,13 @@ fn every_frame_of_a_long_phrase_comes_once_and_in_order() {
     for batch in snapshot(&local).batches() {
         let batch = batch.expect("a batch");
         let ids = batch.column(0).as_string::<i32>();
-        let frame = batch.column(1).as_primitive::<arrow_array::types::Int32Type>();
-        let last = batch.column(MOTION_DIM + 1).as_primitive::<Float32Type>();
+        let dancer = batch.column(1).as_primitive::<arrow_array::types::Int32Type>();
+        let frame = batch.column(2).as_primitive::<arrow_array::types::Int32Type>();
+        let last = batch.column(MOTION_DIM + 2).as_primitive::<Float32Type>();
         for row in 0..batch.num_rows() {
             let (id, i) = expected.next().expect("no more rows than frames");
-            assert_eq!((ids.value(row), frame.value(row)), (id, i as i32));
+            let found = (ids.value(row), dancer.value(row), frame.value(row));
+            assert_eq!(found, (id, 0, i as i32));
             let value = f32::from(id.as_bytes()[0]) + (i % 1013) as f32 * 0.5 + 24.0;
             assert_eq!(last.value(row), value, "{id} {i}");
         }

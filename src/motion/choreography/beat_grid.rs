@@ -66,6 +66,35 @@ impl BeatGrid {
         self.interval_s
     }
 
+    /// Returns the number of beats in a bar.
+    pub fn beats_per_bar(&self) -> usize {
+        self.beats_per_bar
+    }
+
+    /// Returns how many beats have passed since the first of the grid at a time of the song, linear
+    /// between beats and continued at the usual interval beyond both ends.
+    pub fn position(&self, time_s: f64) -> f64 {
+        let i = self.beats.partition_point(|beat| beat.time_s <= time_s);
+        let (Some(before), Some(after)) = (i.checked_sub(1), self.beats.get(i)) else {
+            let nearest = if i == 0 { 0 } else { i - 1 };
+            return nearest as f64 + (time_s - self.beats[nearest].time_s) / self.interval_s;
+        };
+        let start_s = self.beats[before].time_s;
+        before as f64 + (time_s - start_s) / (after.time_s - start_s)
+    }
+
+    /// Returns the time at which so many beats have passed, s: the inverse of [`BeatGrid::position`].
+    pub fn time_s(&self, position: f64) -> f64 {
+        let last = self.beats.len() - 1;
+        let before = position.floor().clamp(0.0, last as f64) as usize;
+        let interval_s = if position < 0.0 || before == last {
+            self.interval_s
+        } else {
+            self.beats[before + 1].time_s - self.beats[before].time_s
+        };
+        self.beats[before].time_s + (position - before as f64) * interval_s
+    }
+
     /// Returns the beats of a short phrase: whole bars, at least 4 beats; a long one has twice as many.
     pub fn short_phrase_beats(&self) -> usize {
         self.beats_per_bar * MIN_PHRASE_BEATS.div_ceil(self.beats_per_bar)
@@ -101,6 +130,18 @@ mod tests {
         let grid = BeatGrid::over(&early, 0.0);
         assert_eq!(grid.beats().iter().map(|b| b.time_s).collect::<Vec<_>>(), [0.0, 0.5]);
         assert_eq!(grid.short_phrase_beats(), 4);
+    }
+
+    #[test]
+    fn positions_count_beats_and_times_are_their_inverse() {
+        let beats = Beats::parse("0.5 2\n1.0 3\n1.5 1\n2.1 2\n").unwrap();
+        let grid = BeatGrid::over(&beats, 3.0);
+        for (time_s, position) in
+            [(-1.0, -2.0), (0.0, 0.0), (0.25, 0.5), (1.8, 3.5), (2.1, 4.0), (3.1, 6.0), (4.1, 8.0)]
+        {
+            assert!((grid.position(time_s) - position).abs() < 1e-9, "{time_s}");
+            assert!((grid.time_s(position) - time_s).abs() < 1e-9, "{position}");
+        }
     }
 
     #[test]

@@ -13,6 +13,7 @@ pub mod accent;
 pub mod activity;
 pub mod beat_grid;
 pub mod floor;
+pub mod group;
 mod joining;
 pub mod primitive;
 pub mod selection;
@@ -32,6 +33,10 @@ use crate::units::frames_to_s;
 pub use activity::activity;
 pub use beat_grid::{Beat, BeatGrid};
 pub use floor::Turn;
+pub use group::{
+    Formation, GROUP_SIZES, GroupDance, GroupPhrase, GroupRules, Unison, choreograph_group,
+    group_phrase,
+};
 pub use primitive::{Primitive, PrimitiveError, Repertoire};
 pub use selection::DanceStep;
 

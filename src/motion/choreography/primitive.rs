@@ -245,7 +245,7 @@ fn primitives(poses: &Poses, capture: usize) -> Vec<Primitive> {
 }
 
 /// Returns the heading of every orientation, rad, without jumps of whole turns.
-fn headings(orientation: &[Quaternion]) -> Vec<f64> {
+pub(super) fn headings(orientation: &[Quaternion]) -> Vec<f64> {
     let yaw = |q: Quaternion| Placement::of([0.0; 3], q).yaw_rad;
     let mut heading = orientation.first().map_or(0.0, |&q| yaw(q));
     let steps = orientation.windows(2).map(|q| yaw(mul(conj(q[0]), q[1])));

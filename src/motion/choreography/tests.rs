@@ -29,7 +29,7 @@ fn capture(lively: f64, step_frames: f64, n_frames: usize) -> Trajectory {
     Trajectory::new(frames_of(&poses, n_frames)).unwrap()
 }
 
-fn repertoire() -> Repertoire {
+pub(super) fn repertoire() -> Repertoire {
     let mut repertoire = Repertoire::new();
     for (lively, step_frames) in [
         (0.15, 40.0),
@@ -47,15 +47,15 @@ fn repertoire() -> Repertoire {
 }
 
 /// A song of steady beats whose loudness swells and falls every 12 s.
-struct Music {
-    beats: Beats,
+pub(super) struct Music {
+    pub(super) beats: Beats,
     rms: Vec<f32>,
     onset_strength: Vec<f32>,
-    times_s: Vec<f64>,
+    pub(super) times_s: Vec<f64>,
 }
 
 impl Music {
-    fn new(tempo_bpm: f64, beats_per_bar: u32, duration_s: f64) -> Self {
+    pub(super) fn new(tempo_bpm: f64, beats_per_bar: u32, duration_s: f64) -> Self {
         let n_beats = (duration_s * tempo_bpm / 60.0) as usize;
         let beat_s = |i: usize| 0.31 + i as f64 * 60.0 / tempo_bpm;
         let beats = Beats::new((0..n_beats).map(beat_s).collect(), None, Some(beats_per_bar));
@@ -73,12 +73,12 @@ impl Music {
         }
     }
 
-    fn song(&self) -> Song<'_> {
+    pub(super) fn song(&self) -> Song<'_> {
         Song::new(&self.beats, &self.rms, &self.onset_strength).unwrap()
     }
 }
 
-fn column(frames: &Array2<f32>, i: usize) -> Vec<f64> {
+pub(super) fn column(frames: &Array2<f32>, i: usize) -> Vec<f64> {
     frames.column(i).iter().map(|&x| f64::from(x)).collect()
 }
 
@@ -98,7 +98,8 @@ fn correlation(a: &[f64], b: &[f64]) -> f64 {
 }
 
 /// The songs of these tests: tempo and beats in a bar.
-const SONGS: [(f64, u32); 5] = [(93.7, 4), (141.3, 3), (171.0, 4), (67.3, 4), (118.9, 3)];
+pub(super) const SONGS: [(f64, u32); 5] =
+    [(93.7, 4), (141.3, 3), (171.0, 4), (67.3, 4), (118.9, 3)];
 
 #[test]
 fn vertical_velocity_is_locked_to_the_bar_and_to_no_other_tempo() {

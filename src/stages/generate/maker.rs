@@ -343,6 +343,8 @@ impl SoloistMaker<'_> {
             real_time_factor: found.generate_s / frames_to_s(n_frames).max(f64::MIN_POSITIVE),
             settings: Some(settings.to_row().to_json()),
             content_hash: Some(music.content_hash.to_owned()),
+            n_dancers: Some(1),
+            consistency: None,
             time: TimestampUs::now(),
         }
     }

@@ -363,6 +363,10 @@ impl IngestJob<'_> {
             tempo_source: tempo.map(|t| t.source.to_owned()),
             beats_per_bar: beats_per_bar.map(|(n, _)| n as i32),
             beats_per_bar_source: beats_per_bar.map(|(_, source)| source.to_owned()),
+            n_dancers: phrase.motion.is_some().then_some(1),
+            formation: None,
+            unison: None,
+            style_name: None,
         }
     }
 

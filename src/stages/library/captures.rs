@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::io::Read as _;
 
 use anyhow::bail;
-use ndarray::Array2;
+use ndarray::{Array3, ArrayView3};
 
 use super::StoreContents;
 use crate::motion::choreography::{PrimitiveError, Repertoire};
@@ -133,18 +133,15 @@ impl Captures {
                         place.store()
                     );
                 }
-                let mut frames: BTreeMap<String, Array2<f32>> = BTreeMap::new();
+                let mut groups: BTreeMap<String, Array3<f32>> = BTreeMap::new();
                 let wanted = ids.keys().cloned().collect();
-                place.table(tables::motion())?.visit_items(&wanted, |id, found| {
-                    frames.insert(id.to_owned(), found);
+                place.table(tables::motion())?.visit_groups(&wanted, |id, found| {
+                    groups.insert(id.to_owned(), found);
                     Ok::<_, StoreError>(())
                 })?;
                 let mut reading = CaptureReading::default();
-                for (id, frames) in frames {
-                    let added = guarded(&id, || {
-                        let motion = Trajectory::new(frames);
-                        reading.add(&id, motion.map_err(|e| Failure::of(&id, e.kind(), &e))?)
-                    });
+                for (id, group) in groups {
+                    let added = guarded(&id, || reading.add_group(&id, group.view()));
                     reading.settle(&id, &place.store().url_of(&id), added);
                 }
                 Ok(reading.finish(self.fingerprint))
@@ -201,6 +198,24 @@ impl CaptureReading {
             Failure::new(kind, path, format!("{path}: {e}"))
         };
         self.repertoire.add(&motion).map(|_| ()).map_err(refused)
+    }
+
+    /// Adds every dancer of a group, `[N, T, 25]`, as a capture of its own.
+    ///
+    /// # Errors
+    /// The first failure, where no dancer can be added.
+    fn add_group(&mut self, path: &str, group: ArrayView3<'_, f32>) -> Result<(), Failure> {
+        let mut first = None;
+        let mut n_added = 0;
+        for dancer in group.outer_iter() {
+            let motion = Trajectory::new(dancer.to_owned());
+            let added = motion.map_err(|e| Failure::of(path, e.kind(), &e));
+            match added.and_then(|motion| self.add(path, motion)) {
+                Ok(()) => n_added += 1,
+                Err(failure) => first = first.or(Some(failure)),
+            }
+        }
+        first.filter(|_| n_added == 0).map_or(Ok(()), Err)
     }
 
     fn settle(&mut self, name: &str, url: &str, added: Result<(), Failure>) {

@@ -217,7 +217,7 @@ impl LibraryJob<'_> {
         });
         let failure = match danced {
             Ok(Ok(written)) => {
-                lock(tally).add(song, written);
+                lock(tally).add(song, &written);
                 None
             }
             Ok(Err(Refusal::Store(error))) => return Err(error),

@@ -15,7 +15,7 @@ const README: &str = "\
 These phrases are constructed, not captured: `motiongen library` made them from songs and from motion
 captures of other occasions.
 
-  motion/ID/trajectory.npy          [frames, 25] at 30 fps
+  motion/ID/trajectory.npy          [frames, 25] at 30 fps; of a group [dancers, frames, 25]
   audio_features/ID/features.npz    mel, chroma, mfcc, rms, spectral_centroid, onset_strength (relative
                                     to the whole song), tempo, beat_times (s, from the begin)
   beats/ID.beats.txt                seconds and number in the bar, on to the downbeat after the phrase
@@ -57,7 +57,12 @@ impl PhraseFolder {
     ) -> io::Result<()> {
         let ConstructedPhrase { id, motion, features, beats, later_beats, .. } = phrase;
         let values: Vec<f32> = motion.iter().copied().collect();
-        let trajectory = npy::write(&[motion.nrows(), motion.ncols()], &values);
+        let shape = match motion.shape() {
+            // A soloist's has no axis of dancers.
+            [1, of_one @ ..] => of_one,
+            shape => shape,
+        };
+        let trajectory = npy::write(shape, &values);
         write_file(&self.folder.join(format!("motion/{id}/trajectory.npy")), |out| {
             out.write_all(&trajectory)
         })?;

@@ -2,6 +2,7 @@
 //! and `beats`.
 
 mod captures;
+mod dancers;
 mod job;
 mod known;
 mod layout;
@@ -23,6 +24,7 @@ use super::{ClientParams, Contract, LinkParams, Progress, Stage, Summary, all_th
 use crate::motion::Axis;
 use crate::store::{Location, Source, StoreError, StoreSnapshot, checkpoint, digest};
 use captures::Captures;
+use dancers::DancerRange;
 use job::LibraryJob;
 use known::StoreContents;
 use made::Band;
@@ -113,6 +115,12 @@ pub struct LibraryRules {
     #[arg(long, value_name = "FRAMES",
           default_value_t = NonZeroUsize::new(60).expect("60 is not 0"))]
     pub hop_frames: NonZeroUsize,
+    /// Dancers of a take, a number or a range that chance draws from for each take, such as 2..5: groups in
+    /// formations, their steps the same, mirrored, in canon, as call and response, or free (docs/groups.md)
+    /// [default: soloists].
+    #[arg(long, value_name = "MIN..MAX")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub dancers: Option<DancerRange>,
     /// Chooses other dances of the same songs and captures.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
@@ -229,4 +237,25 @@ fn unreadable(path: &str, error: &StoreError) -> Failure {
 fn params_hash(rules: &LibraryRules) -> String {
     let text = serde_json::json!({ "output_version": OUTPUT_VERSION, "rules": rules });
     digest(text.to_string().as_bytes())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parameters_that_are_not_given_leave_their_digest_as_it_was() {
+        let mut rules = LibraryRules {
+            takes: NonZeroU32::new(3).unwrap(),
+            phrase_frames: NonZeroUsize::new(120).unwrap(),
+            hop_frames: NonZeroUsize::new(60).unwrap(),
+            dancers: None,
+            seed: 7,
+        };
+        let text = r#"{"output_version":2,"rules":{"hop_frames":60,"phrase_frames":120,"seed":7,"takes":3}}"#;
+        assert_eq!(params_hash(&rules), digest(text.as_bytes()));
+        rules.dancers = Some("2..5".parse().unwrap());
+        let text = r#"{"output_version":2,"rules":{"dancers":"2..5","hop_frames":60,"phrase_frames":120,"seed":7,"takes":3}}"#;
+        assert_eq!(params_hash(&rules), digest(text.as_bytes()));
+    }
 }

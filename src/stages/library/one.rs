@@ -3,14 +3,17 @@
 use std::io::Read as _;
 use std::time::Duration;
 
-use ndarray::{Array2, ArrayView1, s};
+use ndarray::{Array2, Array3, ArrayView1, Axis, s};
 use xxhash_rust::xxh3::xxh3_64_with_seed;
 
 use super::made::{Performance, beats_text};
 use super::songs::{Song, SongFiles, SongInput};
 use super::{LibraryRules, unreadable};
 use crate::audio::BLOCKS;
-use crate::motion::choreography::{self, BeatGrid, Repertoire, SongError, choreograph, n_phrases};
+use crate::motion::choreography::{
+    self, BeatGrid, Formation, GroupRules, Repertoire, SongError, Unison, choreograph,
+    choreograph_group, group_phrase, n_phrases,
+};
 use crate::motion::{Beats, BeatsPerBarSource};
 use crate::stages::beats::{self, BeatSource};
 use crate::stages::extract;
@@ -23,6 +26,10 @@ use crate::units::frames_to_s;
 const TIMEOUT: Duration = Duration::from_secs(900);
 /// Longest song, in seconds.
 const MAX_DURATION_S: f64 = 24.0 * 3600.0;
+/// Length of a group's spans of one kind, at least, in phrases: so that most phrases lie within one.
+const SPAN_PHRASES: usize = 3;
+/// Least share of a phrase's frames that a formation or a kind of unison needs to be told of it.
+const MIN_KIND_SHARE: f64 = 0.75;
 
 /// A song as it is danced to.
 pub struct SongMusic {
@@ -41,8 +48,11 @@ pub struct ConstructedPhrase {
     pub id: String,
     /// Where in the song it begins.
     pub first_frame: usize,
-    /// [n, 25].
-    pub motion: Array2<f32>,
+    /// \[N, n, 25\]: of every dancer, one for a soloist.
+    pub motion: Array3<f32>,
+    /// Of a group, where one holds three quarters of the phrase.
+    pub formation: Option<Formation>,
+    pub unison: Option<Unison>,
     /// [n, 163].
     pub features: Array2<f32>,
     /// Time from the begin of the phrase, and number in the bar, of every beat in it.
@@ -201,6 +211,45 @@ pub fn phrase_id(song: &Song, rules: &LibraryRules, take: u32, index: usize) -> 
     format!("{}.t{take:0digits$}.{index:04}", song.slug)
 }
 
+impl ConstructedPhrase {
+    pub fn n_dancers(&self) -> usize {
+        self.motion.len_of(Axis(0))
+    }
+
+    pub fn n_frames(&self) -> usize {
+        self.motion.len_of(Axis(1))
+    }
+}
+
+/// Motion of a phrase, and what is known of it.
+type PhraseMotion = (Array3<f32>, Option<Formation>, Option<Unison>);
+
+/// Dances to a whole song as a soloist or as a group; returns what cuts `length` frames from a first one on.
+fn danced(
+    song: &choreography::Song<'_>,
+    repertoire: &Repertoire,
+    rules: &LibraryRules,
+    seed: u64,
+) -> Box<dyn Fn(usize, usize) -> PhraseMotion> {
+    let n_dancers = rules.dancers.map_or(1, |range| range.draw(seed));
+    if n_dancers == 1 {
+        let dance = choreograph(song, repertoire, seed);
+        return Box::new(move |first, length| {
+            let frames = choreography::phrase(dance.frames.view(), first, length);
+            (frames.insert_axis(Axis(0)), None, None)
+        });
+    }
+    let min_span_s = frames_to_s(SPAN_PHRASES * rules.phrase_frames.get());
+    let dance = choreograph_group(song, repertoire, &GroupRules { n_dancers, min_span_s, seed });
+    Box::new(move |first, length| {
+        let phrase = group_phrase(&dance, first, length);
+        let (formation, unison) = (phrase.formation, phrase.unison);
+        let formation = (formation.1 >= MIN_KIND_SHARE).then_some(formation.0);
+        let unison = (unison.1 >= MIN_KIND_SHARE).then_some(unison.0);
+        (phrase.frames, formation, unison)
+    })
+}
+
 /// Dances to a song, take by take, and calls `visit` with every phrase, in the order of their names;
 /// returns how many there are.
 ///
@@ -227,14 +276,17 @@ pub fn dance<E: From<Failure>>(
     let grid = heard.grid();
     for take in 0..rules.takes.get() {
         let seed = xxh3_64_with_seed(format!("{}\n{take}", song.id).as_bytes(), rules.seed);
-        let danced = choreograph(&heard, repertoire, seed);
+        let cut = danced(&heard, repertoire, rules, seed);
         for index in 0..per_take {
             let first = index * hop;
             let (beats, later_beats) = beats_of(&grid, first, length);
+            let (motion, formation, unison) = cut(first, length);
             visit(ConstructedPhrase {
                 id: phrase_id(song, rules, take, index),
                 first_frame: first,
-                motion: choreography::phrase(danced.frames.view(), first, length),
+                motion,
+                formation,
+                unison,
                 features: music.features.slice(s![first..first + length, ..]).to_owned(),
                 beats,
                 later_beats,

@@ -4,10 +4,68 @@ use std::collections::BTreeMap;
 use std::io::{self, Write};
 use std::path::PathBuf;
 
+use super::one::ConstructedPhrase;
 use super::songs::Song;
 use super::write::SongOutcome;
+use crate::motion::choreography::{Formation, Unison};
 use crate::stages::Summary;
 use crate::stages::failure::{Failure, failures_json, write_failures, write_notes};
+
+/// Counts of phrases, and of those of groups by what is known of them.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct PhraseCounts {
+    pub n: usize,
+    /// Phrases by number of dancers.
+    pub n_dancers: BTreeMap<usize, usize>,
+    /// Phrases of groups by formation and by unison, `BETWEEN` where neither holds most of the phrase.
+    pub formations: BTreeMap<&'static str, usize>,
+    pub unisons: BTreeMap<&'static str, usize>,
+}
+
+/// What the summary says of a phrase in which one kind goes over into another.
+const BETWEEN: &str = "between two";
+
+impl PhraseCounts {
+    pub fn count(&mut self, phrase: &ConstructedPhrase) {
+        let n_dancers = phrase.n_dancers();
+        self.n += 1;
+        *self.n_dancers.entry(n_dancers).or_default() += 1;
+        if n_dancers > 1 {
+            let formation = phrase.formation.map_or(BETWEEN, Formation::name);
+            let unison = phrase.unison.map_or(BETWEEN, Unison::name);
+            *self.formations.entry(formation).or_default() += 1;
+            *self.unisons.entry(unison).or_default() += 1;
+        }
+    }
+
+    fn add(&mut self, other: &Self) {
+        self.n += other.n;
+        let add = |sum: &mut BTreeMap<&'static str, usize>, of: &BTreeMap<&'static str, usize>| {
+            of.iter().for_each(|(kind, n)| *sum.entry(kind).or_default() += n);
+        };
+        add(&mut self.formations, &other.formations);
+        add(&mut self.unisons, &other.unisons);
+        for (n_dancers, n) in &other.n_dancers {
+            *self.n_dancers.entry(*n_dancers).or_default() += n;
+        }
+    }
+
+    /// Writes what groups were made, if any.
+    fn write_groups(&self, out: &mut dyn Write) -> io::Result<()> {
+        if self.formations.is_empty() {
+            return Ok(());
+        }
+        let sizes: Vec<String> =
+            self.n_dancers.iter().map(|(n_dancers, n)| format!("{n} of {n_dancers}")).collect();
+        let kinds = |of: &BTreeMap<&'static str, usize>| {
+            let kinds: Vec<String> = of.iter().map(|(kind, n)| format!("{n} {kind}")).collect();
+            kinds.join(", ")
+        };
+        writeln!(out, "  phrases by number of dancers: {}", sizes.join(", "))?;
+        writeln!(out, "  formations: {}", kinds(&self.formations))?;
+        writeln!(out, "  unison: {}", kinds(&self.unisons))
+    }
+}
 
 /// Counts of songs, captures and phrases that were constructed, unchanged or failed.
 #[derive(Debug, Default)]
@@ -19,7 +77,7 @@ pub struct LibraryTally {
     pub n_captures: usize,
     pub n_primitives: usize,
     /// New phrases by split.
-    pub phrases: BTreeMap<&'static str, usize>,
+    pub phrases: BTreeMap<&'static str, PhraseCounts>,
     /// Phrases of songs that are gone.
     pub n_forgotten: usize,
     pub failed: Vec<(String, Failure)>,
@@ -30,14 +88,21 @@ pub struct LibraryTally {
 }
 
 impl LibraryTally {
-    pub fn add(&mut self, song: &Song, written: SongOutcome) {
+    pub fn add(&mut self, song: &Song, written: &SongOutcome) {
         match written {
-            SongOutcome::Phrases(n) => {
+            SongOutcome::Phrases(counts) => {
                 self.n_done += 1;
-                *self.phrases.entry(song.split).or_default() += n;
+                self.phrases.entry(song.split).or_default().add(counts);
             }
             SongOutcome::Unchanged => self.n_unchanged += 1,
         }
+    }
+
+    /// Returns the counts of all splits together.
+    fn all_phrases(&self) -> PhraseCounts {
+        let mut all = PhraseCounts::default();
+        self.phrases.values().for_each(|counts| all.add(counts));
+        all
     }
 }
 
@@ -80,7 +145,8 @@ impl Summary for LibrarySummary {
                 tally.n_unchanged
             )?;
         } else {
-            let n_phrases: usize = tally.phrases.values().sum();
+            let phrases = tally.all_phrases();
+            let n_phrases = phrases.n;
             writeln!(
                 out,
                 "  {} songs danced to ({n_phrases} phrases), {} up to date, {n_failed} failed; \
@@ -92,6 +158,7 @@ impl Summary for LibrarySummary {
                 "  {} primitives of {} captures; songs split into {splits}",
                 tally.n_primitives, tally.n_captures
             )?;
+            phrases.write_groups(out)?;
         }
         if tally.is_stopped {
             writeln!(out, "  stopped as asked; the same command goes on with what is missing")?;
@@ -124,6 +191,7 @@ impl Summary for LibrarySummary {
 
     fn figures(&mut self) -> serde_json::Value {
         let LibrarySummary { place, tally, .. } = self;
+        let phrases = tally.all_phrases();
         serde_json::json!({
             "store": place.store,
             "output": place.output,
@@ -131,7 +199,10 @@ impl Summary for LibrarySummary {
             "n_todo": tally.n_todo,
             "n_done": tally.n_done,
             "n_unchanged": tally.n_unchanged,
-            "n_phrases": tally.phrases.values().sum::<usize>(),
+            "n_phrases": phrases.n,
+            "n_dancers": phrases.n_dancers,
+            "formations": phrases.formations,
+            "unisons": phrases.unisons,
             "n_captures": tally.n_captures,
             "n_primitives": tally.n_primitives,
             "n_forgotten": tally.n_forgotten,

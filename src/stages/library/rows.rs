@@ -9,7 +9,7 @@ use crate::units::frames_to_s;
 
 /// Returns the row of a phrase; it has no files of its own.
 pub fn phrase_row(song: &Song, music: &SongMusic, phrase: &ConstructedPhrase) -> PhraseRow {
-    let n_frames = phrase.motion.nrows();
+    let n_frames = phrase.n_frames();
     PhraseRow {
         phrase_id: phrase.id.clone(),
         source: song.url.clone(),
@@ -45,19 +45,23 @@ pub fn phrase_row(song: &Song, music: &SongMusic, phrase: &ConstructedPhrase) ->
         tempo_source: Some(music.tempo_source().to_owned()),
         beats_per_bar: Some(music.beats.beats_per_bar() as i32),
         beats_per_bar_source: Some(music.beats_per_bar_source().to_owned()),
+        n_dancers: Some(phrase.n_dancers() as i32),
+        formation: phrase.formation.map(|formation| formation.name().to_owned()),
+        unison: phrase.unison.map(|unison| unison.name().to_owned()),
+        style_name: None,
     }
 }
 
 /// Digest over one line `role digest` for features and motion, as for the files of a phrase.
 fn content_hash(phrase: &ConstructedPhrase) -> String {
-    let digest_of_values = |values: &ndarray::Array2<f32>| {
-        let bytes: Vec<u8> = values.iter().flat_map(|x| x.to_le_bytes()).collect();
+    let digest_of_values = |values: &mut dyn Iterator<Item = &f32>| {
+        let bytes: Vec<u8> = values.flat_map(|x| x.to_le_bytes()).collect();
         digest(&bytes)
     };
     let lines = format!(
         "features {}\nmotion {}\n",
-        digest_of_values(&phrase.features),
-        digest_of_values(&phrase.motion)
+        digest_of_values(&mut phrase.features.iter()),
+        digest_of_values(&mut phrase.motion.iter())
     );
     digest(lines.as_bytes())
 }
@@ -68,5 +72,5 @@ pub fn beat_rows<'a>(
     phrase: &'a ConstructedPhrase,
 ) -> impl Iterator<Item = BeatRow> + 'a {
     let numbered = phrase.beats.iter().map(|&(time_s, number)| (time_s, Some(i64::from(number))));
-    beats::rows(&phrase.id, numbered, phrase.motion.nrows(), music.beat_source)
+    beats::rows(&phrase.id, numbered, phrase.n_frames(), music.beat_source)
 }

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use super::layout::PhraseFolder;
 use super::one::{self, SongMusic, dance};
+use super::report::PhraseCounts;
 use super::rows::{beat_rows, phrase_row};
 use super::songs::Song;
 use super::{Library, LibraryRules};
@@ -39,10 +40,10 @@ pub struct SongWriter<'a> {
 }
 
 /// The outcome of a song.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub enum SongOutcome {
-    /// The number of new phrases.
-    Phrases(usize),
+    /// The new phrases.
+    Phrases(PhraseCounts),
     /// The store has its phrases already.
     Unchanged,
 }
@@ -125,7 +126,8 @@ impl SongWriter<'_> {
         let fingerprint = fingerprint(song, self.captures_fingerprint);
         let (mut phrases, mut beats) = (Vec::new(), Vec::new());
         let mut items: Vec<Item> = Vec::new();
-        let n_phrases = dance(song, music, self.repertoire, self.rules, |phrase| {
+        let mut counts = PhraseCounts::default();
+        dance(song, music, self.repertoire, self.rules, |phrase| {
             self.refuse_taken(song, &phrase.id)?;
             if let Some(output) = self.output {
                 output.write(song, music, &phrase).map_err(|e| {
@@ -136,9 +138,10 @@ impl SongWriter<'_> {
                 return Ok(());
             }
             let part = commit.part(tables::MOTION, tables::motion)?;
-            part.write_frames(&phrase.id, phrase.motion.view())?;
+            part.write_group(&phrase.id, phrase.motion.view())?;
             let part = commit.part(tables::FEATURES, tables::features)?;
             part.write_frames(&phrase.id, phrase.features.view())?;
+            counts.count(&phrase);
             phrases.push(phrase_row(song, music, &phrase));
             beats.extend(beat_rows(music, &phrase));
             let (fingerprint, input_hash) = (fingerprint.clone(), input_hash.clone());
@@ -157,7 +160,7 @@ impl SongWriter<'_> {
             commit.part(BeatRow::schema().name, BeatRow::schema)?.write_rows(&beats)?;
         }
         self.settle(commit, items)?;
-        Ok(SongOutcome::Phrases(n_phrases))
+        Ok(SongOutcome::Phrases(counts))
     }
 
     /// Keeps the fingerprint of a song whose phrases the store has, and which is met under another: it or a capture

@@ -152,6 +152,8 @@ fn row(settings: Option<String>) -> GenerationRow {
         real_time_factor: 0.0,
         settings,
         content_hash: None,
+        n_dancers: Some(1),
+        consistency: None,
         time: TimestampUs(0),
     }
 }
