@@ -295,3 +295,4 @@ fn processor() -> String {
     told.push(std::env::consts::OS);
     told.join("\n")
 }
+}
