@@ -112,32 +112,48 @@ pub fn axis_features(poses: &Poses, formula: Formula) -> Option<[f64; 8]> {
 ///
 /// None for fewer than three frames. Source: AIST++, `aist_plusplus/features/kinetic.py`.
 pub fn marker_features(poses: &Poses, formula: Formula) -> Option<[f64; 12]> {
+    let energies = marker_energies(poses, formula)?;
+    let n = energies.len() as f64;
+    Some(std::array::from_fn(|i| energies.iter().map(|frame| frame[i]).sum::<f64>() / n))
+}
+
+/// Returns what [`marker_features`] are the means of, for every frame from the second on.
+///
+/// None for fewer than three frames.
+pub fn marker_energies(poses: &Poses, formula: Formula) -> Option<Vec<[f64; 12]>> {
     if poses.len() < MIN_FRAMES {
         return None;
     }
     let origin = formula.origin(poses);
-    let marker = |offset: Vector| -> Vec<Vector> {
+    let markers = markers_m(poses)
+        .map(|marker| -> Vec<Vector> { marker.into_iter().map(|p| minus(p, origin)).collect() });
+    let energies = |t: usize| {
+        std::array::from_fn(|i| {
+            let marker = &markers[i / 3];
+            match i % 3 {
+                0 => {
+                    let [x, _, z] = velocity(marker, t, formula);
+                    x * x + z * z
+                }
+                1 => velocity(marker, t, formula)[1].powi(2),
+                _ => norm(acceleration(marker, t, formula)),
+            }
+        })
+    };
+    Some((1..poses.len()).map(energies).collect())
+}
+
+/// Returns where the body's centre and markers 0.25 m along its x, y and z axis are, m, by frame.
+pub fn markers_m(poses: &Poses) -> [Vec<Vector>; 4] {
+    let offsets =
+        [[0.0; 3], unit(0), unit(1), unit(2)].map(|offset| offset.map(|x| BODY_RADIUS_M * x));
+    offsets.map(|offset| {
         let at = |(&p, &q): (&Vector, &Quaternion)| {
             let arm = rotate(q, offset);
-            minus(std::array::from_fn(|i| p[i] + arm[i]), origin)
+            std::array::from_fn(|i| p[i] + arm[i])
         };
         poses.position_m.iter().zip(&poses.orientation).map(at).collect()
-    };
-    let mut markers = vec![marker([0.0; 3])];
-    for axis in 0..3 {
-        markers.push(marker(unit(axis).map(|x| BODY_RADIUS_M * x)));
-    }
-    Some(std::array::from_fn(|i| {
-        let marker = &markers[i / 3];
-        match i % 3 {
-            0 => mean_over(marker, |t| {
-                let [x, _, z] = velocity(marker, t, formula);
-                x * x + z * z
-            }),
-            1 => mean_over(marker, |t| velocity(marker, t, formula)[1].powi(2)),
-            _ => mean_over(marker, |t| norm(acceleration(marker, t, formula))),
-        }
-    }))
+    })
 }
 
 fn unit(axis: usize) -> Vector {

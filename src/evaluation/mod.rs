@@ -13,6 +13,7 @@ pub mod diversity;
 pub mod draws;
 pub mod frechet;
 pub mod geometric;
+pub mod group;
 pub mod interval;
 pub mod kinetic;
 pub mod locking;
