@@ -14,6 +14,7 @@ use super::train::session::{
 use super::train::{StageSummary, TrainDryRun, TrainSummary, restore};
 use super::trained::{TrainedRun, WeightsChoice};
 use super::{ClientParams, Contract, Progress, Stage, Summary};
+use crate::model::Family;
 use crate::store::Location;
 use crate::training::{
     Augmentation, CheckpointKind, Checkpoints, Drive, FinetuneConfig, FinetuneLearner, Journal,

@@ -78,22 +78,6 @@ impl OpenModel {
         Self::of(ModelFolder::of_store(store, name, cache)?)
     }
 
-    /// Opens a model in a folder of this machine.
-    ///
-    /// # Errors
-    /// One sentence about what is missing or of another kind.
-    pub fn of_folder(folder: &Path) -> anyhow::Result<Self> {
-        Self::of(ModelFolder::of_folder(folder)?)
-    }
-
-    /// Opens the model that ships with the program.
-    ///
-    /// # Errors
-    /// When the program was built without it.
-    pub fn pretrained() -> anyhow::Result<Self> {
-        Self::of(ModelFolder::pretrained()?)
-    }
-
     /// Reads the card of a model.
     ///
     /// # Errors
@@ -283,6 +267,7 @@ impl OpenModel {
             opened
         })
     }
+}
 
 /// Returns what tells this processor from others: a model that is optimised for one may not run on another.
 fn processor() -> String {
@@ -294,5 +279,4 @@ fn processor() -> String {
     told.push(std::env::consts::ARCH);
     told.push(std::env::consts::OS);
     told.join("\n")
-}
 }

@@ -336,9 +336,8 @@ impl Windows {
         first: usize,
         n: usize,
     ) -> Result<Vec<Array2<f32>>, StoreError> {
-        (0..phrase.n_dancers)
-            .map(|dancer| self.dataset.motion_of(phrase, dancer, first, n))
-            .collect()
+        let group = self.dataset.group(phrase, first, n)?;
+        Ok(group.outer_iter().map(|dancer| dancer.to_owned()).collect())
     }
 
     /// Cuts a window by chance and changes it by chance; returns its dancers and its music.
@@ -477,10 +476,8 @@ pub fn fit_scales(
         )
     };
     let motion = gather(MOTION_DIM, MAX_FITTED_FRAMES, &|phrase, first, n| {
-        let dancers = 0..phrase.n_dancers;
-        let mut dancers: Vec<_> = dancers
-            .map(|dancer| dataset.motion_of(phrase, dancer, first, n))
-            .collect::<Result<_, StoreError>>()?;
+        let group = dataset.group(phrase, first, n)?;
+        let mut dancers: Vec<_> = group.outer_iter().map(|dancer| dancer.to_owned()).collect();
         place(&mut dancers);
         let views: Vec<_> = dancers.iter().map(|motion| motion.view()).collect();
         Ok(concatenate(Axis(0), &views).expect("invariant: motions of one width"))

@@ -238,13 +238,13 @@ impl GroupEngine {
 }
 
 /// Inputs whose music is scaled.
-struct Given<'a> {
-    inputs: &'a GroupEngineInputs<'a>,
+struct Given<'a, 'b> {
+    inputs: &'a GroupEngineInputs<'b>,
     audio: &'a Array3<f32>,
     x: &'a [f32],
 }
 
-impl Given<'_> {
+impl Given<'_, '_> {
     fn number<I: Interpreter<Element = f32>>(&self, g: &I, config: &GroupConfig) -> Tensor<f32> {
         let groups = self.audio.dim().0;
         let row = config.embedded_number(self.inputs.n_dancers) as f32;

@@ -246,8 +246,8 @@ pub fn group_sampling_defaults(
     for i in 0..n {
         let phrase = phrases[i * phrases.len() / n];
         let features = dataset.features(phrase, 0, n_frames)?;
-        let motions = (0..phrase.n_dancers).map(|dancer| dataset.motion_of(phrase, dancer, 0, n_frames));
-        let motions = motions.collect::<Result<Vec<_>, _>>()?;
+        let group = dataset.group(phrase, 0, n_frames)?;
+        let motions: Vec<_> = group.outer_iter().map(|dancer| dancer.to_owned()).collect();
         let clock = phrase.clock_of(motions[0].view());
         let heard = condition(network.group.condition(), features.view(), Some(clock.view()));
         groups.push((phrase.n_dancers, heard.clone()));
@@ -333,7 +333,7 @@ fn couplings(dataset: &Dataset) -> anyhow::Result<BTreeMap<Arc<str>, Coupling>> 
     let validation = dataset.phrases().iter().filter(|phrase| phrase.split == Split::Validation);
     for phrase in validation.take(MAX_FITTED_PHRASES) {
         // Of a group the first dancer, whose bar is that of all.
-        let motion = dataset.motion_of(phrase, 0, 0, phrase.n_frames)?;
+        let motion = dataset.motion(phrase, 0, phrase.n_frames)?;
         let phase = phase_of(&motion);
         if is_known(&phase, phrase.beats_per_bar) {
             let (rise, bars) = (rise_m_s(&motion), unwrapped(&phase));

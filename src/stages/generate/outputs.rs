@@ -4,7 +4,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
-use ndarray::ArrayView2;
+use ndarray::{ArrayView3, Axis};
 
 use crate::motion::Trajectory;
 use crate::motion::exchange::{write_bvh, write_csv, write_glb, write_npy};
@@ -56,7 +56,8 @@ impl MotionFormat {
 /// A motion and what belongs to it.
 pub struct MotionOutput<'a> {
     pub name: &'a str,
-    pub frames: ArrayView2<'a, f32>,
+    /// Dancer by dancer, \[N, T, 25\].
+    pub frames: ArrayView3<'a, f32>,
     pub beats_s: &'a [f64],
     pub audio: &'a Path,
     pub facts: Vec<(String, String)>,
@@ -82,7 +83,10 @@ pub fn write(
 }
 
 fn write_as(output: &MotionOutput, format: MotionFormat, path: &Path) -> anyhow::Result<()> {
-    let frames = output.frames;
+    if output.frames.len_of(Axis(0)) != 1 {
+        return write_group_as(output, format, path);
+    }
+    let frames = output.frames.index_axis(Axis(0), 0);
     let to_file = |write: &dyn Fn(&mut dyn Write) -> io::Result<()>| -> anyhow::Result<()> {
         write_file(path, |out| write(out))?;
         Ok(())
@@ -123,6 +127,11 @@ fn write_as(output: &MotionOutput, format: MotionFormat, path: &Path) -> anyhow:
     }
 }
 
+fn write_group_as(output: &MotionOutput, format: MotionFormat, path: &Path) -> anyhow::Result<()> {
+    let _ = (output, format, path);
+    anyhow::bail!("groups are not written yet")
+}
+
 fn view(output: &MotionOutput) -> anyhow::Result<View> {
     let bytes = std::fs::read(output.audio)
         .with_context(|| format!("while reading {}", output.audio.display()))?;
@@ -131,7 +140,7 @@ fn view(output: &MotionOutput) -> anyhow::Result<View> {
         title: output.name.to_owned(),
         samples: vec![ViewSample {
             name: output.name.to_owned(),
-            frames: output.frames.to_owned(),
+            frames: output.frames.index_axis(Axis(0), 0).to_owned(),
             facts: output.facts.clone(),
         }],
         beats_s: output.beats_s.to_vec(),

@@ -11,6 +11,7 @@ use serde::de::DeserializeOwned;
 
 use crate::autodiff::Threads;
 use crate::model::Family;
+use crate::motion::group::MAX_DANCERS;
 use crate::stages::{Progress, all_threads, lease};
 use crate::store::tables::FailureRow;
 use crate::store::{
@@ -18,7 +19,7 @@ use crate::store::{
     digest,
 };
 use crate::training::{
-    Dataset, DatasetOptions, ExcludedPhrase, Scales, TrainingError, Watch, differences, fit_scales,
+    Dataset, DatasetOptions, Ensemble, ExcludedPhrase, Scales, TrainingError, Watch, differences, fit_scales,
 };
 
 /// Longest name of a run.
@@ -148,7 +149,10 @@ pub fn read_phrases(
         n_threads: machine.threads,
         patience: machine.patience(),
         max_train_phrases,
-        family,
+        ensemble: match family {
+            Family::Unet => Ensemble::Soloists,
+            Family::Group => Ensemble::Groups { most: MAX_DANCERS },
+        },
     };
     let is_begun = Mutex::new(false);
     let count = |_: usize, n_parts: usize| {

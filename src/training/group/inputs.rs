@@ -2,7 +2,6 @@
 
 use std::borrow::Cow;
 
-use crate::audio::FEATURE_DIM;
 use crate::autodiff::op::dancers::TakeSamples;
 use crate::autodiff::op::loss::{Cost, Loss};
 use crate::autodiff::op::shape::Reshape;
@@ -34,8 +33,8 @@ pub struct WithholdAll {
     pub clock: f64,
 }
 
-impl From<&mut GroupTraining> for WithholdAll {
-    fn from(config: &mut GroupTraining) -> Self {
+impl From<&GroupTraining> for WithholdAll {
+    fn from(config: &GroupTraining) -> Self {
         Self { audio: config.condition_dropout, clock: config.clock_dropout }
     }
 }

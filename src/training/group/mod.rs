@@ -8,7 +8,7 @@ mod negatives;
 
 use std::sync::Arc;
 
-use crate::autodiff::{Arena, Eager, Gradients, Parameters, Tape, Threads};
+use crate::autodiff::{Arena, Eager, Gradients, Interpreter as _, Parameters, Tape, Threads};
 use crate::diffusion::Schedule;
 use crate::model::{GroupConfig, GroupNetworks};
 use crate::weights::{Archive, Section};
@@ -107,7 +107,7 @@ impl GroupLearner {
                 let share = batch.weight() / all.max(1.0);
                 let seed = tape_seed(*seed, step * n_parts as u64 + part as u64);
                 let mut tape = Tape::new(parameters, arena, Some(seed));
-                let given = GroupBatch::of(&batch, schedule, sizes, config.into(), seed);
+                let given = GroupBatch::of(&batch, schedule, sizes, (&*config).into(), seed);
                 let (loss, parts) =
                     given.loss(&mut tape, networks, normalizer, schedule, config)?;
                 let weight = tape.constant(&[], &[share as f32]);
