@@ -132,6 +132,7 @@ fn view(output: &MotionOutput) -> anyhow::Result<View> {
         samples: vec![ViewSample {
             name: output.name.to_owned(),
             frames: output.frames.to_owned(),
+            further_dancers: Vec::new(),
             facts: output.facts.clone(),
         }],
         beats_s: output.beats_s.to_vec(),
