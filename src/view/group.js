@@ -1,9 +1,6 @@
 // Groups: several bodies on the stage of one, each in a colour of its own. A page without a group has no
 // such part; it comes last, and replaces what is otherwise of one body.
 
-// The first eight after Okabe and Ito, "Color Universal Design", 2008, and the same darker.
-const DANCER_COLORS = ['#0072b2', '#e69f00', '#009e73', '#cc79a7', '#d55e00', '#56b4e9', '#b3a100',
-  '#8f6bb8', '#00496f', '#946600', '#006549', '#84506c', '#893c00', '#377295', '#736700', '#5b4476'];
 const ALL = -1;
 // Space around a group, in metres, and how much further than it is wide the camera stands.
 const GROUP_ROOM = 2.4;
@@ -29,7 +26,7 @@ samples.forEach((sample, i) => {
 const group = { dancers: samples[0].dancers, followed: ALL, size: 0 };
 
 function colorOf(dancer) {
-  return DANCER_COLORS[dancer % DANCER_COLORS.length];
+  return data.colors[dancer % data.colors.length];
 }
 
 // The colours of the page with those of a dancer.
@@ -127,7 +124,7 @@ const dancerChoice = element('select', { id: 'dancer' });
 at('camera').append(element('label', {}, ['Dancer ', dancerChoice]));
 
 function fillDancers() {
-  const options = group.dancers.map((_, i) => element('option', { value: i, textContent: i + 1 }));
+  const options = group.dancers.map((_, i) => element('option', { value: i, textContent: i }));
   dancerChoice.replaceChildren(element('option', { value: ALL, textContent: 'all' }), ...options);
   dancerChoice.value = group.followed;
 }
@@ -136,11 +133,11 @@ function nameDancers() {
   const names = group.dancers.map((_, i) => {
     const swatch = element('span', { textContent: '■ ' });
     swatch.style.color = colorOf(i);
-    const name = element('span', {}, [swatch, `${i + 1}  `]);
+    const name = element('span', {}, [swatch, `${i}  `]);
     name.style.whiteSpace = 'pre';
     return name;
   });
-  const shown = group.followed === ALL ? 1 : group.followed + 1;
+  const shown = Math.max(0, group.followed);
   at('facts').append(
     element('dt', { textContent: 'dancers' }), element('dd', {}, names),
     element('dt', { textContent: 'curves' }), element('dd', { textContent: `of dancer ${shown}` }),

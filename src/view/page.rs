@@ -8,6 +8,7 @@ use ndarray::Array2;
 use serde::Serialize;
 
 use super::{Audio, View, ViewSample};
+use crate::motion::group::DANCER_COLORS;
 use crate::motion::{CHANNEL_NAMES, MOTION_DIM};
 use crate::units::FPS;
 
@@ -43,7 +44,7 @@ pub fn page(view: &View) -> String {
             "data" => out.push_str(&data(view)),
             "script" => {
                 SCRIPTS.iter().for_each(|script| out.push_str(script));
-                if view.samples.iter().any(|sample| !sample.further_dancers.is_empty()) {
+                if has_group(view) {
                     out.push_str(GROUP_SCRIPT);
                 }
             }
@@ -52,6 +53,10 @@ pub fn page(view: &View) -> String {
         out.push_str(rest);
     }
     out
+}
+
+fn has_group(view: &View) -> bool {
+    view.samples.iter().any(|sample| !sample.further_dancers.is_empty())
 }
 
 /// Returns about how long the page will be.
@@ -83,6 +88,9 @@ struct Data<'a> {
     channels: [&'static str; MOTION_DIM],
     beats: Vec<f64>,
     samples: Vec<Sample<'a>>,
+    /// Of dancers, `#rrggbb`, where there is a group.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    colors: Vec<String>,
 }
 
 #[derive(Serialize)]
@@ -105,7 +113,13 @@ fn data(view: &View) -> String {
         frames: floats(&sample.frames),
         dancers: sample.further_dancers.iter().map(floats).collect(),
     });
-    let data = Data { fps: FPS, channels: CHANNEL_NAMES, beats, samples: samples.collect() };
+    let colors = if has_group(view) {
+        DANCER_COLORS.map(|[r, g, b]| format!("#{r:02x}{g:02x}{b:02x}")).to_vec()
+    } else {
+        Vec::new()
+    };
+    let samples = samples.collect();
+    let data = Data { fps: FPS, channels: CHANNEL_NAMES, beats, samples, colors };
     let json = serde_json::to_string(&data)
         .expect("invariant: the data hold only strings and finite numbers");
     inert(&json)
@@ -218,6 +232,7 @@ mod tests {
         assert!(page.find(GROUP_SCRIPT) > page.find(SCRIPTS[4]));
         let data = data_of(&page);
         assert_eq!(data["samples"][0].get("dancers"), None);
+        assert_eq!((&data["colors"][1], data_of(&alone).get("colors")), (&"#e69f00".into(), None));
         let dancers = &data["samples"][1]["dancers"];
         assert_eq!(dancers.as_array().map(Vec::len), Some(2));
         assert_eq!(floats_of(&data["samples"][1]["frames"])[25], 1.0);
