@@ -13,6 +13,12 @@ pub enum PlotError {
     /// An array of another width.
     #[error("features have {found} values per frame; a plot needs {wanted}")]
     Columns { found: usize, wanted: usize },
+    /// A group of another width, or of nobody.
+    #[error(
+        "group has shape [{n_dancers}, {n_frames}, {n_channels}]; a plot needs [N, T, {wanted}] with \
+         dancers and frames"
+    )]
+    Group { n_dancers: usize, n_frames: usize, n_channels: usize, wanted: usize },
     /// Mel bands that give no axis.
     #[error(
         "{found} mel band frequencies; a plot needs {wanted} that are finite, above 0 Hz and rise"

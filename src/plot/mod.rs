@@ -12,6 +12,7 @@ mod error;
 mod features;
 mod font;
 mod frame;
+mod group;
 mod header;
 mod heatmap;
 mod motion;
@@ -34,6 +35,7 @@ mod value_axis;
 
 pub use error::PlotError;
 pub use features::{FeaturesPlot, features};
+pub use group::{GroupPlot, group};
 pub use motion::{MOTION_WIDTH_PX, MotionPlot, motion};
 pub use motion_panel::MotionPanel;
 pub use panel::Panel;

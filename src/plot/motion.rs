@@ -196,7 +196,10 @@ fn facts(plot: &MotionPlot<'_>, has_curves: bool, grid: &Grid) -> Vec<Fact> {
             Fact { key, text: counted(n_beats as u64, "beat") }
         });
     }
-    facts.push(Fact::plain(format!("path of {} m", number(FloorPath::length_m(plot.motion)))));
+    facts.push(Fact::plain(format!(
+        "path of {} m",
+        number(FloorPath::length_m(plot.motion.view()))
+    )));
     let n_missing = plot.motion.view().iter().filter(|value| !value.is_finite()).count();
     if n_missing > 0 {
         let text = format!("{} not finite", counted(n_missing as u64, "value"));

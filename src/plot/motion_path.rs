@@ -1,9 +1,11 @@
 //! The path of a motion as it is seen from above.
 
+use ndarray::{ArrayView2, s};
+
 use super::axis::{self, Tick};
 use super::scene::{Anchor, Point, Rect, Scene, SceneItem};
 use super::style::{
-    BLUE, CAP_HEIGHT, CURVE_PX, GREEN, GRID, HAIRLINE_PX, INK, MUTED, TEXT_PX, VERMILLION,
+    BLUE, CAP_HEIGHT, CURVE_PX, GREEN, GRID, HAIRLINE_PX, INK, MUTED, Rgb, TEXT_PX, VERMILLION,
 };
 use super::{font, frame};
 use crate::motion::quaternion::{dot, normalize, rotate};
@@ -45,18 +47,31 @@ pub(super) struct FloorPath {
     every_s: usize,
 }
 
+/// The colours of a path, of its first and of its last place.
+#[derive(Clone, Copy)]
+pub(super) struct PathColors {
+    pub path: Rgb,
+    pub start: Rgb,
+    pub end: Rgb,
+}
+
 impl FloorPath {
     pub fn of(motion: &Trajectory) -> Self {
-        let (position, quaternion) =
-            (motion.channel(Channel::Position), motion.channel(Channel::Quaternion));
+        Self::of_frames(motion.view())
+    }
+
+    /// Takes the path of frames, `[T, 25]`.
+    pub fn of_frames(frames: ArrayView2<f32>) -> Self {
+        let channel = |channel: Channel| frames.slice_move(s![.., channel.range()]);
+        let (position, quaternion) = (channel(Channel::Position), channel(Channel::Quaternion));
         let places = position.rows().into_iter().map(|p| {
             let place = [f64::from(p[0]), f64::from(p[2])];
             place.iter().all(|x| x.is_finite()).then_some(place)
         });
-        let n_s = (motion.n_frames() as f64 / FPS) as usize;
+        let n_s = (frames.nrows() as f64 / FPS) as usize;
         let every_s = n_s.div_ceil(MAX_MARKS).max(1);
         let every_frames = every_s * FPS as usize;
-        let facings = (0..motion.n_frames()).step_by(every_frames).filter_map(|t| {
+        let facings = (0..frames.nrows()).step_by(every_frames).filter_map(|t| {
             let q = quaternion.row(t);
             let q = normalize(std::array::from_fn(|i| f64::from(q[i])));
             let [x, _, z] = rotate(q, [0.0, 0.0, 1.0]);
@@ -68,8 +83,8 @@ impl FloorPath {
     }
 
     /// Returns the length in metres, gaps left out.
-    pub fn length_m(motion: &Trajectory) -> f64 {
-        let position = motion.channel(Channel::Position);
+    pub fn length_m(frames: ArrayView2<f32>) -> f64 {
+        let position = frames.slice(s![.., Channel::Position.range()]);
         let steps = position.rows().into_iter().zip(position.rows().into_iter().skip(1));
         let lengths = steps.map(|(from, to)| {
             let parts = from.iter().zip(to).map(|(&a, &b)| f64::from(b) - f64::from(a));
@@ -80,10 +95,22 @@ impl FloorPath {
 
     /// Writes heading, unit and legend over the panel at `rect`.
     pub fn heading(&self, scene: &mut Scene, rect: Rect, heading: &str, unit: &str) {
-        let entries = [("start", GREEN), ("end", VERMILLION)];
+        let entries = [("start".to_owned(), GREEN), ("end".to_owned(), VERMILLION)];
+        self.heading_with(scene, rect, [heading, unit], &entries);
+    }
+
+    /// Writes heading, unit and a legend of these entries over the panel at `rect`; a legend that has no
+    /// room is cut at its beginning.
+    pub fn heading_with(
+        &self,
+        scene: &mut Scene,
+        rect: Rect,
+        [heading, unit]: [&str; 2],
+        entries: &[(String, Rgb)],
+    ) {
         let width = |label: &str| END_DOT_PX + KEY_GAP_PX + font::width_px(label, TEXT_PX);
-        let gaps = (entries.len() - 1) as f64 * ENTRY_GAP_PX;
-        let mut x = rect.right() - entries.iter().map(|e| width(e.0)).sum::<f64>() - gaps;
+        let gaps = entries.len().saturating_sub(1) as f64 * ENTRY_GAP_PX;
+        let mut x = rect.right() - entries.iter().map(|e| width(&e.0)).sum::<f64>() - gaps;
         let s = if self.every_s == 1 { "second".to_owned() } else { format!("{} s", self.every_s) };
         let meanings = [
             format!("from above, z downwards; marks: where the front points, every {s}"),
@@ -93,7 +120,7 @@ impl FloorPath {
         let meanings = meanings.each_ref().map(String::as_str);
         frame::heading(scene, rect, x - ENTRY_GAP_PX, heading, &meanings, unit);
         let base = rect.top - LEGEND_UP_PX;
-        for (label, color) in entries {
+        for (label, &color) in entries.iter().map(|(label, color)| (label.as_str(), color)) {
             let middle = [x + END_DOT_PX / 2.0, base - CAP_HEIGHT * TEXT_PX / 2.0];
             scene.dot(middle, END_DOT_PX, color);
             let at = [x + END_DOT_PX + KEY_GAP_PX, base];
@@ -104,7 +131,13 @@ impl FloorPath {
 
     /// Draws the path with its axes, a metre as long on one as on the other.
     pub fn draw(&self, scene: &mut Scene, rect: Rect) {
-        let Some(map) = Map::around(self.places_m.iter().flatten(), rect) else {
+        let colors = PathColors { path: BLUE, start: GREEN, end: VERMILLION };
+        Self::draw_all(&[(self, colors)], scene, rect);
+    }
+
+    /// Draws paths with common axes.
+    pub fn draw_all(paths: &[(&Self, PathColors)], scene: &mut Scene, rect: Rect) {
+        let Some(map) = Map::of(paths, rect) else {
             return frame::nothing(scene, rect, "no values");
         };
         let (x_m, z_m) = (map.ends_m(0, rect.width), map.ends_m(1, rect.height));
@@ -118,22 +151,32 @@ impl FloorPath {
             tick.label = font::elide(&tick.label, TEXT_PX, MAX_LABEL_PX);
         }
         frame::value_grid(scene, rect, &z_ticks, |z| map.at([0.0, z])[1]);
-        self.curve(scene, &map);
+        for (path, colors) in paths {
+            path.curve(scene, &map, *colors);
+        }
         let labels = x_ticks.iter().map(|t| (map.at([t.value, 0.0])[0], t.label.as_str()));
         frame::x_ticks(scene, labels.clone().map(|(x, _)| x), rect.bottom());
         frame::x_labels(scene, labels, [rect.left, rect.right()], rect.bottom(), "x (m)");
     }
 
-    fn curve(&self, scene: &mut Scene, map: &Map) {
+    /// Makes rings of the dots at the begin of paths that are drawn.
+    pub fn hollow_starts(paths: &[(&Self, PathColors)], scene: &mut Scene, rect: Rect, paper: Rgb) {
+        let Some(map) = Map::of(paths, rect) else { return };
+        for place in paths.iter().filter_map(|(path, _)| path.places_m.iter().flatten().next()) {
+            scene.dot(map.at(*place), END_DOT_PX / 2.0, paper);
+        }
+    }
+
+    fn curve(&self, scene: &mut Scene, map: &Map, colors: PathColors) {
         let every = self.places_m.len().div_ceil(MAX_POINTS).max(1);
         let thinned: Vec<_> = self.places_m.iter().step_by(every).collect();
         for run in thinned.split(|place| place.is_none()) {
             let points: Vec<Point> = run.iter().filter_map(|p| p.map(|p| map.at(p))).collect();
             match points.as_slice() {
                 [] => {}
-                &[alone] => scene.dot(alone, MARK_DOT_PX, BLUE),
+                &[alone] => scene.dot(alone, MARK_DOT_PX, colors.path),
                 _ => {
-                    let (color, width_px) = (BLUE, CURVE_PX);
+                    let (color, width_px) = (colors.path, CURVE_PX);
                     scene.items.push(SceneItem::Polyline { points, color, width_px });
                 }
             }
@@ -147,7 +190,7 @@ impl FloorPath {
         }
         let mut places = self.places_m.iter().flatten();
         let (start, end) = (places.next(), self.places_m.iter().flatten().next_back());
-        for (place, color) in [(end, VERMILLION), (start, GREEN)] {
+        for (place, color) in [(end, colors.end), (start, colors.start)] {
             if let Some(&place) = place {
                 scene.dot(map.at(place), END_DOT_PX, color);
             }
@@ -164,6 +207,11 @@ struct Map {
 }
 
 impl Map {
+    /// Returns the map that has room for every place of paths; `None` without one.
+    fn of(paths: &[(&FloorPath, PathColors)], rect: Rect) -> Option<Self> {
+        Self::around(paths.iter().flat_map(|(path, _)| path.places_m.iter().flatten()), rect)
+    }
+
     /// Returns the map that has room for every place; `None` without one.
     fn around<'a>(places_m: impl Iterator<Item = &'a [f64; 2]>, rect: Rect) -> Option<Self> {
         let mut ends: Option<[[f64; 2]; 2]> = None;
@@ -255,13 +303,13 @@ mod tests {
         let motion =
             walk(7, |t| [if t == 3 { f32::NAN } else { 3.0 * t as f32 }, 0.0, 4.0 * t as f32]);
         // Steps of 5 m, of which those to and from frame 3 are not known.
-        assert!((FloorPath::length_m(&motion) - 20.0).abs() < 1e-5);
+        assert!((FloorPath::length_m(motion.view()) - 20.0).abs() < 1e-5);
         let path = FloorPath::of(&motion);
         assert_eq!(path.places_m.iter().flatten().count(), 6);
         let nowhere = walk(3, |_| [f32::INFINITY, 0.0, 0.0]);
         let path = FloorPath::of(&nowhere);
         assert!(Map::around(path.places_m.iter().flatten(), RECT).is_none());
-        assert_eq!(FloorPath::length_m(&nowhere), 0.0);
+        assert_eq!(FloorPath::length_m(nowhere.view()), 0.0);
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! Tests of whole plots: what is on the page, and what is in the bytes.
 
+mod group;
 mod motion;
 mod training;
 

@@ -203,6 +203,7 @@ fn page_of(subject: MotionDisplay, audio: Option<Audio>) -> Page {
     let samples = subject.shown.into_iter().map(|shown| ViewSample {
         name: shown.name,
         frames: shown.motion.into_array(),
+        further_dancers: Vec::new(),
         facts: shown.facts,
     });
     Page { title: subject.title, samples: samples.collect(), beats_s: subject.beats_s, audio }

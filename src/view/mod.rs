@@ -3,11 +3,11 @@
 //! A page shows a body on its way through space, plays the music to it, and draws channels over time.
 //! It asks nothing of any network, works from a folder without a server, and holds its numbers as
 //! they are: 32-bit floats. The scripts are `motion.js` (numbers), `stage.js` and `body.js` (space),
-//! `charts.js` (time) and `page.js` (clock and controls).
+//! `charts.js` (time), `page.js` (clock and controls), and `group.js` on pages with several bodies.
 
 mod page;
 
-use ndarray::Array2;
+use ndarray::{Array2, ArrayView3};
 
 pub use page::page;
 
@@ -27,10 +27,21 @@ pub struct View {
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewSample {
     pub name: String,
-    /// `[T, 25]` at [`crate::units::FPS`]; what is not finite is a gap.
+    /// `[T, 25]` at [`crate::units::FPS`]; what is not finite is a gap. Of a group the first dancer's.
     pub frames: Array2<f32>,
+    /// The further dancers of a group, `[T, 25]` each; none of a soloist.
+    pub further_dancers: Vec<Array2<f32>>,
     /// Names and values, in the order in which they are listed.
     pub facts: Vec<(String, String)>,
+}
+
+impl ViewSample {
+    /// Returns a sample of a group, `[N, T, 25]`; one without dancers has no frames.
+    pub fn of_group(name: String, group: ArrayView3<f32>, facts: Vec<(String, String)>) -> Self {
+        let mut dancers = group.outer_iter().map(|dancer| dancer.to_owned());
+        let frames = dancers.next().unwrap_or_else(|| Array2::zeros((0, group.dim().2)));
+        Self { name, frames, further_dancers: dancers.collect(), facts }
+    }
 }
 
 /// An audio file.

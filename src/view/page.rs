@@ -8,6 +8,7 @@ use ndarray::Array2;
 use serde::Serialize;
 
 use super::{Audio, View, ViewSample};
+use crate::motion::group::DANCER_COLORS;
 use crate::motion::{CHANNEL_NAMES, MOTION_DIM};
 use crate::units::FPS;
 
@@ -22,6 +23,8 @@ const SCRIPTS: [&str; 5] = [
     include_str!("charts.js"),
     include_str!("page.js"),
 ];
+/// The part that a page with a group has after them.
+const GROUP_SCRIPT: &str = include_str!("group.js");
 
 /// Returns the page as HTML. The same view gives the same text.
 ///
@@ -39,7 +42,12 @@ pub fn page(view: &View) -> String {
             "style" => out.push_str(STYLE),
             "audio" => write_audio(&mut out, view.audio.as_ref()),
             "data" => out.push_str(&data(view)),
-            "script" => SCRIPTS.iter().for_each(|script| out.push_str(script)),
+            "script" => {
+                SCRIPTS.iter().for_each(|script| out.push_str(script));
+                if has_group(view) {
+                    out.push_str(GROUP_SCRIPT);
+                }
+            }
             _ => {}
         }
         out.push_str(rest);
@@ -47,10 +55,17 @@ pub fn page(view: &View) -> String {
     out
 }
 
+fn has_group(view: &View) -> bool {
+    view.samples.iter().any(|sample| !sample.further_dancers.is_empty())
+}
+
 /// Returns about how long the page will be.
 fn size_bytes(view: &View) -> usize {
     let in_base64 = |n_bytes: usize| n_bytes.div_ceil(3) * 4;
-    let motion_bytes = |sample: &ViewSample| in_base64(size_of::<f32>() * sample.frames.len());
+    let motion_bytes = |sample: &ViewSample| {
+        let dancers = [&sample.frames].into_iter().chain(&sample.further_dancers);
+        dancers.map(|frames| in_base64(size_of::<f32>() * frames.len())).sum::<usize>()
+    };
     let motions: usize = view.samples.iter().map(motion_bytes).sum();
     let audio = view.audio.as_ref().map_or(0, |audio| in_base64(audio.bytes.len()));
     let own: usize = SCRIPTS.iter().map(|script| script.len()).sum();
@@ -73,6 +88,9 @@ struct Data<'a> {
     channels: [&'static str; MOTION_DIM],
     beats: Vec<f64>,
     samples: Vec<Sample<'a>>,
+    /// Of dancers, `#rrggbb`, where there is a group.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    colors: Vec<String>,
 }
 
 #[derive(Serialize)]
@@ -80,6 +98,9 @@ struct Sample<'a> {
     name: &'a str,
     facts: &'a [(String, String)],
     frames: String,
+    /// Of a group: the other dancers.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    dancers: Vec<String>,
 }
 
 /// Returns the data as JSON that can stand in a script element.
@@ -90,8 +111,15 @@ fn data(view: &View) -> String {
         name: &sample.name,
         facts: &sample.facts,
         frames: floats(&sample.frames),
+        dancers: sample.further_dancers.iter().map(floats).collect(),
     });
-    let data = Data { fps: FPS, channels: CHANNEL_NAMES, beats, samples: samples.collect() };
+    let colors = if has_group(view) {
+        DANCER_COLORS.map(|[r, g, b]| format!("#{r:02x}{g:02x}{b:02x}")).to_vec()
+    } else {
+        Vec::new()
+    };
+    let samples = samples.collect();
+    let data = Data { fps: FPS, channels: CHANNEL_NAMES, beats, samples, colors };
     let json = serde_json::to_string(&data)
         .expect("invariant: the data hold only strings and finite numbers");
     inert(&json)
@@ -138,6 +166,7 @@ fn write_escaped(out: &mut String, text: &str) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ndarray::Array3;
     use proptest::prelude::*;
 
     fn sample(name: &str, n_frames: usize) -> ViewSample {
@@ -145,7 +174,7 @@ mod tests {
             t as f32 + i as f32 / 32.0 - 1.5
         });
         let facts = vec![("seed".to_owned(), "7".to_owned())];
-        ViewSample { name: name.to_owned(), frames, facts }
+        ViewSample { name: name.to_owned(), frames, further_dancers: Vec::new(), facts }
     }
 
     fn view(title: &str, samples: Vec<ViewSample>) -> View {
@@ -186,6 +215,31 @@ mod tests {
             assert!(page.contains(name), "no {name}");
         }
         assert!(!page.contains("<audio"));
+    }
+
+    #[test]
+    fn a_group_has_its_dancers_and_the_part_that_draws_them() {
+        let group = Array3::from_shape_fn((3, 4, MOTION_DIM), |(n, t, i)| {
+            n as f32 * 8.0 + t as f32 + i as f32 / 32.0
+        });
+        let facts = vec![("dancers".to_owned(), "3".to_owned())];
+        let trio = ViewSample::of_group("trio".to_owned(), group.view(), facts);
+        let alone = page(&view("t", vec![sample("0", 3)]));
+        assert!(!alone.contains(GROUP_SCRIPT) && !alone.contains("\"dancers\":["));
+        let page = page(&view("t", vec![sample("0", 3), trio]));
+        assert!(page.contains(GROUP_SCRIPT) && !GROUP_SCRIPT.contains("</script"));
+        // It builds on what comes before.
+        assert!(page.find(GROUP_SCRIPT) > page.find(SCRIPTS[4]));
+        let data = data_of(&page);
+        assert_eq!(data["samples"][0].get("dancers"), None);
+        assert_eq!((&data["colors"][1], data_of(&alone).get("colors")), (&"#e69f00".into(), None));
+        let dancers = &data["samples"][1]["dancers"];
+        assert_eq!(dancers.as_array().map(Vec::len), Some(2));
+        assert_eq!(floats_of(&data["samples"][1]["frames"])[25], 1.0);
+        assert_eq!(floats_of(&dancers[1])[3 * 25 + 2], 16.0 + 3.0 + 2.0 / 32.0);
+        let nobody = Array3::zeros((0, 4, MOTION_DIM));
+        let nobody = ViewSample::of_group(String::new(), nobody.view(), Vec::new());
+        assert_eq!((nobody.frames.dim(), nobody.further_dancers.len()), ((0, MOTION_DIM), 0));
     }
 
     #[test]

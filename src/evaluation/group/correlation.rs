@@ -71,7 +71,7 @@ pub fn correlation(dancers: &[Poses]) -> Option<f64> {
 pub(super) fn pieces(n_frames: usize) -> Vec<Range<usize>> {
     let n_pieces = n_frames / PIECE_FRAMES;
     if n_pieces == 0 {
-        return vec![0..n_frames];
+        return std::iter::once(0..n_frames).collect();
     }
     (0..n_pieces).map(|i| i * PIECE_FRAMES..(i + 1) * PIECE_FRAMES).collect()
 }

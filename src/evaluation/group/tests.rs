@@ -49,7 +49,10 @@ fn dance(n: usize, seed: u64) -> Poses {
         (0..16).map(|_| [0.2 + 1.5 * draws.uniform(), 6.3 * draws.uniform()]).collect();
     let wave = |i: usize, t: usize| {
         (0..4)
-            .map(|k| (6.283 * waves[4 * i + k][0] * t as f64 / FPS + waves[4 * i + k][1]).sin())
+            .map(|k| {
+                (std::f64::consts::TAU * waves[4 * i + k][0] * t as f64 / FPS + waves[4 * i + k][1])
+                    .sin()
+            })
             .sum::<f64>()
     };
     let up = [0.0, 1.0, 0.0];

@@ -5,13 +5,15 @@
 
 use std::io::{self, Write};
 
-use ndarray::{Array2, ArrayView2};
+use ndarray::{Array2, ArrayView2, ArrayView3, Axis};
 
 use crate::motion::channels::{CHANNEL_NAMES, MOTION_DIM};
 use crate::units::{FPS, frames_to_s};
 
 /// Columns before the channels: the number of the frame, and its time in seconds.
 const LEADING: [&str; 2] = ["frame", "time_s"];
+/// The column that tells the dancers of a group apart.
+const DANCER: &str = "dancer";
 const N_COLUMNS: usize = LEADING.len() + MOTION_DIM;
 
 /// Times may be off by half a frame, so that they may be rounded but of no other rate.
@@ -92,6 +94,43 @@ pub fn write_csv_rows(
             write!(out, ",{x:?}")?;
         }
         out.write_all(b"\n")?;
+    }
+    Ok(())
+}
+
+/// Returns the line that names the columns of a group, with its end: `dancer` behind frame and time.
+pub fn group_csv_header() -> String {
+    let mut names: Vec<&str> = column_names().collect();
+    names.insert(LEADING.len(), DANCER);
+    names.join(",") + "\n"
+}
+
+/// Writes a group, `[N, T, 25]`, with its header: for every frame a line of each dancer, counted from 0.
+///
+/// # Errors
+/// The error of `out`.
+pub fn write_group_csv(group: ArrayView3<'_, f32>, out: &mut dyn Write) -> io::Result<()> {
+    out.write_all(group_csv_header().as_bytes())?;
+    write_group_csv_rows(group, 0, out)
+}
+
+/// Writes the lines of frames of a group, `[N, T, 25]`, of which the first has the number `first_frame`.
+///
+/// # Errors
+/// The error of `out`.
+pub fn write_group_csv_rows(
+    group: ArrayView3<'_, f32>,
+    first_frame: usize,
+    out: &mut dyn Write,
+) -> io::Result<()> {
+    for (frame, dancers) in (first_frame..).zip(group.axis_iter(Axis(1))) {
+        for (dancer, row) in dancers.rows().into_iter().enumerate() {
+            write!(out, "{frame},{:?},{dancer}", frames_to_s(frame))?;
+            for x in row {
+                write!(out, ",{x:?}")?;
+            }
+            out.write_all(b"\n")?;
+        }
     }
     Ok(())
 }
@@ -177,7 +216,7 @@ fn shown(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ndarray::s;
+    use ndarray::{Array3, s};
     use proptest::prelude::*;
 
     fn written(frames: &Array2<f32>) -> String {
@@ -289,6 +328,40 @@ mod tests {
         assert!(no_time.starts_with("csv line 3 column 2 (time_s) is NaN at frame 1"), "{no_time}");
         let long = refusal(&replaced(&text, 3, 27, &"é".repeat(90)));
         assert!(long.contains(&format!("(style_7) reads `{}`,", "é".repeat(40))), "{long}");
+    }
+
+    #[test]
+    fn a_group_is_a_line_for_every_dancer_of_every_frame() {
+        let group = Array3::from_shape_fn((2, 3, MOTION_DIM), |(n, t, i)| {
+            10.0 * n as f32 + t as f32 - 0.5 * i as f32
+        });
+        let mut bytes = Vec::new();
+        write_group_csv(group.view(), &mut bytes).expect("memory");
+        let text = String::from_utf8(bytes).expect("text");
+        let lines: Vec<&str> = text.lines().collect();
+        assert!(lines[0].starts_with("frame,time_s,dancer,position_x,position_y,"), "{}", lines[0]);
+        assert_eq!(lines.len(), 1 + 6);
+        assert!(lines[1].starts_with("0,0.0,0,0.0,-0.5,"), "{}", lines[1]);
+        assert!(lines[4].starts_with("1,0.03333333333333333,1,11.0,10.5,"), "{}", lines[4]);
+        // Without the column each dancer's lines are a motion.
+        for dancer in 0..2_usize {
+            let own = lines.iter().enumerate().filter(|(i, _)| *i == 0 || (i - 1) % 2 == dancer);
+            let own: Vec<String> = own
+                .map(|(_, line)| {
+                    let fields = line.split(',').enumerate().filter(|(k, _)| *k != 2);
+                    fields.map(|(_, field)| field).collect::<Vec<_>>().join(",")
+                })
+                .collect();
+            assert_eq!(
+                read_csv(&own.join("\n")).expect("a motion"),
+                group.slice(s![dancer, .., ..])
+            );
+        }
+        let mut rows = Vec::new();
+        write_group_csv_rows(group.slice(s![.., 2.., ..]), 2, &mut rows).expect("memory");
+        assert!(text.as_bytes().ends_with(&rows) && rows.starts_with(b"2,"));
+        // Who reads one motion is told of the column that tells of several.
+        assert!(read_csv(&text).expect_err("a group").to_string().contains("has 28 values"));
     }
 
     proptest! {

@@ -1,4 +1,4 @@
-//! Motion as binary glTF 2.0: a body that shows where its front and its head point, moved by one
+//! Motion as binary glTF 2.0: bodies that show where their front and their head point, moved by one
 //! animation. Source: glTF 2.0 Specification, Khronos Group, ISO/IEC 12113:2022.
 //!
 //! glTF has our axes and units, right-handed, +Y up, +Z forward, metres, seconds; only the order of
@@ -6,11 +6,13 @@
 
 use std::io::{self, Write};
 
-use ndarray::ArrayView2;
+use ndarray::{ArrayView2, ArrayView3};
 use serde_json::{Map, Value, json};
 
 use super::body::{Corner, body};
-use super::poses;
+use super::{PoseError, poses};
+use crate::motion::group::DANCER_COLORS;
+use crate::motion::kinematics::Poses;
 use crate::motion::quaternion::Quaternion;
 use crate::units::{FPS, frames_to_s};
 
@@ -43,12 +45,58 @@ pub fn write_glb(
     audio: Option<&str>,
     out: &mut dyn Write,
 ) -> io::Result<()> {
-    let poses = poses(frames, "glTF")?;
+    let body =
+        Figure { name: "body".to_owned(), color: [0.8, 0.45, 0.2], poses: poses(frames, "glTF")? };
+    write(&[body], audio, out)
+}
+
+/// Writes a group, `[N, T, 25]`, `N >= 1` and `T >= 1`, as one animation of the nodes `dancer_0` to
+/// `dancer_{N - 1}`, each in its colour; else as [`write_glb`].
+///
+/// # Errors
+/// The error of `out`, [`super::PoseError`] for what glTF cannot hold, and more than 4 GiB.
+///
+/// # Panics
+/// When there are other than 25 channels.
+pub fn write_group_glb(
+    group: ArrayView3<'_, f32>,
+    audio: Option<&str>,
+    out: &mut dyn Write,
+) -> io::Result<()> {
+    let figure = |(i, frames): (usize, ArrayView2<'_, f32>)| {
+        let color = DANCER_COLORS[i % DANCER_COLORS.len()].map(linear);
+        let poses = poses(frames, "glTF")?;
+        Ok(Figure { name: format!("dancer_{i}"), color, poses })
+    };
+    let figures: io::Result<Vec<Figure>> = group.outer_iter().enumerate().map(figure).collect();
+    let figures = figures?;
+    if figures.is_empty() {
+        let refused = PoseError::Empty { format: "glTF" };
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, refused));
+    }
+    write(&figures, audio, out)
+}
+
+/// A body in the scene, and what it does.
+struct Figure {
+    name: String,
+    /// Red, green and blue, linear, from 0 to 1.
+    color: [f64; 3],
+    poses: Poses,
+}
+
+/// The linear value of one of 256 steps of sRGB. Source: IEC 61966-2-1.
+fn linear(step: u8) -> f64 {
+    let x = f64::from(step) / 255.0;
+    let value = if x <= 0.04045 { x / 12.92 } else { ((x + 0.055) / 1.055).powf(2.4) };
+    // As many digits as steps can be told apart by.
+    (value * 1e4).round() / 1e4
+}
+
+fn write(figures: &[Figure], audio: Option<&str>, out: &mut dyn Write) -> io::Result<()> {
     let corners = body();
-    let times_s: Vec<[f32; 1]> = (0..poses.len()).map(|t| [frames_to_s(t) as f32]).collect();
-    let translations: Vec<[f32; 3]> =
-        poses.position_m.iter().map(|p| p.map(|c| c as f32)).collect();
-    let rotations: Vec<[f32; 4]> = poses.orientation.iter().map(|&q| in_gltf_order(q)).collect();
+    let n_frames = figures.iter().map(|figure| figure.poses.len()).max().unwrap_or(0);
+    let times_s: Vec<[f32; 1]> = (0..n_frames).map(|t| [frames_to_s(t) as f32]).collect();
 
     let mut buffer = Buffer::default();
     let positions: Vec<[f32; 3]> =
@@ -57,8 +105,50 @@ pub fn write_glb(
     let position = buffer.add(&positions, "VEC3", Some(ARRAY_BUFFER));
     let normal = buffer.add(&normals, "VEC3", Some(ARRAY_BUFFER));
     let time = buffer.add(&times_s, "SCALAR", None);
-    let translation = buffer.add(&translations, "VEC3", None);
-    let rotation = buffer.add(&rotations, "VEC4", None);
+
+    let mut parts = SceneParts::default();
+    for (i, Figure { name, color, poses }) in figures.iter().enumerate() {
+        let translations: Vec<[f32; 3]> =
+            poses.position_m.iter().map(|p| p.map(|c| c as f32)).collect();
+        let rotations: Vec<[f32; 4]> =
+            poses.orientation.iter().map(|&q| in_gltf_order(q)).collect();
+        let outputs = [
+            ("translation", buffer.add(&translations, "VEC3", None)),
+            ("rotation", buffer.add(&rotations, "VEC4", None)),
+        ];
+        for (path, output) in outputs {
+            parts.channels.push(json!({
+                "sampler": parts.samplers.len(),
+                "target": { "node": i, "path": path },
+            }));
+            parts.samplers.push(json!({
+                "input": time, "interpolation": "LINEAR", "output": output,
+            }));
+        }
+        parts.materials.push(json!({
+            "name": name,
+            "pbrMetallicRoughness": {
+                "baseColorFactor": [color[0], color[1], color[2], 1.0],
+                "metallicFactor": 0.0,
+                "roughnessFactor": 0.8,
+            },
+        }));
+        parts.meshes.push(json!({
+            "name": name,
+            "primitives": [{
+                "attributes": { "NORMAL": normal, "POSITION": position },
+                "material": i,
+                "mode": TRIANGLES,
+            }],
+        }));
+        // At rest it stands where the motion begins.
+        parts.nodes.push(json!({
+            "mesh": i,
+            "name": name,
+            "rotation": rotations[0].map(f64::from),
+            "translation": translations[0].map(f64::from),
+        }));
+    }
 
     let generator = concat!("motiongen ", env!("CARGO_PKG_VERSION"));
     let mut extras = Map::new();
@@ -73,45 +163,19 @@ pub fn write_glb(
     let document = json!({
         "accessors": buffer.accessors,
         "animations": [{
-            "channels": [
-                { "sampler": 0, "target": { "node": 0, "path": "translation" } },
-                { "sampler": 1, "target": { "node": 0, "path": "rotation" } },
-            ],
+            "channels": parts.channels,
             "name": "motion",
-            "samplers": [
-                { "input": time, "interpolation": "LINEAR", "output": translation },
-                { "input": time, "interpolation": "LINEAR", "output": rotation },
-            ],
+            "samplers": parts.samplers,
         }],
         "asset": { "generator": generator, "version": "2.0" },
         "bufferViews": buffer.views,
         "buffers": [{ "byteLength": buffer.bytes.len() }],
         "extras": extras,
-        "materials": [{
-            "name": "body",
-            "pbrMetallicRoughness": {
-                "baseColorFactor": [0.8, 0.45, 0.2, 1.0],
-                "metallicFactor": 0.0,
-                "roughnessFactor": 0.8,
-            },
-        }],
-        "meshes": [{
-            "name": "body",
-            "primitives": [{
-                "attributes": { "NORMAL": normal, "POSITION": position },
-                "material": 0,
-                "mode": TRIANGLES,
-            }],
-        }],
-        // At rest it stands where the motion begins.
-        "nodes": [{
-            "mesh": 0,
-            "name": "body",
-            "rotation": rotations[0].map(f64::from),
-            "translation": translations[0].map(f64::from),
-        }],
+        "materials": parts.materials,
+        "meshes": parts.meshes,
+        "nodes": parts.nodes,
         "scene": 0,
-        "scenes": [{ "nodes": [0] }],
+        "scenes": [{ "nodes": (0..figures.len()).collect::<Vec<_>>() }],
     });
 
     let mut text = serde_json::to_vec(&document)?;
@@ -127,6 +191,16 @@ pub fn write_glb(
         out.write_all(chunk)?;
     }
     Ok(())
+}
+
+/// What the document has of every figure.
+#[derive(Default)]
+struct SceneParts {
+    channels: Vec<Value>,
+    samplers: Vec<Value>,
+    materials: Vec<Value>,
+    meshes: Vec<Value>,
+    nodes: Vec<Value>,
 }
 
 /// Ours are (w, x, y, z), those of glTF (x, y, z, w).
@@ -194,7 +268,7 @@ mod tests {
     use super::*;
     use crate::motion::channels::{Channel, MOTION_DIM};
     use crate::motion::quaternion::{dot, from_axis_angle};
-    use ndarray::Array2;
+    use ndarray::{Array2, Array3};
     use std::f64::consts::{FRAC_PI_2, SQRT_2};
 
     /// A file taken apart.
@@ -207,6 +281,10 @@ mod tests {
         fn of(frames: &Array2<f32>, audio: Option<&str>) -> Self {
             let mut file = Vec::new();
             write_glb(frames.view(), audio, &mut file).expect("memory");
+            Self::taken_apart(&file)
+        }
+
+        fn taken_apart(file: &[u8]) -> Self {
             let word = |at: usize| {
                 u32::from_le_bytes(file[at..at + 4].try_into().expect("4 bytes")) as usize
             };
@@ -352,6 +430,45 @@ mod tests {
         let normals = glb.items(glb.number(&format!("{attributes}/NORMAL")));
         assert_eq!((positions.len(), positions.len() % 3), (normals.len(), 0));
         assert_eq!(glb.number("/meshes/0/primitives/0/mode"), 4);
+    }
+
+    #[test]
+    fn every_dancer_of_a_group_is_a_node_of_its_own() {
+        let mut group = Array3::zeros((3, 7, MOTION_DIM));
+        for (i, mut dancer) in group.outer_iter_mut().enumerate() {
+            dancer.assign(&spin(7));
+            dancer.column_mut(0).fill(1.5 * i as f32);
+        }
+        let mut file = Vec::new();
+        write_group_glb(group.view(), Some("a.wav"), &mut file).expect("memory");
+        let glb = Glb::taken_apart(&file);
+        assert_eq!(glb.document["scenes"][0]["nodes"], json!([0, 1, 2]));
+        assert_eq!(glb.document["animations"].as_array().map(Vec::len), Some(1));
+        for i in 0..3_usize {
+            let node = &glb.document["nodes"][i];
+            assert_eq!(node["name"], format!("dancer_{i}"));
+            assert_eq!(
+                (&node["mesh"], &node["translation"][0]),
+                (&json!(i), &json!(1.5 * i as f64))
+            );
+            assert_eq!(glb.document["meshes"][i]["primitives"][0]["material"], i);
+            for (k, path) in ["translation", "rotation"].into_iter().enumerate() {
+                let channel = &glb.document["animations"][0]["channels"][2 * i + k];
+                assert_eq!(channel["target"], json!({ "node": i, "path": path }));
+                let sampler = format!("/animations/0/samplers/{}", channel["sampler"]);
+                let items = glb.items(glb.number(&format!("{sampler}/output")));
+                assert_eq!(items.len(), 7);
+                assert!(k == 1 || items.iter().all(|place| place[0] == 1.5 * i as f32));
+            }
+        }
+        // 0x72 of sRGB is 0.1683 of the light of white.
+        let color = &glb.document["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"];
+        assert_eq!(color, &json!([0.0, 0.1683, 0.4452, 1.0]));
+        let nobody = Array3::zeros((0, 7, MOTION_DIM));
+        assert_eq!(
+            write_group_glb(nobody.view(), None, &mut Vec::new()).expect_err("nobody").to_string(),
+            "motion has no frames, and glTF holds at least one; write it as npy or csv"
+        );
     }
 
     #[test]

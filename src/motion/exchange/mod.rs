@@ -10,14 +10,17 @@ mod glb;
 
 use std::io::{self, Write};
 
-use ndarray::ArrayView2;
+use ndarray::{ArrayView, ArrayView2, ArrayView3, Dimension};
 
 #[cfg(test)]
 pub(in crate::motion) use bvh::euler_zxy;
 pub use bvh::write_bvh;
 pub(in crate::motion) use bvh::{END_SITE_CM, ROOT_NAME};
-pub use csv::{CsvError, csv_header, read_csv, write_csv, write_csv_rows};
-pub use glb::write_glb;
+pub use csv::{
+    CsvError, csv_header, group_csv_header, read_csv, write_csv, write_csv_rows, write_group_csv,
+    write_group_csv_rows,
+};
+pub use glb::{write_glb, write_group_glb};
 
 use super::channels::{CHANNEL_NAMES, Channel, MOTION_DIM};
 use super::kinematics::Poses;
@@ -53,9 +56,21 @@ pub enum PoseError {
 /// # Errors
 /// The error of `out`.
 pub fn write_npy(frames: ArrayView2<'_, f32>, out: &mut dyn Write) -> io::Result<()> {
-    out.write_all(&npy::header::<f32>(frames.shape()))?;
-    let mut bytes = Vec::with_capacity(frames.ncols() * size_of::<f32>());
-    for row in frames.rows() {
+    write_array(frames, out)
+}
+
+/// Writes a group, `[N, T, 25]`, as [`write_npy`] writes motion.
+///
+/// # Errors
+/// The error of `out`.
+pub fn write_group_npy(group: ArrayView3<'_, f32>, out: &mut dyn Write) -> io::Result<()> {
+    write_array(group, out)
+}
+
+fn write_array<D: Dimension>(array: ArrayView<'_, f32, D>, out: &mut dyn Write) -> io::Result<()> {
+    out.write_all(&npy::header::<f32>(array.shape()))?;
+    let mut bytes = Vec::new();
+    for row in array.rows() {
         bytes.clear();
         bytes.extend(row.iter().flat_map(|x| x.to_le_bytes()));
         out.write_all(&bytes)?;
@@ -98,7 +113,7 @@ fn poses(frames: ArrayView2<'_, f32>, format: &'static str) -> io::Result<Poses>
 mod tests {
     use super::*;
     use crate::motion::npy::read_f32;
-    use ndarray::{Array2, s};
+    use ndarray::{Array2, Array3, s};
 
     #[test]
     fn an_array_is_written_as_numpy_does_whatever_its_strides() {
@@ -114,6 +129,19 @@ mod tests {
         let read = read_f32(&bytes).expect("an array");
         assert_eq!(read.shape, [4, MOTION_DIM]);
         assert_eq!(read.values, backwards.iter().copied().collect::<Vec<f32>>());
+    }
+
+    #[test]
+    fn a_group_is_written_with_an_axis_of_dancers() {
+        let group = Array3::from_shape_fn((3, 5, MOTION_DIM), |(n, t, i)| {
+            100.0 * n as f32 + t as f32 + 0.01 * i as f32
+        });
+        let turned = group.slice(s![..;-1, ..;2, ..]);
+        let mut bytes = Vec::new();
+        write_group_npy(turned, &mut bytes).expect("memory");
+        let read = read_f32(&bytes).expect("an array");
+        assert_eq!(read.shape, [3, 3, MOTION_DIM]);
+        assert_eq!(read.values, turned.iter().copied().collect::<Vec<f32>>());
     }
 
     #[test]

@@ -3,11 +3,13 @@
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use anyhow::Context as _;
+use anyhow::{Context as _, bail};
 use ndarray::{ArrayView3, Axis};
 
 use crate::motion::Trajectory;
-use crate::motion::exchange::{write_bvh, write_csv, write_glb, write_npy};
+use crate::motion::exchange::{
+    write_bvh, write_csv, write_glb, write_group_csv, write_group_glb, write_group_npy, write_npy,
+};
 use crate::plot::{self, MOTION_WIDTH_PX, MotionPanel, MotionPlot};
 use crate::store::{PartWriter, replace_file, tables, temporary_beside, write_file};
 use crate::training::TemporalConfig;
@@ -127,9 +129,52 @@ fn write_as(output: &MotionOutput, format: MotionFormat, path: &Path) -> anyhow:
     }
 }
 
+/// Writes the motion of several dancers.
 fn write_group_as(output: &MotionOutput, format: MotionFormat, path: &Path) -> anyhow::Result<()> {
-    let _ = (output, format, path);
-    anyhow::bail!("groups are not written yet")
+    let group = output.frames;
+    let to_file = |write: &dyn Fn(&mut dyn Write) -> io::Result<()>| -> anyhow::Result<()> {
+        write_file(path, |out| write(out))?;
+        Ok(())
+    };
+    match format {
+        MotionFormat::Npy => to_file(&|out| write_group_npy(group, out)),
+        MotionFormat::Csv => to_file(&|out| write_group_csv(group, out)),
+        MotionFormat::Bvh => bail!(
+            "bvh holds one dancer, and there are {}; choose glb, npy or csv with --format",
+            group.len_of(Axis(0))
+        ),
+        MotionFormat::Glb => {
+            let audio = output.audio.file_name().map(|name| name.to_string_lossy().into_owned());
+            to_file(&|out| write_group_glb(group, audio.as_deref(), out))
+        }
+        MotionFormat::Parquet => {
+            let file = temporary_beside(path)?;
+            let mut writer = PartWriter::new(tables::motion(), file)?;
+            writer.write_group(output.name, group)?;
+            replace_file(path, writer.finish(&[])?.file)?;
+            Ok(())
+        }
+        MotionFormat::Png | MotionFormat::Svg => {
+            let dancers = group.outer_iter().map(|dancer| Trajectory::new(dancer.to_owned()));
+            let dancers = dancers.collect::<Result<Vec<_>, _>>()?;
+            let Some(first) = dancers.first() else { bail!("there is no dancer to draw") };
+            let figure = MotionPlot {
+                title: output.name,
+                motion: first,
+                beat_times_s: output.beats_s,
+                first_frame: 0,
+                jerk_limit_m_s3: TemporalConfig::default().target_jerk,
+            };
+            let format =
+                if format == MotionFormat::Png { plot::Format::Png } else { plot::Format::Svg };
+            let bytes = plot::motion(&figure, &MotionPanel::USUAL, MOTION_WIDTH_PX, format)?.bytes;
+            to_file(&|out| out.write_all(&bytes))
+        }
+        MotionFormat::Html => {
+            let text = page(&self::view(output)?);
+            to_file(&|out| out.write_all(text.as_bytes()))
+        }
+    }
 }
 
 fn view(output: &MotionOutput) -> anyhow::Result<View> {
@@ -138,11 +183,11 @@ fn view(output: &MotionOutput) -> anyhow::Result<View> {
     let extension = output.audio.extension().and_then(|e| e.to_str()).unwrap_or_default();
     Ok(View {
         title: output.name.to_owned(),
-        samples: vec![ViewSample {
-            name: output.name.to_owned(),
-            frames: output.frames.index_axis(Axis(0), 0).to_owned(),
-            facts: output.facts.clone(),
-        }],
+        samples: vec![ViewSample::of_group(
+            output.name.to_owned(),
+            output.frames,
+            output.facts.clone(),
+        )],
         beats_s: output.beats_s.to_vec(),
         audio: Some(Audio { mime: mime_of(extension).to_owned(), bytes }),
     })

@@ -74,7 +74,7 @@ fn wandering(n: usize, n_frames: usize, half_side_m: f64, seed: u64) -> Array3<f
             let sum: f64 = (0..4)
                 .map(|k| {
                     let [hz, phase, size] = waves[(i * 2 + axis) * 4 + k];
-                    size * (6.283 * hz * t as f64 / FPS + phase).sin()
+                    size * (std::f64::consts::TAU * hz * t as f64 / FPS + phase).sin()
                 })
                 .sum();
             half_side_m * sum / 2.0
