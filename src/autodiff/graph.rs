@@ -232,12 +232,7 @@ impl<I: Interpreter> Graph for I {
         self.apply(ConcatFrames::default(), parts)
     }
 
-    fn frames(
-        &mut self,
-        x: &Self::Tensor,
-        first: usize,
-        n: Option<usize>,
-    ) -> Result<Self::Tensor> {
+    fn frames(&mut self, x: &Self::Tensor, first: usize, n: Option<usize>) -> Result<Self::Tensor> {
         self.apply(TakeFrames::from(first, n), &[x])
     }
 

@@ -3,9 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 /// What kind of networks a model has, which decides how it is trained, sampled and written down.
-#[derive(
-    Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum, Serialize, Deserialize,
-)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Family {
     /// A UNet that denoises the motion of one dancer, and a decoder.

@@ -306,12 +306,7 @@ pub trait Graph: Sized {
     fn concat_frames(&mut self, parts: &[&Self::Tensor]) -> Result<Self::Tensor>;
 
     /// Takes `n` frames from the frame `first` on, or all behind it.
-    fn frames(
-        &mut self,
-        x: &Self::Tensor,
-        first: usize,
-        n: Option<usize>,
-    ) -> Result<Self::Tensor>;
+    fn frames(&mut self, x: &Self::Tensor, first: usize, n: Option<usize>) -> Result<Self::Tensor>;
 
     /// Puts `n` tokens, which count, before the frames of a mask: \[batch, frames\] → \[batch, n + frames\].
     fn token_mask(&mut self, mask: &Self::Tensor, n: usize) -> Result<Self::Tensor>;

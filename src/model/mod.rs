@@ -23,7 +23,8 @@ pub use graph::{
     Result,
 };
 pub use group::{
-    GroupConfig, GroupDenoiser, GroupInputs, GroupNetworks, GroupPrediction, GroupScore, GroupScoreInputs,
+    GroupConfig, GroupDenoiser, GroupInputs, GroupNetworks, GroupPrediction, GroupScore,
+    GroupScoreInputs,
 };
 pub use layers::{AttentionBlock, Conv1d, GroupNorm, LayerNorm, Linear, ResBlock};
 pub use outline::{ActivationCounts, Layer, Outline};

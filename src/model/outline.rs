@@ -375,12 +375,7 @@ impl Graph for Outline<'_> {
         Ok(mask.iter().enumerate().map(|(i, m)| if i == 1 { m + n } else { *m }).collect())
     }
 
-    fn modulate(
-        &mut self,
-        x: &Vec<usize>,
-        _film: &Vec<usize>,
-        _bias: f64,
-    ) -> Result<Vec<usize>> {
+    fn modulate(&mut self, x: &Vec<usize>, _film: &Vec<usize>, _bias: f64) -> Result<Vec<usize>> {
         Ok(self.result(x.clone()))
     }
 

@@ -23,7 +23,8 @@ pub use check::check;
 pub use error::OnnxError;
 pub use file::{EMBEDDED_BYTES, EncodedModel, IR_VERSION, ModelFile, OPSET};
 pub use networks::{
-    DecoderNames, GroupNames, GroupScoreNames, UNetNames, decoder, group_denoiser, group_score, unet,
+    DecoderNames, GroupNames, GroupScoreNames, UNetNames, decoder, group_denoiser, group_score,
+    unet,
 };
 pub use proto::{Graph, Model};
 pub use runtime::{Device, PINNED_VERSION, Runtime};

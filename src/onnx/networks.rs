@@ -187,8 +187,7 @@ pub fn group_denoiser(
         config.motion_dim,
         "noisy motion, normalised, group by group and dancer by dancer, 30 frames a second",
     );
-    let t =
-        g.integer_input(GroupNames::T, Axes::Batch, "step of the diffusion, 0 the least noisy");
+    let t = g.integer_input(GroupNames::T, Axes::Batch, "step of the diffusion, 0 the least noisy");
     let audio = g.input(
         GroupNames::AUDIO,
         Axes::Frames,
@@ -261,6 +260,10 @@ pub fn group_score(
     let number = g.integer_input(GroupScoreNames::NUMBER, Axes::Batch, NUMBER);
     let inputs = GroupScoreInputs { x0: &x0, t: &t, w: &w, number: &number, mask: None };
     let y = score.forward(&mut g, &inputs)?;
-    g.output(GroupScoreNames::LOG_RATIO, y, "log of p(motion | group) / p(motion), up to a constant")?;
+    g.output(
+        GroupScoreNames::LOG_RATIO,
+        y,
+        "log of p(motion | group) / p(motion), up to a constant",
+    )?;
     Ok(g.finish("score"))
 }

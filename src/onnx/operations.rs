@@ -460,8 +460,7 @@ impl Graph for Builder<'_> {
         // [batch, …] → [batch, 1, …] → [batch, times, …] → [rows, …]
         let apart = self.node("Unsqueeze", &[&name, &one], vec![]);
         let behind = self.node("Shape", &[&name], vec![integer("start", 1)]);
-        let shape =
-            self.node("Concat", &[&batch, &times, &behind], vec![integer("axis", 0)]);
+        let shape = self.node("Concat", &[&batch, &times, &behind], vec![integer("axis", 0)]);
         let repeated = self.node("Expand", &[&apart, &shape], vec![]);
         let shape = self.node("Concat", &[&rows, &behind], vec![integer("axis", 0)]);
         let y = self.node("Reshape", &[&repeated, &shape], vec![]);
@@ -525,12 +524,7 @@ impl Graph for Builder<'_> {
         Ok(self.new_last(Axes::Frames, x.channels, y))
     }
 
-    fn normalize_frames(
-        &mut self,
-        x: &Value,
-        mask: Option<&Value>,
-        epsilon: f64,
-    ) -> Result<Value> {
+    fn normalize_frames(&mut self, x: &Value, mask: Option<&Value>, epsilon: f64) -> Result<Value> {
         self.begin("normalize_frames", None);
         let name = self.last(*x)?;
         let mean = self.mean_over_frames(*x, &name, mask)?;

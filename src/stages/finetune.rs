@@ -305,8 +305,15 @@ impl Stage for Finetune {
         }
         let machine = &params.machine;
         let (limit, is_dry_run) = (config.num_phrases, params.dry_run);
-        let phrases =
-            read_phrases(&store, Self::NAME, (machine, Family::Unet), limit, progress, &watch, is_dry_run)?;
+        let phrases = read_phrases(
+            &store,
+            Self::NAME,
+            (machine, Family::Unet),
+            limit,
+            progress,
+            &watch,
+            is_dry_run,
+        )?;
         let network = &trained.config.network;
         let windows = Windows::new(
             Arc::clone(&phrases.dataset),

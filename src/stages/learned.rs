@@ -8,8 +8,10 @@ use super::train::session::{MachineParams, ProgressWatch, read_phrases};
 use super::trained::{FinetuneData, TrainedRun};
 use super::{Progress, Stage as _, finetune::Finetune, pretrained, train::Train};
 
+use crate::generation::{
+    CardError, GroupCard, LearnedFrom, MAX_CARD_BYTES, ModelCard, Purpose, family_of, file_names,
+};
 use crate::model::Family;
-use crate::generation::{CardError, LearnedFrom, MAX_CARD_BYTES, ModelCard, Purpose, file_names};
 use crate::store::{Location, Patience, StoreError};
 use crate::training::{Dataset, Split};
 
@@ -185,11 +187,10 @@ pub fn of_model(
         let (store, model) = (store.to_string(), model.to_owned());
         return Ok(Err(LearnedFromError::NoModel { store, model }));
     };
-    let card = match ModelCard::read(&bytes, &store.url_of(&path)) {
-        Ok(card) => card,
+    let (found, learned_from) = match weights_and_music(&bytes, &store.url_of(&path)) {
+        Ok(found) => found,
         Err(error) => return Ok(Err(error.into())),
     };
-    let found = weights_digest(&card);
     if found != weights {
         let short = |digest: &str| digest.chars().take(12).collect();
         return Ok(Err(LearnedFromError::OtherWeights {
@@ -200,7 +201,21 @@ pub fn of_model(
         }));
     }
     let model = model.to_owned();
-    Ok(card.provenance.learned_from.ok_or(LearnedFromError::NotListed { model }))
+    Ok(learned_from.ok_or(LearnedFromError::NotListed { model }))
+}
+
+/// Returns the digest of a model's weights, and what it learned from, as the card of a model of any family says.
+fn weights_and_music(card: &[u8], place: &str) -> Result<(String, Option<LearnedFrom>), CardError> {
+    Ok(match family_of(card, place)? {
+        Family::Unet => {
+            let card = ModelCard::read(card, place)?;
+            (weights_digest(&card), card.provenance.learned_from)
+        }
+        Family::Group => {
+            let card = GroupCard::read(card, place)?;
+            (card.weights_sha256, card.provenance.learned_from)
+        }
+    })
 }
 
 /// Returns whether the store has the model that made a motion, with the same weights.

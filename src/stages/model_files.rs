@@ -103,8 +103,7 @@ impl OpenModel {
             Ok(Box::new(self.eager(n_workers, n_threads)?))
         };
         // What the program has in itself needs nothing beside it.
-        let needs_nothing =
-            params.engine == EngineChoice::Auto && self.files.is_pretrained();
+        let needs_nothing = params.engine == EngineChoice::Auto && self.files.is_pretrained();
         if params.engine == EngineChoice::Eager || needs_nothing {
             return Ok((eager()?, None));
         }

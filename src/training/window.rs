@@ -234,7 +234,17 @@ impl Windows {
         let n_dancers = dataset.phrases().iter().map(|phrase| phrase.n_dancers);
         let n_slots = n_dancers.max().unwrap_or(1);
         let has_clock = false;
-        Self { dataset, scales, augmentation, n_frames, has_clock, n_slots, seed, train, validation }
+        Self {
+            dataset,
+            scales,
+            augmentation,
+            n_frames,
+            has_clock,
+            n_slots,
+            seed,
+            train,
+            validation,
+        }
     }
 
     /// Gives windows what a network hears: the clock too, where its configuration says so.
@@ -286,7 +296,8 @@ impl Windows {
     /// # Errors
     /// [`StoreError`] when the frames at hand cannot be read.
     pub fn train(&self, windows: &[(u64, u32)]) -> Result<Batch, StoreError> {
-        let mut batch = Batch::empty(windows.len(), self.n_frames, self.n_slots, self.condition_dim());
+        let mut batch =
+            Batch::empty(windows.len(), self.n_frames, self.n_slots, self.condition_dim());
         for &(number, phrase) in windows {
             let phrase = &self.dataset.phrases()[phrase as usize];
             let (dancers, audio) = self.augmented(phrase, number)?;
@@ -312,7 +323,8 @@ impl Windows {
     /// # Panics
     /// When there are no validation windows.
     pub fn validation(&self, range: std::ops::Range<usize>) -> Result<Batch, StoreError> {
-        let mut batch = Batch::empty(range.len(), self.n_frames, self.n_slots, self.condition_dim());
+        let mut batch =
+            Batch::empty(range.len(), self.n_frames, self.n_slots, self.condition_dim());
         for number in range {
             let (phrase, first) = self.validation[number % self.validation.len()];
             let phrase = &self.dataset.phrases()[phrase as usize];
@@ -438,7 +450,6 @@ fn place(dancers: &mut [Array2<f32>]) {
         placement.remove(soloist);
     }
 }
-
 
 /// Most frames that a normalizer is fitted to; more say nothing new.
 const MAX_FITTED_FRAMES: usize = 1 << 20;

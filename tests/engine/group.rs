@@ -112,8 +112,7 @@ fn forward<E: Element, I: Interpreter<Element = E>>(
     let x0 = g.apply(TakeSamples::new(taken), &[&found.x0])?;
     let w = g.apply(TakeSamples::new(groups.clone()), &[&found.w])?;
     let number = g.apply(TakeSamples::new(groups), &[&given.number])?;
-    let inputs =
-        GroupScoreInputs { x0: &x0, t: &t, w: &w, number: &number, mask: Some(&mask) };
+    let inputs = GroupScoreInputs { x0: &x0, t: &t, w: &w, number: &number, mask: Some(&mask) };
     let logits = score.forward(g, &inputs)?;
     let logits = g.apply(Reshape::new(&[BATCH, 1 + k]), &[&logits])?;
     Ok([found.x0, found.w, logits])

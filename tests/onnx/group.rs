@@ -17,12 +17,8 @@ fn tiny() -> GroupConfig {
 }
 
 /// Groups, dancers of each, frames, and which groups go without music.
-const CASES: [(usize, usize, usize, &[f32]); 4] = [
-    (1, 5, 120, &[]),
-    (3, 2, 77, &[0.0, 1.0, 0.0]),
-    (2, 1, 9, &[1.0, 0.0]),
-    (1, 16, 13, &[0.0]),
-];
+const CASES: [(usize, usize, usize, &[f32]); 4] =
+    [(1, 5, 120, &[]), (3, 2, 77, &[0.0, 1.0, 0.0]), (2, 1, 9, &[1.0, 0.0]), (1, 16, 13, &[0.0])];
 
 #[test]
 fn a_denoiser_of_groups_predicts_what_the_interpreter_predicts() {
@@ -30,8 +26,7 @@ fn a_denoiser_of_groups_predicts_what_the_interpreter_predicts() {
     for config in [tiny(), GroupConfig { clock: false, add_audio: false, blocks: 1, ..tiny() }] {
         let parameters: Parameters<f32> = random(GroupDenoiser::new(&config).1, 5);
         let weights = |id| parameters.unpacked(id);
-        let graph =
-            group_denoiser(&config, &weights, &scale(), Storage::Fp32).expect("a graph");
+        let graph = group_denoiser(&config, &weights, &scale(), Storage::Fp32).expect("a graph");
         let mut session = session(file(graph), folder.path(), "denoiser.onnx");
         let (denoiser, _) = GroupDenoiser::new(&config);
         for (groups, dancers, frames, drop) in CASES {
@@ -123,8 +118,7 @@ fn a_score_of_groups_is_what_the_interpreter_says() {
             let t = g.constant(&[rows], &as_floats(&t));
             let w = g.constant(&[groups, config.width], &w);
             let number = g.constant(&[groups], &as_floats(&number));
-            let given =
-                GroupScoreInputs { x0: &x0, t: &t, w: &w, number: &number, mask: None };
+            let given = GroupScoreInputs { x0: &x0, t: &t, w: &w, number: &number, mask: None };
             let wanted = score.forward(&mut g, &given).expect("shapes fit");
             let (shape, found) =
                 session.run(&inputs, GroupScoreNames::LOG_RATIO).expect("an answer");

@@ -125,9 +125,7 @@ fn shares<E: Element>(x: &Tensor<E>, mask: Option<&&Tensor<E>>) -> Vec<Vec<f64>>
     let (batch, frames) = (x.shape()[0], x.shape()[1]);
     let share = |b: usize| {
         let weights: Vec<f64> = match mask {
-            Some(mask) => {
-                mask.data()[b * frames..][..frames].iter().map(|w| w.to_f64()).collect()
-            }
+            Some(mask) => mask.data()[b * frames..][..frames].iter().map(|w| w.to_f64()).collect(),
             None => vec![1.0; frames],
         };
         let total: f64 = weights.iter().sum();

@@ -105,7 +105,9 @@ impl GroupCard {
             ("n_steps of the network", group.n_steps, diffusion.n_steps),
         ] {
             if found != expected {
-                return Err(format!("{name} is {found}, expected {expected}; export the model again"));
+                return Err(format!(
+                    "{name} is {found}, expected {expected}; export the model again"
+                ));
             }
         }
         Ok(())

@@ -6,9 +6,7 @@ use ndarray::{Array2, Array3, ArrayView3};
 
 use crate::audio::FeatureScale;
 use crate::autodiff::op::reduce::{Over, Reduce};
-use crate::autodiff::{
-    Arena, Eager, Gradients, Interpreter, Parameters, Tape, Tensor, Threads,
-};
+use crate::autodiff::{Arena, Eager, Gradients, Interpreter, Parameters, Tape, Tensor, Threads};
 use crate::diffusion::Schedule;
 use crate::generation::engine::EngineError;
 use crate::generation::pool::Pool;

@@ -76,7 +76,11 @@ impl GroupGenerator<'_> {
                     true => windows.shift(i + 1),
                     false => motion.dim().1,
                 };
-                emit(with_phase(motion.slice(s![.., ..n_own, ..]), track.phase, windows.frames(i).start))?;
+                emit(with_phase(
+                    motion.slice(s![.., ..n_own, ..]),
+                    track.phase,
+                    windows.frames(i).start,
+                ))?;
             }
             before = made.into_iter().last();
         }

@@ -61,7 +61,8 @@ impl GroupBlock {
         let h = g.add(&h, &y)?;
 
         let tokens = g.concat_frames(&[token, w])?;
-        let all = self.global.forward(g, &tokens, &h, x, masks.map(|(_, with_tokens)| with_tokens))?;
+        let all =
+            self.global.forward(g, &tokens, &h, x, masks.map(|(_, with_tokens)| with_tokens))?;
         let token = g.frames(&all, 0, Some(1))?;
         let h = g.frames(&all, 2, None)?;
 

@@ -115,16 +115,14 @@ struct StepEmbedding {
 impl StepEmbedding {
     fn new(scope: &mut Scope, config: &GroupConfig, has_tokens: bool) -> Self {
         let d = config.width;
-        let mut linear = |name: &str, inputs, outputs| {
-            Linear::new(&mut scope.at(name), inputs, outputs)
-        };
+        let mut linear =
+            |name: &str, inputs, outputs| Linear::new(&mut scope.at(name), inputs, outputs);
         Self {
             table: Arc::new(time_table(config.n_steps, d)),
             hidden: linear("hidden", d, 4 * d),
             embedding: linear("embedding", 4 * d, d),
-            tokens: has_tokens.then(|| {
-                [linear("tokens.0", 4 * d, d), linear("tokens.1", 4 * d, d)]
-            }),
+            tokens: has_tokens
+                .then(|| [linear("tokens.0", 4 * d, d), linear("tokens.1", 4 * d, d)]),
         }
     }
 
@@ -217,7 +215,8 @@ impl GroupDenoiser {
         let context = projected(&self.context, g, &heard)?;
         let context = g.add(&t_emb, &context)?;
         let context = g.activation(&context, Activation::Mish)?;
-        let [a, b] = self.time.tokens.as_ref().expect("invariant: a denoiser has tokens of the step");
+        let [a, b] =
+            self.time.tokens.as_ref().expect("invariant: a denoiser has tokens of the step");
         let (a, b) = (a.forward(g, &hidden)?, b.forward(g, &hidden)?);
         let step = g.concat_frames(&[&a, &b])?;
         let memory = Memory {

@@ -66,8 +66,10 @@ impl GroupScore {
             ),
             layers: (0..config.score_layers)
                 .map(|i| {
-                    let local = EncoderLayer::new(&mut root.at(format!("layers.{i}.local")), config);
-                    let global = GlobalLayer::new(&mut root.at(format!("layers.{i}.global")), config);
+                    let local =
+                        EncoderLayer::new(&mut root.at(format!("layers.{i}.local")), config);
+                    let global =
+                        GlobalLayer::new(&mut root.at(format!("layers.{i}.global")), config);
                     (local, global)
                 })
                 .collect(),

@@ -20,7 +20,8 @@ fn the_base_is_as_large_as_the_network_of_the_paper_and_the_small_fits_beside_a_
 
 #[test]
 fn shapes_are_followed_through_both_networks_and_every_parameter_is_met() {
-    let config = GroupConfig { score_patch_frames: 4, ..GroupConfig::of(Preset::Tiny).expect("one") };
+    let config =
+        GroupConfig { score_patch_frames: 4, ..GroupConfig::of(Preset::Tiny).expect("one") };
     let (batch, n_dancers, frames) = (2, 3, 7);
     let (denoiser, list) = GroupDenoiser::new(&config);
     let mut g = Outline::new(&list);
@@ -47,8 +48,7 @@ fn shapes_are_followed_through_both_networks_and_every_parameter_is_met() {
     let of_each = g.input(&[batch * n_dancers]);
     let w = g.input(&[batch, config.width]);
     let mask = g.input(&[batch, n_dancers * 2]);
-    let inputs =
-        GroupScoreInputs { x0: &x, t: &of_each, w: &w, number: &t, mask: Some(&mask) };
+    let inputs = GroupScoreInputs { x0: &x, t: &of_each, w: &w, number: &t, mask: Some(&mask) };
     assert_eq!(score.forward(&mut g, &inputs), Ok(vec![batch, 1]));
     assert_eq!(unique(&g, &list), list.n_elements());
 }

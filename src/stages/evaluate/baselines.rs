@@ -155,7 +155,7 @@ fn of_columns(row: &GenerationRow, card: &ModelCard) -> anyhow::Result<MotionSet
         overlap_frames: OVERLAP_FRAMES.min(card.window_frames - 1),
         prime: None,
         postprocess: PostProcessParams::usual()
-                .config((card.motion_range, card.fusion_variances()))?,
+            .config((card.motion_range, card.fusion_variances()))?,
         constraints: None,
         constraint_strength: 1.0,
         soft: false,

@@ -448,7 +448,7 @@ const MAX_NOTES: usize = 5;
 
 /// Returns what the model that made each motion had to do with its music, as the card says, and a note where that is
 /// not known.
-fn splits_of(
+pub(super) fn splits_of(
     store: &Location,
     phrases: &PhraseIndex,
     generations: &[GenerationRow],

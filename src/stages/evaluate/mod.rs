@@ -4,6 +4,7 @@ mod baselines;
 mod compared;
 mod evaluand;
 mod foreign;
+mod group;
 mod job;
 mod measure;
 mod motions;
@@ -55,6 +56,11 @@ impl Stage for Evaluate {
         let started = Instant::now();
         params.check()?;
         let store = Location::open(&params.store, &params.client.options())?;
+        if let Some(run) = params.run.as_deref().filter(|_| params.motions.is_none())
+            && group::is_of_groups(&store, run)?
+        {
+            return group::run(&params, &store, run, progress);
+        }
         let against = params.against.as_deref().map(|run| page::OtherRun::read(&store, run));
         let against = against.transpose()?;
         let mut subject = Evaluand::read(&store, &params)?;

@@ -10,9 +10,9 @@ use super::foreign;
 use crate::audio::BLOCKS;
 use crate::evaluation::locking::since_start;
 use crate::evaluation::metrics::Music;
-use crate::motion::bar_phase;
 use crate::motion::choreography::activity;
 use crate::motion::phase::unwrapped;
+use crate::motion::{Beats, bar_phase};
 use crate::stages::beats::{self, PhraseBeats};
 use crate::stages::generate::url_of;
 use crate::stages::plot::nearest::nearest;
@@ -126,6 +126,11 @@ impl PhraseIndex {
             found.insert(id, foreign::ForeignPhrase { id, url: url_of(row), n_frames });
         }
         found.into_values().collect()
+    }
+
+    /// Returns the beats of a phrase in bars; none for too few of them.
+    pub fn beats(&self, phrase_id: &str) -> Option<Beats> {
+        self.beats.get(phrase_id)?.in_bars(self.rows.get(phrase_id)?)
     }
 
     /// Whether some phrase has beats.

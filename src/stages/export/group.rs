@@ -295,7 +295,13 @@ fn checks(
         rows.push((case, "score", difference(&found.1, &logits), onnx_s, eager_s));
     }
     let build = runtime.build();
-    let row = |(case, name, apart, onnx_s, eager_s): (Case, &str, super::checks::Difference, f64, f64)| {
+    let row = |(case, name, apart, onnx_s, eager_s): (
+        Case,
+        &str,
+        super::checks::Difference,
+        f64,
+        f64,
+    )| {
         OnnxCheckRow {
             model: params.model.clone(),
             run: params.run.clone(),
@@ -409,13 +415,12 @@ impl Given {
         trained: &TrainedGroup,
     ) -> anyhow::Result<Vec<f32>> {
         let Case { n_groups, n_dancers, n_frames } = self.case;
-        let mut features = Array3::from_shape_vec((n_groups, n_frames, FEATURE_DIM), self.features.clone())?;
+        let mut features =
+            Array3::from_shape_vec((n_groups, n_frames, FEATURE_DIM), self.features.clone())?;
         let rows = features.view_mut().into_shape_with_order((n_groups * n_frames, FEATURE_DIM))?;
         trained.state.scales.features.apply(rows);
         let mut heard = Vec::new();
-        for (row, clock) in
-            features.rows().into_iter().zip(self.clock.chunks_exact(CLOCK_DIM))
-        {
+        for (row, clock) in features.rows().into_iter().zip(self.clock.chunks_exact(CLOCK_DIM)) {
             heard.extend(row);
             heard.extend(clock.iter().filter(|_| self.has_clock));
         }
@@ -485,7 +490,10 @@ impl Summary for GroupExportSummary {
             let sizes: Vec<String> = card.files.iter().map(size).collect();
             let GroupProvenance { run, step, .. } = &card.provenance;
             let sizes = sizes.join(" and ");
-            return writeln!(out, "would check and write {sizes} of run {run} (step {step}) to {place}");
+            return writeln!(
+                out,
+                "would check and write {sizes} of run {run} (step {step}) to {place}"
+            );
         }
         super::report::write_checks(out, checks)?;
         let note = if *is_up_to_date { ", up to date" } else { "" };

@@ -99,8 +99,15 @@ impl Stage for Export {
         let machine = &params.machine;
         let watch = ProgressWatch(progress);
         let (most, is_dry_run) = (Some(MAX_TRAIN_PHRASES), params.dry_run);
-        let phrases =
-            read_phrases(&store, Self::NAME, (machine, Family::Unet), most, progress, &watch, is_dry_run)?;
+        let phrases = read_phrases(
+            &store,
+            Self::NAME,
+            (machine, Family::Unet),
+            most,
+            progress,
+            &watch,
+            is_dry_run,
+        )?;
         let learned_from =
             learned::of_run(&store, &params.run, &trained, machine, progress, is_dry_run)?;
         if learned_from.is_none() {

@@ -39,7 +39,8 @@ const DEFAULT_DANCERS: usize = 3;
 /// # Errors
 /// One sentence.
 pub fn refuse_for_soloists(params: &Params, model: &str) -> anyhow::Result<()> {
-    let is_group = "is of the family unet, which makes one dancer; name one of the family group with --model";
+    let is_group =
+        "is of the family unet, which makes one dancer; name one of the family group with --model";
     if let Some(n) = params.dancers.filter(|&n| n != 1) {
         bail!("--dancers {n}: model {model} {is_group}, or leave --dancers out");
     }
@@ -155,8 +156,7 @@ pub fn run(
     let is_single = params.audio.len() == 1 || params.phrase.len() == 1;
     let threads = params.engine.threads;
     let n_workers = if is_single { NonZeroUsize::MIN } else { threads };
-    let n_threads =
-        NonZeroUsize::new(threads.get() / n_workers.get()).unwrap_or(NonZeroUsize::MIN);
+    let n_threads = NonZeroUsize::new(threads.get() / n_workers.get()).unwrap_or(NonZeroUsize::MIN);
     let parameters = parameters(&files, &card)?;
     let workers = (n_workers, n_threads);
     let engine = GroupEngine::new(&card.group, parameters, &card.feature_scale, workers)
@@ -318,15 +318,13 @@ impl GroupMaker<'_> {
     ) -> GenerationRow {
         let settings = self.settings;
         let (n_dancers, n_frames, _) = frames.dim();
-        let errors = decoded.outer_iter().map(|dancer| {
-            derivative_error(dancer, Channel::Position, Channel::Velocity)
-        });
+        let errors = decoded
+            .outer_iter()
+            .map(|dancer| derivative_error(dancer, Channel::Position, Channel::Velocity));
         let velocity_error = errors.sum::<f64>() / n_dancers as f64;
         let limits = settings.postprocess.limits;
-        let scores: Vec<_> = frames
-            .outer_iter()
-            .map(|dancer| score(dancer, limits, bars, velocity_error))
-            .collect();
+        let scores: Vec<_> =
+            frames.outer_iter().map(|dancer| score(dancer, limits, bars, velocity_error)).collect();
         let mean = |values: Vec<Option<f64>>| {
             let values: Option<Vec<f64>> = values.into_iter().collect();
             values.map(|values| values.iter().sum::<f64>() / n_dancers as f64)

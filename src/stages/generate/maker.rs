@@ -136,7 +136,8 @@ impl MotionMaker for SoloistMaker<'_> {
     }
 
     fn settings(&self) -> serde_json::Value {
-        serde_json::to_value(self.settings.to_row()).expect("invariant: numbers and texts become JSON")
+        serde_json::to_value(self.settings.to_row())
+            .expect("invariant: numbers and texts become JSON")
     }
 
     fn settings_digest(&self) -> String {

@@ -59,10 +59,9 @@ fn check_numbers(config: &GroupTrainConfig) -> anyhow::Result<()> {
     ] {
         ensure!((0.0..1.0).contains(&x), "{flag} {x} is no share; give a number from 0 to below 1");
     }
-    for (flag, x) in [
-        ("--markers-loss", training.losses.markers),
-        ("--contrast-loss", training.losses.contrast),
-    ] {
+    for (flag, x) in
+        [("--markers-loss", training.losses.markers), ("--contrast-loss", training.losses.contrast)]
+    {
         ensure!(x.is_finite() && x >= 0.0, "{flag} {x} is no weight; give 0 or more");
     }
     let peak = training.learning_rate.peak;
@@ -81,8 +80,15 @@ impl Run<'_> {
     ) -> anyhow::Result<Box<dyn Summary>> {
         let machine = &self.params.machine;
         let dancers = Family::Group;
-        let phrases =
-            read_phrases(self.store, Train::NAME, (machine, dancers), None, progress, self.watch, true)?;
+        let phrases = read_phrases(
+            self.store,
+            Train::NAME,
+            (machine, dancers),
+            None,
+            progress,
+            self.watch,
+            true,
+        )?;
         let windows = Windows::new(
             phrases.dataset,
             Normalizer::identity(),
@@ -109,8 +115,15 @@ impl Run<'_> {
         let params = self.params;
         let machine = &params.machine;
         let dancers = Family::Group;
-        let phrases =
-            read_phrases(self.store, Train::NAME, (machine, dancers), None, progress, self.watch, false)?;
+        let phrases = read_phrases(
+            self.store,
+            Train::NAME,
+            (machine, dancers),
+            None,
+            progress,
+            self.watch,
+            false,
+        )?;
         let threads = Arc::new(machine.start_threads()?);
         let n_frames = config.network.window_frames;
         let scales = scales(&phrases.dataset, n_frames, self.watch)?;
@@ -130,10 +143,8 @@ impl Run<'_> {
             self.clear()?;
         }
         claim(self.store, &params.run, Train::NAME, config, machine.patience(), self.watch)?;
-        let steps = super::StageBudget {
-            share: 1.0,
-            ..self.steps_of_diffusion(config.group.batch_size)
-        };
+        let steps =
+            super::StageBudget { share: 1.0, ..self.steps_of_diffusion(config.group.batch_size) };
         let end = self.stage(config, steps, &mut learner, &windows, &mut account)?;
         if end == TrainingEnd::Interrupted {
             return Ok(Box::new(account.interrupted(&resume_command(params))));

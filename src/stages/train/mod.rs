@@ -21,7 +21,8 @@ use crate::motion::Normalizer;
 use crate::store::{Lease, Location};
 use crate::training::{
     Augmentation, CheckpointKind, Checkpoints, DecoderLearner, Denoiser, DiffusionLearner, Drive,
-    GroupLearner, Journal, Learner, Loader, Plan, State, TrainConfig, TrainingEnd, TrainingError, Windows,
+    GroupLearner, Journal, Learner, Loader, Plan, State, TrainConfig, TrainingEnd, TrainingError,
+    Windows,
 };
 use session::{
     MachineParams, ProgressWatch, check_run_name, claim, claim_path, lease_of, read_phrases, scales,
@@ -212,12 +213,9 @@ impl<'a> Run<'a> {
 
     /// Removes what the run has left, so that it can begin anew.
     fn clear(&mut self) -> anyhow::Result<()> {
-        for stage in [
-            DiffusionLearner::STAGE,
-            DecoderLearner::STAGE,
-            GroupLearner::STAGE,
-            "finetune",
-        ] {
+        for stage in
+            [DiffusionLearner::STAGE, DecoderLearner::STAGE, GroupLearner::STAGE, "finetune"]
+        {
             self.checkpoints(stage).clear()?;
         }
         for stage in [DiffusionLearner::STAGE, DecoderLearner::STAGE, GroupLearner::STAGE] {
@@ -237,8 +235,15 @@ impl<'a> Run<'a> {
         progress: &dyn Progress,
     ) -> anyhow::Result<Box<dyn Summary>> {
         let machine = &self.params.machine;
-        let phrases =
-            read_phrases(self.store, Train::NAME, (machine, Family::Unet), None, progress, self.watch, true)?;
+        let phrases = read_phrases(
+            self.store,
+            Train::NAME,
+            (machine, Family::Unet),
+            None,
+            progress,
+            self.watch,
+            true,
+        )?;
         let n_frames = config.network.window_frames;
         let windows = Windows::new(
             phrases.dataset,
@@ -265,8 +270,15 @@ impl<'a> Run<'a> {
     ) -> anyhow::Result<Box<dyn Summary>> {
         let params = self.params;
         let machine = &params.machine;
-        let phrases =
-            read_phrases(self.store, Train::NAME, (machine, Family::Unet), None, progress, self.watch, false)?;
+        let phrases = read_phrases(
+            self.store,
+            Train::NAME,
+            (machine, Family::Unet),
+            None,
+            progress,
+            self.watch,
+            false,
+        )?;
         let threads = Arc::new(params.machine.start_threads()?);
         let n_frames = config.network.window_frames;
         let scales = scales(&phrases.dataset, n_frames, self.watch)?;
@@ -287,7 +299,13 @@ impl<'a> Run<'a> {
         }
         let patience = params.machine.patience();
         claim(self.store, &params.run, Train::NAME, config, patience, self.watch)?;
-        let end = self.stage(config, self.steps_of_diffusion(config.diffusion.batch_size), &mut learner, &augmented, &mut account)?;
+        let end = self.stage(
+            config,
+            self.steps_of_diffusion(config.diffusion.batch_size),
+            &mut learner,
+            &augmented,
+            &mut account,
+        )?;
         if end == TrainingEnd::Interrupted {
             return Ok(Box::new(account.interrupted(&resume_command(params))));
         }
@@ -311,7 +329,13 @@ impl<'a> Run<'a> {
             params.seed,
         )
         .on(&threads);
-        let end = self.stage(config, self.steps_of_decoder(config), &mut learner, &augmented, &mut account)?;
+        let end = self.stage(
+            config,
+            self.steps_of_decoder(config),
+            &mut learner,
+            &augmented,
+            &mut account,
+        )?;
         if end == TrainingEnd::Interrupted {
             return Ok(Box::new(account.interrupted(&resume_command(params))));
         }

@@ -8,7 +8,8 @@ use crate::motion::ChannelLimits;
 use crate::motion::style::STYLE_DIM;
 use crate::training::{
     Augmentation, ChannelWeights, DecoderTraining, DiffusionTraining, EmaConfig, EstimateLosses,
-    GroupLosses, GroupNetworkConfig, GroupTrainConfig, GroupTraining, LearningRate, LearningRateSchedule, NetworkConfig, Objective, OptimizerConfig, TrainConfig,
+    GroupLosses, GroupNetworkConfig, GroupTrainConfig, GroupTraining, LearningRate,
+    LearningRateSchedule, NetworkConfig, Objective, OptimizerConfig, TrainConfig,
 };
 
 /// Sizes of the networks; each wins over the preset.

@@ -18,9 +18,9 @@ use crate::training::error::TrainingError;
 use crate::training::sampling::motion_view;
 use crate::training::window::Batch;
 
+use super::GroupTraining;
 use super::markers::markers;
 use super::negatives::mixed;
-use super::GroupTraining;
 
 /// Streams of random numbers of a batch, told apart by their use.
 const EMBEDDING_NOISE: u64 = 1 << 61;
@@ -72,8 +72,7 @@ impl<'a> GroupBatch<'a> {
         let (n, slots, frames) = (batch.n_windows, batch.n_slots, batch.n_frames);
         let step = |u: f64| ((u * schedule.len() as f64) as usize).min(schedule.len() - 1);
         let t: Vec<usize> = batch.chances.iter().map(|chance| step(chance.step)).collect();
-        let t_dancers: Vec<usize> =
-            t.iter().flat_map(|&t| std::iter::repeat_n(t, slots)).collect();
+        let t_dancers: Vec<usize> = t.iter().flat_map(|&t| std::iter::repeat_n(t, slots)).collect();
         let rows = n * slots;
         let (x0, noise) =
             (motion_view(&batch.motion, rows, frames), motion_view(&batch.noise, rows, frames));
@@ -218,8 +217,7 @@ impl<'a> GroupBatch<'a> {
         let mask = g.constant(&[n_groups, slots * patches], &mask);
         let x0 = g.apply(TakeSamples::new(mixed.dancers), &[x0])?;
         let w = g.apply(TakeSamples::new(mixed.groups), &[w])?;
-        let inputs =
-            GroupScoreInputs { x0: &x0, t: &t, w: &w, number: &number, mask: Some(&mask) };
+        let inputs = GroupScoreInputs { x0: &x0, t: &t, w: &w, number: &number, mask: Some(&mask) };
         let logits = networks.score.forward(g, &inputs)?;
         let logits = g.apply(Reshape::new(&[n, 1 + n_negatives]), &[&logits])?;
         let labels = g.constant(&[n], &vec![0.0; n]);

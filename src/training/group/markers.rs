@@ -1,7 +1,7 @@
 //! Points that are fixed to a body, where its pose puts them.
 
-use crate::autodiff::{Backward, Element, Interpreter, Operation, Run, Tensor};
 use crate::autodiff::op::binary::{Binary, Pair};
+use crate::autodiff::{Backward, Element, Interpreter, Operation, Run, Tensor};
 use crate::model::{Graph, GraphError, Result};
 use crate::motion::{Channel, Normalizer};
 
@@ -75,8 +75,8 @@ impl<E: Element> Operation<E> for RotatedPoints<E> {
                         let (ud, um, md) = (dot(u, d), dot(u, m), dot(m, d));
                         sum[0] += 2.0 * dot(d, cross(u, m));
                         for i in 0..3 {
-                            sum[1 + i] += 2.0 * w * c[i]
-                                + 2.0 * (d[i] * um + m[i] * ud - 2.0 * u[i] * md);
+                            sum[1 + i] +=
+                                2.0 * w * c[i] + 2.0 * (d[i] * um + m[i] * ud - 2.0 * u[i] * md);
                         }
                     }
                     dq.iter_mut().zip(sum).for_each(|(dq, sum)| *dq = E::from_f64(sum));

@@ -93,7 +93,17 @@ impl GroupLearner {
         let all = batch.weight();
         let at = |part: usize| part * batch.n_windows / n_parts;
         let Self {
-            gradients, arenas, network, networks, schedule, sizes, config, threads, seed, windows, ..
+            gradients,
+            arenas,
+            network,
+            networks,
+            schedule,
+            sizes,
+            config,
+            threads,
+            seed,
+            windows,
+            ..
         } = &mut *self;
         let normalizer = windows.normalizer();
         let parameters = network.live();

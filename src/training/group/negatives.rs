@@ -73,9 +73,7 @@ mod tests {
         let found = mixed(&n_dancers, n_slots, k, Stream::new(3, 1)).expect("five groups");
         assert_eq!(found.groups.len(), 5 * 9);
         let (mut n_swapped, mut n_members) = (0, 0);
-        for (i, (places, &group)) in
-            found.dancers.chunks(n_slots).zip(&found.groups).enumerate()
-        {
+        for (i, (places, &group)) in found.dancers.chunks(n_slots).zip(&found.groups).enumerate() {
             assert_eq!(group, i / 9);
             let (there, absent) = places.split_at(n_dancers[group]);
             for (place, &dancer) in absent.iter().enumerate() {
