@@ -161,7 +161,7 @@ fn the_response_repeats_the_call_while_it_rests() {
             if !(0.2..0.7).contains(&in_bar) {
                 continue;
             }
-            let resting = if bars as usize % 2 == 0 { response } else { call };
+            let resting = if (bars as usize).is_multiple_of(2) { response } else { call };
             let [vx, _, vz, wx, wy, wz] = own(dance, span, resting, t);
             assert_near([vx, 0.0, vz, wx, wy, wz], [0.0; 6], ROUNDING, t);
         }
