@@ -222,7 +222,9 @@ fn mistakes_are_named() {
     let output = train(&store, "run", &["--preset=large"]);
     assert_eq!(output.code, 2);
     assert!(
-        output.stderr.contains("--preset large is none of the family group; give tiny, small or base"),
+        output
+            .stderr
+            .contains("--preset large is none of the family group; give tiny, small or base"),
         "{output:?}"
     );
     assert_eq!(train(&store, "run", &[]).code, 0);
@@ -262,7 +264,9 @@ fn mistakes_are_named() {
     let output = finish(&mut command);
     assert_eq!(output.code, 2, "{output:?}");
     assert!(
-        output.stderr.contains("is a model of the family group, and one of the family unet is needed"),
+        output
+            .stderr
+            .contains("is a model of the family group, and one of the family unet is needed"),
         "{output:?}"
     );
 }

@@ -10,7 +10,7 @@ use crate::motion::Trajectory;
 use crate::motion::exchange::{
     write_bvh, write_csv, write_glb, write_group_csv, write_group_glb, write_group_npy, write_npy,
 };
-use crate::plot::{self, MOTION_WIDTH_PX, MotionPanel, MotionPlot};
+use crate::plot::{self, GroupPlot, MOTION_WIDTH_PX, MotionPanel, MotionPlot};
 use crate::store::{PartWriter, replace_file, tables, temporary_beside, write_file};
 use crate::training::TemporalConfig;
 use crate::view::{Audio, View, ViewSample, mime_of, page};
@@ -155,19 +155,10 @@ fn write_group_as(output: &MotionOutput, format: MotionFormat, path: &Path) -> a
             Ok(())
         }
         MotionFormat::Png | MotionFormat::Svg => {
-            let dancers = group.outer_iter().map(|dancer| Trajectory::new(dancer.to_owned()));
-            let dancers = dancers.collect::<Result<Vec<_>, _>>()?;
-            let Some(first) = dancers.first() else { bail!("there is no dancer to draw") };
-            let figure = MotionPlot {
-                title: output.name,
-                motion: first,
-                beat_times_s: output.beats_s,
-                first_frame: 0,
-                jerk_limit_m_s3: TemporalConfig::default().target_jerk,
-            };
+            let figure = GroupPlot { title: output.name, group };
             let format =
                 if format == MotionFormat::Png { plot::Format::Png } else { plot::Format::Svg };
-            let bytes = plot::motion(&figure, &MotionPanel::USUAL, MOTION_WIDTH_PX, format)?.bytes;
+            let bytes = plot::group(&figure, MOTION_WIDTH_PX, format)?.bytes;
             to_file(&|out| out.write_all(&bytes))
         }
         MotionFormat::Html => {
