@@ -27,6 +27,10 @@ build: ## build the executables (dev profile)
 demo: build setup ## from tests/data to tables, a library, trained networks, a plot and answers (build/demo)
 	@$(MAKE) --file pipelines/demo.mk BIN=$(BIN)
 
+.PHONY: demo-group
+demo-group: build setup ## from tests/data to a library of groups, a model of groups, and five dancers on a page (build/demo-group)
+	@$(MAKE) --file pipelines/group.mk BIN=$(BIN)
+
 # Processors round transforms differently, and a phrase that library constructs is named by a digest of every bit. One row
 # of motion that moves by half of its column's spread is told.
 TABLES := phrases,motion,beats,features,extractions

@@ -105,6 +105,8 @@ impl Bench {
         };
         let batch = Batch {
             n_windows: n,
+            n_slots: 1,
+            n_dancers: vec![1; n],
             n_frames: frames,
             motion: random(1, n * frames * MOTION_DIM),
             audio: random(2, n * frames * network.unet.audio_cond_dim),

@@ -139,6 +139,9 @@ struct GeneratedGroup {
     frames: Array3<f32>,
 }
 
+/// Real groups with their music.
+type RealGroups = BTreeMap<Subject, Vec<(WindowMusic, Array3<f32>)>>;
+
 /// Returns whether all motions of a run are of groups.
 ///
 /// # Errors
@@ -282,9 +285,9 @@ fn real_windows(
     snapshot: &StoreSnapshot,
     phrases: &PhraseIndex,
     rows: &[PhraseRow],
-) -> anyhow::Result<BTreeMap<Subject, Vec<(WindowMusic, Array3<f32>)>>> {
+) -> anyhow::Result<RealGroups> {
     let wanted: BTreeSet<String> = rows.iter().map(|row| row.phrase_id.clone()).collect();
-    let mut found: BTreeMap<Subject, Vec<(WindowMusic, Array3<f32>)>> = BTreeMap::new();
+    let mut found = RealGroups::new();
     snapshot.table(tables::motion())?.visit_groups(&wanted, |id, frames| {
         let subject = match phrases.row(id).map(|row| row.split.as_str()) {
             Some("train") => Subject::TrainingTruth,
@@ -353,7 +356,7 @@ type Found = BTreeMap<(&'static str, Subject), Windows>;
 /// Measures windows of generated groups, of groups made up from them, and of real groups.
 fn measured(
     generated: &[GeneratedGroup],
-    real: &BTreeMap<Subject, Vec<(WindowMusic, Array3<f32>)>>,
+    real: &RealGroups,
     window: usize,
     progress: &dyn Progress,
 ) -> Found {

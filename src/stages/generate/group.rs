@@ -80,7 +80,7 @@ impl GroupSettings {
             ("--stream", params.stream.is_some()),
             ("--best-of", params.best_of.get() > 1),
         ];
-        for (flag, _) in only_soloists.into_iter().filter(|(_, is_given)| *is_given) {
+        if let Some((flag, _)) = only_soloists.into_iter().find(|(_, is_given)| *is_given) {
             bail!(
                 "{flag}: model {} is of the family group, which does not know it; leave it out, or name a model of \
                  the family unet",

@@ -16,7 +16,7 @@ use crate::motion::Normalizer;
 use crate::onnx::{EMBEDDED_BYTES, Form, ModelFile, Storage, decoder, unet};
 use crate::stages::Silent;
 use crate::stages::generate::weights_digest;
-use crate::stages::model_files::sha256;
+use crate::stages::model_files::{ModelFolder, sha256};
 use crate::store::TimestampUs;
 use crate::units::FPS;
 
@@ -66,6 +66,7 @@ fn model_in(folder: &Path, config: UNetConfig) -> OpenModel {
     let mut normalizer = Normalizer::identity();
     normalizer.centre[1] = 0.9;
     let card = ModelCard {
+        family: crate::model::Family::Unet,
         format: MODEL_FORMAT,
         name: "m".to_owned(),
         program: "p".to_owned(),
@@ -98,7 +99,8 @@ fn model_in(folder: &Path, config: UNetConfig) -> OpenModel {
     };
     let text = serde_json::to_vec(&card).expect("JSON");
     std::fs::write(folder.join(file_names::CARD), text).expect("written");
-    OpenModel::of_folder(folder).expect("a model")
+    let files = ModelFolder::of_folder(folder).expect("a folder");
+    OpenModel::of(files).expect("a model")
 }
 
 fn music(seed: u64, n_frames: usize) -> Array2<f32> {
