@@ -94,9 +94,18 @@ pub fn angular_velocity(from: Quaternion, to: Quaternion, rate_hz: f64) -> [f64;
 ///
 /// Source: Shoemake, Animating rotation with quaternion curves, SIGGRAPH 1985.
 pub fn slerp(a: Quaternion, b: Quaternion, s: f64) -> Quaternion {
+    slerp_as_signed(a, nearer(a, b), s)
+}
+
+/// Spherical linear interpolation along the arc that the signs of `a` and `b` say, which may be the longer one.
+///
+/// Between two orientations that turn, each with continuous signs, the arc stays on one side though they pass half a
+/// turn of each other; the shorter arc would change sides there. Where `b` is nearly `-a` no arc is told, and the
+/// shorter one is taken.
+pub fn slerp_as_signed(a: Quaternion, b: Quaternion, s: f64) -> Quaternion {
     let cosine = dot(a, b);
-    let b = if cosine < 0.0 { b.map(|c| -c) } else { b };
-    let angle = cosine.abs().min(1.0).acos();
+    let b = if cosine < -1.0 + 1e-6 { b.map(|c| -c) } else { b };
+    let angle = dot(a, b).clamp(-1.0, 1.0).acos();
     // Nearly equal orientations: the limit of both weights.
     let (wa, wb) = if angle < 1e-6 {
         (1.0 - s, s)
@@ -104,6 +113,11 @@ pub fn slerp(a: Quaternion, b: Quaternion, s: f64) -> Quaternion {
         (((1.0 - s) * angle).sin() / angle.sin(), (s * angle).sin() / angle.sin())
     };
     normalize(std::array::from_fn(|c| wa * a[c] + wb * b[c]))
+}
+
+/// Returns the one of `q` and `-q` that is nearer to `like`.
+pub fn nearer(like: Quaternion, q: Quaternion) -> Quaternion {
+    if dot(like, q) < 0.0 { q.map(|c| -c) } else { q }
 }
 
 fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
@@ -120,6 +134,21 @@ mod tests {
         prop::array::uniform4(-1.0..1.0f64)
             .prop_filter("away from zero", |q| dot(*q, *q) > 1e-3)
             .prop_map(normalize)
+    }
+
+    #[test]
+    fn an_arc_between_turning_orientations_keeps_its_side() {
+        // b turns from 90° to 270° while a stands: the middle goes on from 45° to 135°, and does not fall to -45°.
+        let about_y = |degrees: f64| from_axis_angle([0.0, 1.0, 0.0], degrees.to_radians());
+        let a = about_y(0.0);
+        let mut b = about_y(90.0);
+        for k in 0..=30 {
+            let degrees = 90.0 + 6.0 * f64::from(k);
+            b = nearer(b, about_y(degrees));
+            assert_close(&slerp_as_signed(a, b, 0.5), &about_y(degrees / 2.0), 1e-12);
+        }
+        assert_close(&slerp(a, about_y(270.0), 0.5), &about_y(-45.0), 1e-12);
+        assert_close(&slerp_as_signed(a, a.map(|c| -c), 0.3), &a, 1e-12);
     }
 
     fn assert_close(a: &[f64], b: &[f64], tolerance: f64) {

@@ -64,6 +64,9 @@ impl GatheredFrames {
     /// # Errors
     /// What is wrong with the rows, to go on from the item's name.
     pub fn take(&mut self, columns: &FrameColumns, rows: Range<usize>) -> Result<(), String> {
+        if rows.is_empty() {
+            return Ok(());
+        }
         for row in rows.clone() {
             let dancer = columns.dancers.map_or(0, |dancers| dancers.value(row));
             self.expect(dancer, columns.numbers.value(row))?;

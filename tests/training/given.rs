@@ -56,6 +56,8 @@ pub fn batch(golden: &Golden, x0: Vec<f32>, noise: Vec<f32>, audio: Vec<f32>) ->
     Batch {
         n_windows,
         n_frames,
+        n_slots: 1,
+        n_dancers: vec![1; n_windows],
         motion: x0,
         audio,
         mask: single(golden.values("mask")),

@@ -132,6 +132,11 @@ impl GroupSettings {
         })
     }
 
+    /// Returns the settings as JSON in the order of these fields, the same in every build.
+    fn text(&self) -> String {
+        serde_json::to_string(self).expect("invariant: numbers and texts become JSON")
+    }
+
     fn to_json(&self) -> serde_json::Value {
         serde_json::to_value(self).expect("invariant: numbers and texts become JSON")
     }
@@ -247,7 +252,7 @@ impl MotionMaker for GroupMaker<'_> {
     }
 
     fn settings_digest(&self) -> String {
-        let text = format!("{}\n{}\n{}", self.settings.to_json(), self.weights(), self.seed);
+        let text = format!("{}\n{}\n{}", self.settings.text(), self.weights(), self.seed);
         digest(text.as_bytes())
     }
 
@@ -360,7 +365,7 @@ impl GroupMaker<'_> {
             control_error_deg: None,
             generate_s,
             real_time_factor: generate_s / frames_to_s(n_frames).max(f64::MIN_POSITIVE),
-            settings: Some(settings.to_json().to_string()),
+            settings: Some(settings.text()),
             content_hash: Some(music.content_hash.to_owned()),
             n_dancers: Some(n_dancers as i32),
             consistency: Some(settings.consistency),

@@ -26,7 +26,7 @@ use super::super::kinematics::Poses;
 use super::super::phase::bar_phase;
 use super::super::placement::Placement;
 use super::super::quaternion::{
-    Quaternion, from_axis_angle, make_sign_continuous, mul, rotate, slerp,
+    Quaternion, from_axis_angle, make_sign_continuous, mul, nearer, rotate, slerp_as_signed,
 };
 use super::primitive::UP;
 use super::{DIFFERENCED_FRAMES, Repertoire, STEPS_STREAM, Song, channels, floor, selection};
@@ -171,6 +171,7 @@ fn in_turn(
         let change_start_s = span.start_s - HALF_CHANGE_S;
         let first = if i == 0 { 0 } else { times_s.partition_point(|&t| t < change_start_s) };
         let end = times_s.partition_point(|&t| is_last || t < span.end_s + HALF_CHANGE_S);
+        let mut before: Option<(Quaternion, Quaternion)> = None;
         let new = danced(span, &times_s[first..end]);
         for (j, t) in (first..end).enumerate() {
             let (p, q) = (new.position_m[j], new.orientation[j]);
@@ -183,7 +184,13 @@ fn in_turn(
             let s = u * u * (3.0 - 2.0 * u);
             let old = poses.position_m[t];
             poses.position_m[t] = std::array::from_fn(|axis| old[axis] + s * (p[axis] - old[axis]));
-            poses.orientation[t] = slerp(poses.orientation[t], q, s);
+            // Both turn meanwhile: the arc between them stays on the side on which it began.
+            let (a, b) = match before {
+                None => (poses.orientation[t], nearer(poses.orientation[t], q)),
+                Some((a, b)) => (nearer(a, poses.orientation[t]), nearer(b, q)),
+            };
+            before = Some((a, b));
+            poses.orientation[t] = slerp_as_signed(a, b, s);
         }
     }
     poses
