@@ -16,6 +16,7 @@ mod evaluation;
 mod extract;
 mod foreign_models;
 mod generate;
+mod groups;
 mod ingest_bad_input;
 mod ingest_kill;
 mod ingest_local;

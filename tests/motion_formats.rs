@@ -179,7 +179,7 @@ fn what_is_not_read_is_refused_with_the_way_out() {
             "motion/pickled/motion.pkl is a Python pickle, which can run any program and is never loaded; \
              convert it where you trust it: python3 -c \"import pickle, numpy as n; d = \
              pickle.load(open('motion.pkl', 'rb'), encoding='latin1'); n.savez('motion.npz', **{k: d[k] for \
-             k in ('smpl_poses', 'smpl_trans', 'smpl_scaling')})\"",
+             k in ('smpl_poses', 'smpl_trans', 'root_trans', 'smpl_scaling') if k in d})\"",
         ),
         (
             "songs",

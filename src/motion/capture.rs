@@ -6,6 +6,7 @@
 //! dropped, so that every kept frame obeys the identities. What was found is told with the trajectory.
 
 mod account;
+mod group;
 mod own;
 mod own_axes;
 mod skeleton;
@@ -17,6 +18,7 @@ mod upright;
 use thiserror::Error;
 
 pub use account::{CaptureAccount, CaptureNote, Unit};
+pub use group::{GroupCapture, convert_captures, convert_tracks};
 pub use track::{RATE_RANGE_HZ, RigidTrack};
 pub use upright::Axis;
 
@@ -26,6 +28,7 @@ use crate::units::FPS;
 
 use super::bvh::Bvh;
 use super::channels::Channel;
+use super::dancers::DancersError;
 use super::kinematics::{Poses, forward_differences, frames_of};
 use super::phase::{Beats, bar_phase};
 use super::quaternion::{Quaternion, make_sign_continuous, normalize};
@@ -82,6 +85,21 @@ pub enum CaptureError {
         "capture has {rate_hz:?} frames per second, expected {low} to {high}; write the rate of the take"
     )]
     Rate { rate_hz: f64, low: f64, high: f64 },
+    /// Captures of one group that have different axes up.
+    #[error(
+        "dancer {dancer} is captured with {up} up and dancer 0 with {first}; export all dancers of a group in one \
+         frame of reference, or name the axis that is up with --up"
+    )]
+    GroupUp { dancer: usize, up: Axis, first: Axis },
+    /// Captures of one group in different units of length.
+    #[error(
+        "dancer {dancer} is captured in units of {unit_m:?} m and dancer 0 in units of {first_m:?} m, by the \
+         lengths of their bones; export all dancers of a group in one unit"
+    )]
+    GroupUnit { dancer: usize, unit_m: f64, first_m: f64 },
+    /// Captures that make no group.
+    #[error(transparent)]
+    Dancers(#[from] DancersError),
     /// The capture's times cannot carry a spline.
     #[error(transparent)]
     Spline(#[from] SplineError),
@@ -118,7 +136,7 @@ pub fn convert_capture(
     let (take, mut account) = Take::of(bvh, up)?;
     let notes = bvh.notes().iter().map(|note| CaptureNote::Text(note.to_string()));
     account.notes.splice(0..0, notes);
-    Ok(Capture { trajectory: trajectory_of(take, beats)?, account })
+    Ok(Capture { trajectory: trajectory_of(take, beats, None)?, account })
 }
 
 /// Converts the track of one rigid body to a trajectory, as [`convert_capture`] does with a hierarchy.
@@ -131,14 +149,18 @@ pub fn convert_track(
     up: Option<Axis>,
 ) -> Result<Capture, CaptureError> {
     let (take, account) = Take::of_track(track, up)?;
-    Ok(Capture { trajectory: trajectory_of(take, beats)?, account })
+    Ok(Capture { trajectory: trajectory_of(take, beats, None)?, account })
 }
 
-fn trajectory_of(mut take: Take, beats: Option<&Beats>) -> Result<Trajectory, CaptureError> {
+/// Makes the trajectory of a take, which is moved so that `origin_m` comes over the origin; without one, where its
+/// path starts does.
+fn trajectory_of(
+    mut take: Take,
+    beats: Option<&Beats>,
+    origin_m: Option<[f64; 3]>,
+) -> Result<Trajectory, CaptureError> {
     let (grid_s, t_kept) = take.resampling_grid()?;
-    if !take.is_smooth {
-        take.lowpass();
-    }
+    take.smooth();
 
     let mut p: Vec<[f64; 3]> = vec![[0.0; 3]; grid_s.len()];
     for (axis, signal) in take.nodes[..3].iter().enumerate() {
@@ -155,12 +177,14 @@ fn trajectory_of(mut take: Take, beats: Option<&Beats>) -> Result<Trajectory, Ca
     q.iter_mut().for_each(|q| *q = normalize(*q));
     make_sign_continuous(&mut q);
 
-    let origin = if take.is_own {
-        [0.0; 3]
-    } else {
-        // A root alone has no feet: how high it is over the floor is as the file says.
-        let ground = if take.is_root_alone { 0.0 } else { take.ground() };
-        [p[0][0], ground, p[0][2]]
+    let origin = match origin_m {
+        Some(origin) => origin,
+        None if take.is_own => [0.0; 3],
+        None => {
+            // A root alone has no feet: how high it is over the floor is as the file says.
+            let ground = if take.is_root_alone { 0.0 } else { take.ground() };
+            [p[0][0], ground, p[0][2]]
+        }
     };
     for p in &mut p {
         *p = std::array::from_fn(|axis| p[axis] - origin[axis]);

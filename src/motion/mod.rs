@@ -21,6 +21,7 @@ pub mod capture;
 pub mod channels;
 pub mod choreography;
 pub mod clock;
+mod dancers;
 pub mod exchange;
 pub mod formats;
 pub mod group;
@@ -43,11 +44,12 @@ pub mod trajectory;
 
 pub use bvh::{Bvh, BvhError, BvhNote};
 pub use capture::{
-    Axis, Capture, CaptureAccount, CaptureError, CaptureNote, RigidTrack, convert_bvh,
-    convert_capture, convert_track,
+    Axis, Capture, CaptureAccount, CaptureError, CaptureNote, GroupCapture, RigidTrack,
+    convert_bvh, convert_capture, convert_captures, convert_track, convert_tracks,
 };
 pub use channels::{CHANNEL_NAMES, Channel, MOTION_DIM, channel_unit};
 pub use clock::{CLOCK_DIM, CLOCK_NAMES, clock};
+pub use dancers::{Dancers, DancersError, MAX_DANCERS};
 pub use kinematics::Poses;
 pub use normalizer::Normalizer;
 pub use phase::{Beats, BeatsError, BeatsPerBarSource, bar_phase};

@@ -4,12 +4,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use anyhow::{anyhow, bail, ensure};
-use ndarray::Array2;
+use ndarray::{Array2, Array3};
 
 use super::Stage as _;
 use super::beats;
 use super::generate::generation_id;
-use super::ingest::{Ingest, read_beats, read_trajectory};
+use super::ingest::{Ingest, read_beats, read_dancers, read_trajectory};
 use super::plot::nearest::nearest;
 use crate::motion::{Trajectory, exchange, npy};
 use crate::store::tables::{self, FailureRow, GenerationRow, PhraseRow};
@@ -122,15 +122,11 @@ impl MotionParams {
                 (format!("{phrase} by {run}"), shown)
             }
             None => {
-                let Some(frames) = rows.frames(tables::motion())? else {
+                let Some(frames) = rows.group(tables::motion())? else {
                     return Err(missing(store, phrase, &rows, known.is_some())?);
                 };
                 let facts = known.as_ref().map(facts_of_phrase).unwrap_or_default();
-                let motion = Trajectory::new(frames)?;
-                (
-                    phrase.to_owned(),
-                    vec![DisplayedMotion { name: phrase.to_owned(), motion, facts }],
-                )
+                (phrase.to_owned(), of_dancers(phrase, &frames, &facts, room)?)
             }
         };
         let beats_s = beats::of_item(&rows)?.times_s().to_vec();
@@ -142,8 +138,7 @@ fn of_files(files: &[PathBuf], room: MotionCapacity) -> anyhow::Result<MotionDis
     check_room(files.len(), "--motion", room)?;
     let mut shown = Vec::new();
     for path in files {
-        let motion = read_motion(path)?;
-        shown.push(DisplayedMotion { name: name_of(path), motion, facts: Vec::new() });
+        shown.extend(of_dancers(&name_of(path), &read_group(path)?, &[], room)?);
     }
     let title = match files {
         [first, rest @ ..] if !rest.is_empty() => {
@@ -190,6 +185,16 @@ pub fn read_motion(path: &Path) -> anyhow::Result<Trajectory> {
         }
         _ => bail!("{place}: is named like no motion; name a .npy or .csv file of 25 channels"),
     }
+}
+
+/// Reads a motion file of a soloist, or as `.npy` of a group, `[N, T, 25]`; its values are not looked at.
+fn read_group(path: &Path) -> anyhow::Result<Array3<f32>> {
+    let is_npy = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("npy"));
+    if !is_npy {
+        return Ok(read_motion(path)?.into_array().insert_axis(ndarray::Axis(0)));
+    }
+    let dancers = read_dancers(&path.display().to_string(), &bytes_of(path)?);
+    Ok(dancers.map_err(|failure| anyhow!(failure.message))?.to_array())
 }
 
 /// Reads a whole file that may be one.
@@ -278,27 +283,72 @@ fn of_run(
                 known.join(", ")
             );
         };
-        let motion = Trajectory::new(generated_frames(store, run, phrase, number)?)?;
+        let frames = generated_group(store, run, phrase, number)?;
         let facts = facts_of_generation(row, *n_candidates);
-        shown.push(DisplayedMotion { name: format!("sample {number}"), motion, facts });
+        shown.extend(of_dancers(&format!("sample {number}"), &frames, &facts, room)?);
     }
     Ok(shown)
 }
 
-/// Reads the frames of a generated motion, `[T, 25]`: the one place that knows how `generated` names them.
+/// Returns the dancers of a motion, `[N, T, 25]`, one beside the other; in a plot, which has room for one, the first.
+fn of_dancers(
+    name: &str,
+    frames: &Array3<f32>,
+    facts: &[(String, String)],
+    room: MotionCapacity,
+) -> anyhow::Result<Vec<DisplayedMotion>> {
+    let n_dancers = frames.len_of(ndarray::Axis(0));
+    let n_shown = match room {
+        MotionCapacity::One => n_dancers.min(1),
+        MotionCapacity::Many => n_dancers,
+    };
+    let shown = frames.outer_iter().take(n_shown).enumerate().map(|(dancer, frames)| {
+        let motion = Trajectory::new(frames.to_owned())?;
+        let (mut name, mut facts) = (name.to_owned(), facts.to_vec());
+        if n_dancers > 1 {
+            name = format!("{name}, dancer {dancer}");
+            facts.push(("dancer".to_owned(), format!("{dancer}, of {n_dancers}")));
+        }
+        Ok(DisplayedMotion { name, motion, facts })
+    });
+    shown.collect()
+}
+
+/// Reads the frames of a generated motion of a soloist, `[T, 25]`.
 ///
 /// # Errors
-/// [`StoreError`], or one sentence where the table has no such motion.
+/// [`StoreError`], or one sentence where the table has no such motion, or one of a group.
 pub fn generated_frames(
     store: &Location,
     run: &str,
     phrase: &str,
     sample: usize,
 ) -> anyhow::Result<Array2<f32>> {
+    let group = generated_group(store, run, phrase, sample)?;
+    let n_dancers = group.len_of(ndarray::Axis(0));
+    ensure!(
+        n_dancers == 1,
+        "store {store}: {} has {n_dancers} dancers where one is read",
+        generation_id(run, phrase, sample)
+    );
+    Ok(group.index_axis_move(ndarray::Axis(0), 0))
+}
+
+/// Reads the frames of all dancers of a generated motion, `[N, T, 25]`: the one place that knows how `generated` names
+/// them.
+///
+/// # Errors
+/// [`StoreError`], or one sentence where the table has no such motion.
+pub fn generated_group(
+    store: &Location,
+    run: &str,
+    phrase: &str,
+    sample: usize,
+) -> anyhow::Result<Array3<f32>> {
     let name = generation_id(run, phrase, sample);
     let mut found = None;
     let table = Snapshot::take(store, tables::generated())?;
-    table.visit_items(&BTreeSet::from([name.clone()]), |_, frames| {
+    table.visit_groups(&BTreeSet::from([name.clone()]), |_, frames| {
         found = Some(frames);
         Ok::<(), StoreError>(())
     })?;

@@ -8,7 +8,7 @@ use ndarray::{Array2, ArrayView2, s};
 use crate::generation::{Retrieval, Windows};
 use crate::motion::{MOTION_DIM, Placement};
 use crate::store::{Location, Patience, StoreError, StoreSnapshot};
-use crate::training::{Dataset, DatasetOptions, Phrase, Split};
+use crate::training::{Dataset, DatasetOptions, Ensemble, ExcludedPhrase, Phrase, Split};
 
 /// Most training phrases that are read, the same ones every time: a bound on memory.
 pub const MAX_TRAIN_PHRASES: usize = 4000;
@@ -21,24 +21,32 @@ pub fn read_dataset(
     store: &Location,
     threads: NonZeroUsize,
 ) -> Result<Dataset, crate::training::DatasetError> {
-    dataset_of(&StoreSnapshot::take(store)?, threads)
+    let (dataset, left_out) = dataset_of(&StoreSnapshot::take(store)?, threads)?;
+    let n_groups = left_out.iter().filter(|one| one.is_for_other_models()).count();
+    if n_groups > 0 {
+        tracing::info!(
+            "{n_groups} phrases of groups of dancers are left out: soloists begin from soloists"
+        );
+    }
+    Ok(dataset)
 }
 
-/// Reads the phrases of a snapshot that there is to learn from.
+/// Reads the phrases of a snapshot that there is for a soloist to learn from, and those that are left out.
 ///
 /// # Errors
 /// As [`Dataset::read`].
 pub fn dataset_of(
     snapshot: &StoreSnapshot,
     threads: NonZeroUsize,
-) -> Result<Dataset, crate::training::DatasetError> {
+) -> Result<(Dataset, Vec<ExcludedPhrase>), crate::training::DatasetError> {
     let reading = DatasetOptions {
+        ensemble: Ensemble::Soloists,
         in_memory: false,
         n_threads: threads,
         patience: Patience::default(),
         max_train_phrases: Some(MAX_TRAIN_PHRASES),
     };
-    Dataset::of(snapshot, &reading, &|_, _| {}, &|_, _| {}).map(|(dataset, _)| dataset)
+    Dataset::of(snapshot, &reading, &|_, _| {}, &|_, _| {})
 }
 
 /// Returns an index of the training phrases that have `window_frames`, and their places in the dataset; none

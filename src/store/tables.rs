@@ -17,11 +17,11 @@ rows! {
     {
         phrase_id: String, "", "Name of the phrase: its folder in a phrase layout, its relative path in a music library; of a constructed one `SONG.tTAKE.NUMBER`.";
         source: String, "URL", "The source it came from; of a constructed phrase, the song.";
-        motion_url: Option<String>, "URL", "The file that the motion was read from.";
+        motion_url: Option<String>, "URL", "The file that the motion was read from; of a group with a file for each dancer, that of the first.";
         features_url: Option<String>, "URL", "The feature file (`features.npz`).";
         audio_url: Option<String>, "URL", "The audio file.";
         beats_url: Option<String>, "URL", "The beat list (`.beats.txt`).";
-        motion_bytes: Option<i64>, "bytes", "Size of the motion file.";
+        motion_bytes: Option<i64>, "bytes", "Size of the motion file, or of those of all dancers.";
         features_bytes: Option<i64>, "bytes", "Size of the feature file.";
         audio_bytes: Option<i64>, "bytes", "Size of the audio file.";
         beats_bytes: Option<i64>, "bytes", "Size of the beat list.";
@@ -31,7 +31,7 @@ rows! {
         has_features: bool, "", "Whether the phrase has a feature file, or was constructed with features.";
         has_audio: bool, "", "Whether the phrase has audio.";
         has_beats: bool, "", "Whether the phrase has beat times (beat list, feature file, or those of its song).";
-        motion_format: Option<String>, "", "`npy` (25 channels as they were), the format that was converted (`bvh`, `aist`, `amass`, `smpl`, `humanml3d`, `vmd`, `vmd_camera`) or `constructed` (by library).";
+        motion_format: Option<String>, "", "`npy` (25 channels as they were), the format that was converted (`bvh`, `aist`, `amass`, `gdance`, `smpl`, `positions`, `humanml3d`, `vmd`, `vmd_camera`) or `constructed` (by library).";
         motion_root: Option<String>, "", "Of a capture: the joint whose motion it is, the first that moves or branches. This and the columns to `motion_notes` are none for other motion, and in rows of release 0.1.";
         motion_up: Option<String>, "", "Of a capture: the axis that is up in the file, found or given by --up: `y`, `z`, `x`, `-y`, `-z` or `-x`.";
         motion_unit_m: Option<f64>, "m", "Of a capture: length of one file unit, guessed from the lengths of bones.";
@@ -42,7 +42,7 @@ rows! {
         n_channels: Option<i32>, "channels", "Channels named by the audio header.";
         duration_s: f64, "s", "Length of the audio; without audio, frames / 30.";
         start_s: Option<f64>, "s", "Of a constructed phrase, where in its song it begins.";
-        n_frames: Option<i64>, "frames", "Motion frames at 30 fps.";
+        n_frames: Option<i64>, "frames", "Motion frames at 30 fps, of each dancer.";
         n_feature_frames: Option<i64>, "frames", "Frames in the feature file, or of the features.";
         split: String, "", "`train` (90 %), `validation` (5 %) or `test` (5 %), by a stable hash of `phrase_id`; constructed phrases go with their song.";
         tempo_bpm: Option<f64>, "beats/min", "Tempo.";
@@ -217,6 +217,13 @@ rows! {
         n_dancers: Option<i32>, "dancers", "Dancers in the motion, 1 of a soloist. None in rows of versions before 4, where it is 1.";
         consistency: Option<f64>, "", "γ, the guidance towards consistency (above 0) or diversity (below 0), from -1 to 1; none where it was not asked for.";
         time: TimestampUs, "", "When it was made.";
+    }
+}
+
+impl GenerationRow {
+    /// Returns how many dancers the motion has, 1 where the row is older than groups.
+    pub fn count_dancers(&self) -> usize {
+        usize::try_from(self.n_dancers.unwrap_or(1)).unwrap_or(1)
     }
 }
 

@@ -1,21 +1,24 @@
 //! Phrases to learn from: read once from the tables of a store, then at hand in any order.
 
+mod frames;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::num::NonZeroUsize;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use ndarray::{Array2, ArrayView2};
+use ndarray::{Array2, Array3, ArrayView2};
 
 use crate::audio::FEATURE_DIM;
 use crate::motion::phase::DEFAULT_BEATS_PER_BAR;
-use crate::motion::{Channel, MOTION_DIM, Trajectory, TrajectoryError, clock};
+use crate::motion::{Channel, MOTION_DIM, clock};
 use crate::store::tables::{self, PhraseRow};
 use crate::store::{
-    FrameSpool, Location, Patience, Row as _, Snapshot, StoreError, StoreSnapshot, TableSchema,
-    digest, outdated_features,
+    FrameSpool, Location, Patience, Row as _, StoreError, StoreSnapshot, TableSchema, digest,
+    outdated_features,
 };
+use frames::gather;
 
 /// Motion and features of one phrase may differ by this much: ingest lets a frame pass, the last frame of
 /// features is centred on the end of the audio, and both lengths are rounded.
@@ -50,6 +53,8 @@ impl Split {
 pub struct Phrase {
     pub id: Arc<str>,
     pub split: Split,
+    /// Dancers of the motion, 1 of a soloist.
+    pub n_dancers: usize,
     pub n_frames: usize,
     /// Beats of a bar.
     pub beats_per_bar: u32,
@@ -57,6 +62,8 @@ pub struct Phrase {
     pub song_hash: Option<Arc<str>>,
     /// Digest of the phrase's files, or of its motion and features.
     pub content_hash: Arc<str>,
+    /// Frames of each dancer, which may be more than have features.
+    motion_frames: usize,
     motion_row: u64,
     feature_row: u64,
 }
@@ -82,9 +89,45 @@ pub struct ExcludedPhrase {
     pub message: String,
 }
 
+impl ExcludedPhrase {
+    /// The kind of a phrase that has other dancers than are learned from.
+    pub const GROUP: &'static str = "group";
+
+    /// Returns whether nothing is wrong with the phrase: it is for another kind of model.
+    pub fn is_for_other_models(&self) -> bool {
+        self.kind == Self::GROUP
+    }
+}
+
+/// Whose motion is learned from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ensemble {
+    /// One dancer's.
+    Soloists,
+    /// That of up to `most` dancers together; a soloist is a group of one.
+    Groups { most: usize },
+}
+
+impl Ensemble {
+    /// Returns why so many dancers are not learned from, to go on from "has".
+    fn refusal(self, n_dancers: usize) -> Option<String> {
+        match self {
+            Self::Soloists if n_dancers > 1 => Some(format!(
+                "{n_dancers} dancers; a model of the family unet learns from soloists"
+            )),
+            Self::Groups { most } if n_dancers > most => Some(format!(
+                "{n_dancers} dancers, more than the {most} of the largest group that is learned from"
+            )),
+            _ => None,
+        }
+    }
+}
+
 /// How phrases are read.
 #[derive(Clone, Debug)]
 pub struct DatasetOptions {
+    /// Whose motion is read; phrases of others are left out.
+    pub ensemble: Ensemble,
     /// Whether frames are kept in memory rather than in a temporary file.
     pub in_memory: bool,
     pub n_threads: NonZeroUsize,
@@ -115,6 +158,11 @@ pub enum DatasetError {
     )]
     Empty { store: String },
     #[error(
+        "store {store} has {n_groups} phrases with both motion and features, all of groups of dancers; a model of \
+         the family unet learns from soloists"
+    )]
+    GroupsAlone { store: String, n_groups: usize },
+    #[error(
         "store {store}: split {split} is empty ({n_train} train, {n_validation} validation phrases); {way_out}"
     )]
     EmptySplit {
@@ -125,16 +173,6 @@ pub enum DatasetError {
         way_out: &'static str,
     },
 }
-
-/// The frames of a phrase as read from one table.
-struct PhraseFrames {
-    row: u64,
-    n_frames: usize,
-    digest: String,
-}
-
-/// Frames of one table by phrase, or why they are of no use.
-type PhraseResults = BTreeMap<String, Result<PhraseFrames, ExcludedPhrase>>;
 
 impl Dataset {
     /// Reads all phrases with motion and features.
@@ -191,8 +229,14 @@ impl Dataset {
         let n_parts = tables.iter().map(|table| table.parts().len()).sum();
         let n_read = AtomicUsize::new(0);
         let count = || progress(n_read.fetch_add(1, Ordering::Relaxed) + 1, n_parts);
-        let [with_motion, with_features] = [(&tables[0], &motion), (&tables[1], &features)]
-            .map(|(table, spool)| gather(table, spool, &wanted, reading, notice, &count));
+        // Features have no dancers.
+        let of_music = Ensemble::Soloists;
+        let [with_motion, with_features] =
+            [(&tables[0], &motion, reading.ensemble), (&tables[1], &features, of_music)].map(
+                |(table, spool, ensemble)| {
+                    gather(table, spool, &wanted, (reading, ensemble), notice, &count)
+                },
+            );
         let (mut with_motion, mut with_features) = (with_motion?, with_features?);
 
         let (mut phrases, mut left_out, mut digests) = (Vec::new(), Vec::new(), Vec::new());
@@ -244,10 +288,12 @@ impl Dataset {
             phrases.push(Phrase {
                 id: id.into(),
                 split,
+                n_dancers: motion.n_dancers,
                 n_frames: motion.n_frames.min(features.n_frames),
                 beats_per_bar: beats_per_bar(&row),
                 song_hash: row.song_hash.map(Into::into),
                 content_hash: row.content_hash.into(),
+                motion_frames: motion.n_frames,
                 motion_row: motion.row,
                 feature_row: features.row,
             });
@@ -256,7 +302,12 @@ impl Dataset {
             keep_train(&mut phrases, &mut digests, most);
         }
         if phrases.is_empty() {
-            return Err(DatasetError::Empty { store: snapshot.store().to_string() });
+            let store = snapshot.store().to_string();
+            let n_groups = left_out.iter().filter(|one| one.is_for_other_models()).count();
+            return Err(match n_groups {
+                0 => DatasetError::Empty { store },
+                n_groups => DatasetError::GroupsAlone { store, n_groups },
+            });
         }
         let fingerprint = digest(digests.join("\n").as_bytes());
         Ok((Self { phrases, motion, features, fingerprint }, left_out))
@@ -275,26 +326,50 @@ impl Dataset {
     pub fn in_memory<'a>(
         phrases: impl IntoIterator<Item = (&'a str, Split, Array2<f32>, Array2<f32>)>,
     ) -> Result<Self, StoreError> {
+        Self::groups_in_memory(phrases.into_iter().map(|(id, split, motion, features)| {
+            (id, split, motion.insert_axis(ndarray::Axis(0)), features)
+        }))
+    }
+
+    /// Makes a dataset of phrases of groups that are at hand: name, split, motion `[n_dancers, n_frames, 25]` and
+    /// features `[n_frames, 163]`, as [`Dataset::in_memory`] does.
+    ///
+    /// # Errors
+    /// [`StoreError`] when the frames cannot be kept.
+    ///
+    /// # Panics
+    /// When frames have another width.
+    pub fn groups_in_memory<'a>(
+        phrases: impl IntoIterator<Item = (&'a str, Split, Array3<f32>, Array2<f32>)>,
+    ) -> Result<Self, StoreError> {
         let (motion, features) =
             (FrameSpool::in_memory(MOTION_DIM), FrameSpool::in_memory(FEATURE_DIM));
         let mut given: Vec<_> = phrases.into_iter().collect();
         given.sort_by_key(|&(id, ..)| id);
         let (mut phrases, mut digests) = (Vec::new(), Vec::new());
         for (id, split, of_motion, of_features) in given {
-            let digest_of = |frames: &Array2<f32>| {
+            let (n_dancers, motion_frames, width) = of_motion.dim();
+            let rows = of_motion.as_standard_layout();
+            let rows = rows
+                .to_shape((n_dancers * motion_frames, width))
+                .expect("invariant: as many numbers, in order");
+            let digest_of = |frames: ArrayView2<f32>| {
                 digest(&frames.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<_>>())
             };
-            let (a, b) = (digest_of(&of_motion), digest_of(&of_features));
+            let (a, b) = (digest_of(rows.view()), digest_of(of_features.view()));
+            let a = if n_dancers == 1 { a } else { format!("{n_dancers} dancers {a}") };
             digests.push(format!("{id}\n{}\n{a}\n{b}", split.name()));
             let content_hash = digest(format!("features {b}\nmotion {a}\n").as_bytes());
             phrases.push(Phrase {
                 id: id.into(),
                 split,
-                n_frames: of_motion.nrows().min(of_features.nrows()),
+                n_dancers,
+                n_frames: motion_frames.min(of_features.nrows()),
                 beats_per_bar: DEFAULT_BEATS_PER_BAR,
                 song_hash: None,
                 content_hash: content_hash.into(),
-                motion_row: motion.append(of_motion.view())?,
+                motion_frames,
+                motion_row: motion.append(rows.view())?,
                 feature_row: features.append(of_features.view())?,
             });
         }
@@ -336,7 +411,7 @@ impl Dataset {
         &self.fingerprint
     }
 
-    /// Returns frames of motion of a phrase, `[n_frames, 25]`.
+    /// Returns frames of motion of a phrase, of a group those of its first dancer, `[n_frames, 25]`.
     ///
     /// # Errors
     /// [`StoreError`] when the frames at hand cannot be read.
@@ -347,6 +422,25 @@ impl Dataset {
         n_frames: usize,
     ) -> Result<Array2<f32>, StoreError> {
         read(&self.motion, phrase.motion_row + first as u64, [n_frames, MOTION_DIM])
+    }
+
+    /// Returns frames of motion of all dancers of a phrase, `[n_dancers, n_frames, 25]`; a soloist is a group of one.
+    ///
+    /// # Errors
+    /// [`StoreError`] when the frames at hand cannot be read.
+    pub fn group(
+        &self,
+        phrase: &Phrase,
+        first: usize,
+        n_frames: usize,
+    ) -> Result<Array3<f32>, StoreError> {
+        let mut frames = Array3::zeros((phrase.n_dancers, n_frames, MOTION_DIM));
+        for (mut of_dancer, dancer) in frames.outer_iter_mut().zip(0..) {
+            let row = phrase.motion_row + dancer * phrase.motion_frames as u64 + first as u64;
+            let target = of_dancer.as_slice_mut().expect("new arrays lie in order");
+            self.motion.read(row, target)?;
+        }
+        Ok(frames)
     }
 
     /// Returns frames of features of a phrase, `[n_frames, 163]`.
@@ -387,95 +481,4 @@ fn keep_train(phrases: &mut Vec<Phrase>, digests: &mut Vec<String>, most: usize)
     phrases.retain(|_| keep.next() == Some(&true));
     let mut keep = keeps.iter();
     digests.retain(|_| keep.next() == Some(&true));
-}
-
-/// Reads the wanted phrases of a frame table into a spool, parts side by side.
-fn gather(
-    table: &Snapshot,
-    spool: &FrameSpool,
-    wanted: &BTreeSet<String>,
-    reading: &DatasetOptions,
-    notice: &(dyn Fn(&StoreError, Duration) + Sync),
-    count: &(dyn Fn() + Sync),
-) -> Result<PhraseResults, StoreError> {
-    let next = AtomicUsize::new(0);
-    let all = Mutex::new(PhraseResults::new());
-    let failed: Mutex<Option<StoreError>> = Mutex::new(None);
-    let lock = |all: &Mutex<PhraseResults>, found: PhraseResults| {
-        all.lock().unwrap_or_else(PoisonError::into_inner).extend(found);
-    };
-    let work = || {
-        loop {
-            let i = next.fetch_add(1, Ordering::Relaxed);
-            if i >= table.parts().len() {
-                return;
-            }
-            let part = table.part(i);
-            // A part that breaks off is read again from its beginning: what it left in the spool is
-            // never looked at.
-            let outcome = reading.patience.wait_out(notice, || {
-                let mut found = PhraseResults::new();
-                part.visit_items(wanted, |id, frames| {
-                    let one = keep(id, &frames, spool)?;
-                    found.insert(id.to_owned(), one);
-                    Ok::<_, StoreError>(())
-                })?;
-                Ok(found)
-            });
-            match outcome {
-                Ok(found) => lock(&all, found),
-                Err(error) => {
-                    next.store(table.parts().len(), Ordering::Relaxed);
-                    *failed.lock().unwrap_or_else(PoisonError::into_inner) = Some(error);
-                    return;
-                }
-            }
-            count();
-        }
-    };
-    std::thread::scope(|scope| {
-        for _ in 0..reading.n_threads.get().min(table.parts().len()) {
-            scope.spawn(work);
-        }
-    });
-    match failed.into_inner().unwrap_or_else(PoisonError::into_inner) {
-        Some(error) => Err(error),
-        None => Ok(all.into_inner().unwrap_or_else(PoisonError::into_inner)),
-    }
-}
-
-/// Puts frames into the spool, unless they are not sound.
-fn keep(
-    id: &str,
-    frames: &Array2<f32>,
-    spool: &FrameSpool,
-) -> Result<Result<PhraseFrames, ExcludedPhrase>, StoreError> {
-    if let Err((kind, what)) = check(frames) {
-        let message = format!("phrase {id}: {what}");
-        return Ok(Err(ExcludedPhrase { phrase_id: id.to_owned(), kind, message }));
-    }
-    let values = frames.as_slice().expect("frames are gathered in order");
-    let bytes: Vec<u8> = values.iter().flat_map(|x| x.to_le_bytes()).collect();
-    let row = spool.append(frames.view())?;
-    Ok(Ok(PhraseFrames { row, n_frames: frames.nrows(), digest: digest(&bytes) }))
-}
-
-/// Refuses frames that are not finite; those of motion are checked as ingest does, because a table may
-/// have been written by another program.
-fn check(frames: &Array2<f32>) -> Result<(), (&'static str, String)> {
-    if frames.ncols() == MOTION_DIM {
-        let sound = |frames: &Array2<f32>| -> Result<(), TrajectoryError> {
-            Trajectory::new(frames.clone())?.check(&crate::motion::ChannelLimits::Wide)
-        };
-        return sound(frames).map_err(|e| (e.kind(), e.to_string()));
-    }
-    match frames.indexed_iter().find(|(_, x)| !x.is_finite()) {
-        None => Ok(()),
-        Some(((frame, column), value)) => {
-            let name = crate::audio::feature_names().nth(column).map(|(name, _)| name);
-            let name = name.unwrap_or_default();
-            let what = format!("feature {name} is {value} at frame {frame}; extract it again");
-            Err(("non_finite", what))
-        }
-    }
 }

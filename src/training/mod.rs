@@ -29,7 +29,7 @@ pub use config::{
     DecoderTraining, DiffusionTraining, FinetuneConfig, NetworkConfig, OptimizerConfig,
     TrainConfig, differences,
 };
-pub use dataset::{Dataset, DatasetError, DatasetOptions, ExcludedPhrase, Phrase, Split};
+pub use dataset::{Dataset, DatasetError, DatasetOptions, Ensemble, ExcludedPhrase, Phrase, Split};
 pub use decoder::DecoderLearner;
 pub use diffusion::{Baselines, DiffusionInputs, DiffusionLearner, WithholdProbabilities};
 pub use drive::{

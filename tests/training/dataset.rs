@@ -7,7 +7,9 @@ use motiongen::autodiff::Parameters;
 use motiongen::model::{DecoderConfig, MotionDecoder, ParameterList};
 use motiongen::motion::Normalizer;
 use motiongen::store::{Location, Patience, PutOutcome};
-use motiongen::training::{CheckpointKind, Checkpoints, Dataset, DatasetOptions, Split, State};
+use motiongen::training::{
+    CheckpointKind, Checkpoints, Dataset, DatasetOptions, Ensemble, Split, State,
+};
 use motiongen::weights::Section;
 use ndarray::Array2;
 
@@ -40,6 +42,7 @@ fn phrases_at_hand_are_read_back_in_order_of_name() {
 /// What is read of a store, wherever it lies.
 fn read(store: &Location, in_memory: bool) -> Dataset {
     let reading = DatasetOptions {
+        ensemble: Ensemble::Soloists,
         in_memory,
         n_threads: NonZeroUsize::new(3).expect("above 0"),
         patience: Patience::default(),

@@ -185,7 +185,26 @@ impl Take {
         percentile(&mut heights.copied().collect::<Vec<_>>(), 1.0).unwrap_or(0.0)
     }
 
-    pub fn lowpass(&mut self) {
+    /// Leaves out what comes before a time, s; times count from the first frame that is kept.
+    pub fn drop_start(&mut self, start_s: f64) {
+        // A frame at the time itself stays, whatever its rounding.
+        let n_dropped = self.times_s.partition_point(|&t| t < start_s - 1e-9);
+        let Some(&first_s) = self.times_s.get(n_dropped).filter(|_| n_dropped > 0) else { return };
+        self.times_s.drain(..n_dropped);
+        self.times_s.iter_mut().for_each(|t| *t -= first_s);
+        for signal in self.nodes.iter_mut().chain(&mut self.orientation) {
+            signal.drain(..n_dropped);
+        }
+    }
+
+    /// Filters the noise of the capture, once.
+    pub fn smooth(&mut self) {
+        if !std::mem::replace(&mut self.is_smooth, true) {
+            self.lowpass();
+        }
+    }
+
+    fn lowpass(&mut self) {
         let mut intervals: Vec<f64> = self.times_s.windows(2).map(|t| t[1] - t[0]).collect();
         let Some(interval_s) = median(&mut intervals) else { return };
         let rate_hz = 1.0 / interval_s;

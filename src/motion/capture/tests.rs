@@ -5,7 +5,7 @@ use proptest::prelude::*;
 use std::f64::consts::PI;
 
 /// A post of 1.7 m: a root with six channels at 1 m, a head above and a foot below.
-fn post(rate_hz: f64, rows: &[[f64; 6]]) -> Bvh {
+pub(super) fn post(rate_hz: f64, rows: &[[f64; 6]]) -> Bvh {
     let mut text = String::from(
         "HIERARCHY\nROOT hips\n{\nOFFSET 50 60 70\nCHANNELS 6 Xposition Yposition Zposition \
          Yrotation Xrotation Zrotation\nJOINT chest\n{\nOFFSET 0 0.3 0\n\

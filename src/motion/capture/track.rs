@@ -126,7 +126,10 @@ fn check_finite(track: &RigidTrack, n_frames: usize) -> Result<(), CaptureError>
 }
 
 /// The axis that is up by the format, held against how the body is carried over the take.
-fn up_of(track: &RigidTrack, notes: &mut Vec<CaptureNote>) -> Result<Axis, CaptureError> {
+pub(super) fn up_of(
+    track: &RigidTrack,
+    notes: &mut Vec<CaptureNote>,
+) -> Result<Axis, CaptureError> {
     let n = track.orientation.len().max(1) as f64;
     let mut mean = [0.0; 3];
     for &q in &track.orientation {

@@ -5,9 +5,11 @@
 
 pub mod humanml3d;
 mod keys;
+pub mod rigid;
 pub mod smpl;
 pub mod vmd;
 
 pub use humanml3d::HumanMl3dError;
+pub use rigid::RigidError;
 pub use smpl::SmplError;
 pub use vmd::VmdError;

@@ -78,11 +78,16 @@ impl Evaluand {
 
     fn of_run(snapshot: StoreSnapshot, run: &str, most: Option<usize>) -> anyhow::Result<Self> {
         let store = snapshot.store();
-        let generations = motions::of_run(&snapshot, run, most)?;
+        let (generations, n_groups) = motions::of_run(&snapshot, run, most)?;
         let phrases =
             PhraseIndex::read(&snapshot, generations.iter().map(|row| row.phrase_id.as_str()))?;
         refuse_outdated(&snapshot, run, &phrases, &generations)?;
-        let (splits, notes) = splits_of(store, &phrases, &generations)?;
+        let (splits, mut notes) = splits_of(store, &phrases, &generations)?;
+        if n_groups > 0 {
+            notes.push(format!(
+                "{n_groups} motions of groups of dancers are left out; what is measured is a soloist's."
+            ));
+        }
         let motions = generations
             .iter()
             .zip(splits)

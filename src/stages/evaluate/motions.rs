@@ -21,8 +21,8 @@ use crate::store::{Row as _, StoreError, StoreSnapshot, digest};
 use crate::training::Split;
 use crate::units::{FPS, frames_to_s};
 
-/// Returns the motions of a run that were kept, in order of name, at most `n`: those whose names have the
-/// smallest digests, which is no order that phrases have.
+/// Returns the motions of soloists of a run that were kept, in order of name, at most `n`: those whose names have
+/// the smallest digests, which is no order that phrases have; and how many of groups are left out.
 ///
 /// # Errors
 /// [`StoreError`], or one sentence where there are none.
@@ -30,7 +30,7 @@ pub fn of_run(
     snapshot: &StoreSnapshot,
     run: &str,
     n: Option<usize>,
-) -> anyhow::Result<Vec<GenerationRow>> {
+) -> anyhow::Result<(Vec<GenerationRow>, usize)> {
     let store = snapshot.store();
     let mut runs = BTreeSet::new();
     let table = snapshot.table(GenerationRow::schema())?;
@@ -50,12 +50,21 @@ pub fn of_run(
         let nearest = nearest(run, runs);
         bail!("store {store} has no generated motion of run \"{run}\"; nearest: {nearest}");
     }
+    let n_kept = rows.len();
+    rows.retain(|row| row.count_dancers() == 1);
+    let n_groups = n_kept - rows.len();
+    if rows.is_empty() {
+        bail!(
+            "store {store}: run \"{run}\" has {n_groups} motions, all of groups of dancers; evaluate measures \
+             soloists"
+        );
+    }
     if let Some(n) = n.filter(|n| *n < rows.len()) {
         rows.sort_by_cached_key(|row| digest(row.generation.as_bytes()));
         rows.truncate(n);
     }
     rows.sort_by(|a, b| a.generation.cmp(&b.generation));
-    Ok(rows)
+    Ok((rows, n_groups))
 }
 
 /// Whether generate made motions of a run's name.
@@ -228,7 +237,8 @@ impl PhraseIndex {
 }
 
 fn has_truth(row: &PhraseRow) -> bool {
-    row.has_motion && (row.has_features || row.has_audio)
+    // Groups are no measure of a soloist.
+    row.count_dancers() == 1 && (row.has_features || row.has_audio)
 }
 
 /// Returns the identity of a phrase's song: the digest of its music, or its file where that is not known.

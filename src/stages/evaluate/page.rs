@@ -45,7 +45,7 @@ impl OtherRun {
         let made = StoreSnapshot::take(store)
             .ok()
             .and_then(|snapshot| motions::of_run(&snapshot, run, Some(1)).ok())
-            .and_then(|mut rows| rows.pop());
+            .and_then(|(mut rows, _)| rows.pop());
         Ok(Self { run: run.to_owned(), metrics, songs, made })
     }
 }

@@ -46,7 +46,20 @@ pub fn read(
     progress: &dyn Progress,
 ) -> anyhow::Result<Option<Truth>> {
     let dataset = match dataset_of(snapshot, threads) {
-        Ok(dataset) => dataset,
+        Ok((dataset, left_out)) => {
+            let n_groups = left_out.iter().filter(|one| one.is_for_other_models()).count();
+            if n_groups > 0 {
+                progress.note(&format!(
+                    "{n_groups} phrases of groups of dancers are left out of real motion: soloists are compared \
+                     with soloists"
+                ));
+            }
+            dataset
+        }
+        Err(e @ DatasetError::GroupsAlone { .. }) => {
+            progress.note(&format!("{e}, so that there is no real motion to compare with"));
+            return Ok(None);
+        }
         Err(DatasetError::Empty { .. }) => {
             progress.note(
                 "the store has no phrases with motion and features, so that there is no real motion to \

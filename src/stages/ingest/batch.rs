@@ -242,7 +242,12 @@ impl IngestJob<'_> {
             Ok(_) if unchanged => tally.n_unchanged += 1,
             Ok(phrase) => {
                 tally.n_done += 1;
-                tally.n_frames += phrase.motion.as_ref().map_or(0, |m| m.n_frames() as u64);
+                let (n_dancers, n_frames) = phrase
+                    .motion
+                    .as_ref()
+                    .map_or((0, 0), |dancers| (dancers.n_dancers(), dancers.n_frames()));
+                tally.n_frames += (n_dancers * n_frames) as u64;
+                tally.n_groups += u64::from(n_dancers > 1);
                 tally.duration_s += phrase.duration_s();
                 let notes = phrase.capture.as_ref().and_then(notes_of);
                 tally.noted.extend(notes.map(|notes| (id.clone(), notes)));
@@ -262,7 +267,7 @@ impl IngestJob<'_> {
         }
         if let Ok(CheckedPhrase { motion: Some(motion), .. }) = &outcome {
             let part = commit.part(tables::MOTION, tables::motion)?;
-            part.write_frames(&id, motion.view())?;
+            part.write_group(&id, motion.to_array().view())?;
         }
         match outcome {
             Ok(phrase) => {
@@ -323,7 +328,11 @@ impl IngestJob<'_> {
         let location = self.source.location();
         let file = |name: &str| planned.files.iter().find(|(role, _)| role.name() == name);
         let url = |name| file(name).map(|(_, f)| location.url_of(&f.path));
-        let bytes = |name| file(name).map(|(_, f)| f.size_bytes as i64);
+        // A group may have a file for each dancer.
+        let bytes = |name| {
+            let of_role = planned.files.iter().filter(|(role, _)| role.name() == name);
+            file(name).map(|_| of_role.map(|(_, f)| f.size_bytes as i64).sum::<i64>())
+        };
         let duration_s = phrase.duration_s();
         let tempo = phrase.tempo;
         let capture = phrase.capture.as_ref();
@@ -363,7 +372,7 @@ impl IngestJob<'_> {
             tempo_source: tempo.map(|t| t.source.to_owned()),
             beats_per_bar: beats_per_bar.map(|(n, _)| n as i32),
             beats_per_bar_source: beats_per_bar.map(|(_, source)| source.to_owned()),
-            n_dancers: phrase.motion.is_some().then_some(1),
+            n_dancers: phrase.motion.as_ref().map(|dancers| dancers.n_dancers() as i32),
             formation: None,
             unison: None,
             style_name: None,
@@ -411,7 +420,10 @@ fn version_lines(planned: &PlannedPhrase) -> String {
     if has(Role::Beats) {
         lines += &format!("beats version {BEATS_VERSION}\n");
     }
-    if has(Role::MotionCapture) {
+    let is_capture = |(role, file): &(Role, SourceFile)| {
+        matches!(role, Role::Dancer(_)) && file.path.ends_with(".bvh")
+    };
+    if has(Role::MotionCapture) || planned.files.iter().any(is_capture) {
         lines += &format!("capture version {CAPTURE_VERSION}\n");
     }
     lines

@@ -6,12 +6,17 @@ mod tests;
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::audio::formats::is_audio_extension as is_audio;
+use crate::motion::MAX_DANCERS;
 use crate::store::{Listing, SourceFile, SourceProblem, SourceProblemKind};
 
 use super::motion::CAPTURE_EXTENSIONS;
 use crate::stages::failure::{Failure, FailureKind};
 
 const BEATS_SUFFIX: &str = ".beats.txt";
+/// How the files of a group's dancers are called, before their number.
+const DANCER_PREFIX: &str = "dancer_";
+/// Endings of such names.
+const DANCER_EXTENSIONS: [&str; 2] = ["npy", "bvh"];
 
 /// How a source is organised.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -19,8 +24,8 @@ pub enum Layout {
     /// Phrases if the source has `motion/` or `audio_features/`, or nothing but `audio/` and
     /// `beats/`; else a music library.
     Auto,
-    /// `motion/ID/trajectory.npy` or `motion.bvh` (or `.npz`, `.npy`, `.vmd`), `audio_features/ID/features.npz`,
-    /// `audio/ID.wav`, `beats/ID.beats.txt`.
+    /// `motion/ID/trajectory.npy` or `motion.bvh` (or `.npz`, `.npy`, `.vmd`), of a group also `dancer_0.npy` (or
+    /// `.bvh`), `dancer_1.npy` and so on; `audio_features/ID/features.npz`, `audio/ID.wav`, `beats/ID.beats.txt`.
     Phrases,
     /// Any tree of audio files; a phrase's id is its relative path, extension included.
     Library,
@@ -34,6 +39,8 @@ pub enum Role {
     Features,
     MotionCapture,
     MotionNpy,
+    /// Motion of one dancer of a group, by number.
+    Dancer(u32),
 }
 
 impl Role {
@@ -43,7 +50,7 @@ impl Role {
             Role::Audio => "audio",
             Role::Beats => "beats",
             Role::Features => "features",
-            Role::MotionCapture | Role::MotionNpy => "motion",
+            Role::MotionCapture | Role::MotionNpy | Role::Dancer(_) => "motion",
         }
     }
 }
@@ -188,8 +195,14 @@ fn phrase_slot(path: &str) -> Option<(&str, Role)> {
     let slot = match top {
         "motion" => in_folder("trajectory.npy").map(|id| (id, Role::MotionNpy)).or_else(|| {
             let (stem, ending) = rest.rsplit_once('.')?;
-            let id = stem.strip_suffix("/motion")?;
-            CAPTURE_EXTENSIONS.contains(&ending).then_some((id, Role::MotionCapture))
+            if let Some(id) = stem.strip_suffix("/motion") {
+                return CAPTURE_EXTENSIONS.contains(&ending).then_some((id, Role::MotionCapture));
+            }
+            let (id, name) = stem.rsplit_once('/')?;
+            let number = name.strip_prefix(DANCER_PREFIX)?;
+            let is_number = number.bytes().all(|digit| digit.is_ascii_digit());
+            let number = number.parse().ok().filter(|_| is_number)?;
+            DANCER_EXTENSIONS.contains(&ending).then_some((id, Role::Dancer(number)))
         }),
         "audio_features" => in_folder("features.npz").map(|id| (id, Role::Features)),
         "beats" => Some((rest.strip_suffix(BEATS_SUFFIX)?, Role::Beats)),
@@ -329,7 +342,9 @@ impl Drafts {
 fn conflict(phrase: &PlannedPhrase) -> Option<Failure> {
     for pair in phrase.files.windows(2) {
         let [(a_role, a), (b_role, b)] = pair else { continue };
-        if a_role.name() == b_role.name() {
+        let are_two_dancers =
+            matches!((a_role, b_role), (Role::Dancer(a), Role::Dancer(b)) if a != b);
+        if a_role.name() == b_role.name() && !are_two_dancers {
             let message = format!(
                 "{} comes twice, from {} and {}; keep one of them",
                 a_role.name(),
@@ -339,6 +354,9 @@ fn conflict(phrase: &PlannedPhrase) -> Option<Failure> {
             return Some(Failure::new(FailureKind::DuplicateId, &b.path, message));
         }
     }
+    if let Some(failure) = missing_dancer(phrase) {
+        return Some(failure);
+    }
     if let [(Role::Beats, beats)] = phrase.files.as_slice() {
         let message = format!(
             "{} stands alone, without audio, motion or features; add one of them or remove it",
@@ -347,6 +365,33 @@ fn conflict(phrase: &PlannedPhrase) -> Option<Failure> {
         return Some(Failure::new(FailureKind::Layout, &beats.path, message));
     }
     None
+}
+
+/// Returns why the files of a group are not those of the dancers 0, 1, 2 and so on.
+fn missing_dancer(phrase: &PlannedPhrase) -> Option<Failure> {
+    let dancers = phrase.files.iter().filter_map(|(role, file)| match role {
+        Role::Dancer(number) => Some((*number as usize, file)),
+        _ => None,
+    });
+    let dancers: Vec<(usize, &SourceFile)> = dancers.collect();
+    let (_, last) = dancers.last()?;
+    let folder = parent(&last.path).unwrap_or(&last.path);
+    let refused = |message: String| Some(Failure::new(FailureKind::Layout, folder, message));
+    if dancers.len() > MAX_DANCERS {
+        return refused(group_too_large(folder, dancers.len()));
+    }
+    let missing = (0..dancers.len()).find(|&i| dancers[i].0 != i)?;
+    refused(format!(
+        "folder {folder} has {}, but no {DANCER_PREFIX}{missing}; number the dancers of a group 0, 1, 2 and so on",
+        last.path.rsplit('/').next().unwrap_or(&last.path)
+    ))
+}
+
+/// Says that a group has more dancers than one may have.
+pub(super) fn group_too_large(place: &str, n_dancers: usize) -> String {
+    format!(
+        "{place} has {n_dancers} dancers, more than the {MAX_DANCERS} of a group; split it into several phrases"
+    )
 }
 
 fn not_a_file(folder: &str) -> Failure {

@@ -22,7 +22,7 @@ use super::seen::SeenContent;
 pub(in crate::stages) use crate::audio::formats::is_audio_extension as is_audio;
 pub use layout::{IngestPlan, Layout, PlannedPhrase, Role, plan};
 pub(in crate::stages) use motion::{
-    CAPTURE_EXTENSIONS, ReadMotion, notes_of, read_bvh, read_motion, read_trajectory,
+    CAPTURE_EXTENSIONS, ReadMotion, notes_of, read_bvh, read_dancers, read_motion, read_trajectory,
 };
 pub(in crate::stages) use phrase::read_beats;
 pub use phrase::{IngestRules, content_hash_of_audio};
@@ -247,6 +247,8 @@ struct IngestTally {
     n_done: u64,
     n_unchanged: u64,
     n_frames: u64,
+    /// Phrases with several dancers.
+    n_groups: u64,
     duration_s: f64,
     failed: Vec<FailedPhrase>,
     /// Whether batches are left because the user asked for an end.
@@ -267,6 +269,7 @@ impl IngestTally {
         self.n_done += other.n_done;
         self.n_unchanged += other.n_unchanged;
         self.n_frames += other.n_frames;
+        self.n_groups += other.n_groups;
         self.duration_s += other.duration_s;
         self.failed.extend(other.failed);
         self.is_stopped |= other.is_stopped;
@@ -298,9 +301,14 @@ impl Summary for IngestSummary {
         } else if *n_todo == 0 {
             writeln!(out, "  nothing to do: {} phrases are up to date", tally.n_unchanged)?;
         } else {
+            let groups = match tally.n_groups {
+                0 => String::new(),
+                1 => ", 1 group of dancers".to_owned(),
+                n => format!(", {n} groups of dancers"),
+            };
             writeln!(
                 out,
-                "  {} ingested ({:.1} s of music or motion, {} motion frames), {} up to date, \
+                "  {} ingested ({:.1} s of music or motion, {} motion frames{groups}), {} up to date, \
                  {n_failed} failed; {took_s:.1} s, {:.0} phrases/s",
                 tally.n_done,
                 tally.duration_s,
@@ -346,6 +354,7 @@ impl Summary for IngestSummary {
             "n_done": tally.n_done,
             "n_unchanged": tally.n_unchanged,
             "n_frames": tally.n_frames,
+            "n_groups": tally.n_groups,
             "duration_s": tally.duration_s,
             "n_ignored": self.ignored.len(),
             "failures": failures_json(tally.failed.iter().map(|one| (&one.id, &one.failure))),

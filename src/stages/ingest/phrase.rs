@@ -3,10 +3,10 @@
 use std::io::{Read as _, Seek as _};
 
 use super::layout::Role;
-use super::motion::{read_motion, read_trajectory};
+use super::motion::{ReadMotion, read_dancers, read_group, read_motion};
 use crate::audio::header::{AudioHeader, AudioHeaderError, read_header, read_header_from};
 use crate::motion::text::text_of;
-use crate::motion::{Axis, Beats, BeatsPerBarSource, CaptureAccount, ChannelLimits, Trajectory};
+use crate::motion::{Axis, Beats, BeatsPerBarSource, CaptureAccount, ChannelLimits, Dancers};
 use crate::stages::beats::{self, BeatSource};
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::feature_file::read_features;
@@ -39,7 +39,7 @@ pub struct CheckedPhrase {
     pub content_hash: String,
     /// Digest of the audio file, without audio of the feature file.
     pub song_hash: Option<String>,
-    pub motion: Option<Trajectory>,
+    pub motion: Option<Dancers>,
     pub motion_format: Option<&'static str>,
     /// Of a motion capture, what was found out about it.
     pub capture: Option<CaptureAccount>,
@@ -62,14 +62,32 @@ pub struct Tempo {
 impl CheckedPhrase {
     /// Returns the length of the audio, else of the motion or the features.
     pub fn duration_s(&self) -> f64 {
-        let n_frames = self.motion.as_ref().map(Trajectory::n_frames).or(self.n_feature_frames);
+        let n_frames = self.motion.as_ref().map(Dancers::n_frames).or(self.n_feature_frames);
         self.audio.as_ref().map_or_else(|| frames_to_s(n_frames.unwrap_or(0)), |a| a.duration_s)
     }
 
     /// Returns the frames of the motion, else of the features or of those that the audio will have.
     pub fn n_frames(&self) -> usize {
-        let n_frames = self.motion.as_ref().map(Trajectory::n_frames).or(self.n_feature_frames);
+        let n_frames = self.motion.as_ref().map(Dancers::n_frames).or(self.n_feature_frames);
         n_frames.unwrap_or_else(|| s_to_frames(self.duration_s()).floor() as usize + 1)
+    }
+
+    /// Takes the motion that was read at a place, if it keeps the rules.
+    fn take_motion(
+        &mut self,
+        place: &str,
+        read: ReadMotion,
+        rules: &IngestRules,
+    ) -> Result<(), Failure> {
+        let checked = match read.dancers.trajectories() {
+            [soloist] => soloist.check(&rules.limits).map_err(|e| Failure::of(place, e.kind(), &e)),
+            _ => read.dancers.check(&rules.limits).map_err(|e| Failure::of(place, e.kind(), &e)),
+        };
+        checked?;
+        self.motion = Some(read.dancers);
+        self.motion_format = Some(read.format);
+        self.capture = read.account;
+        Ok(())
     }
 }
 
@@ -103,7 +121,7 @@ impl PhraseFiles {
             match role {
                 Role::Audio => of_audio = Some(hash),
                 Role::Features => of_features = Some(hash),
-                Role::Beats | Role::MotionNpy | Role::MotionCapture => {}
+                Role::Beats | Role::MotionNpy | Role::MotionCapture | Role::Dancer(_) => {}
             }
             taken.push((role, file, content));
         }
@@ -133,6 +151,7 @@ impl PhraseFiles {
             has_beats: false,
         };
         let mut motion_path = String::new();
+        let mut of_dancers: Vec<(String, bytes::Bytes)> = Vec::new();
         // Roles are sorted, so beats are known before the motion whose phase needs them.
         for (role, file, content) in self.files {
             let path = file.path.as_str();
@@ -154,21 +173,26 @@ impl PhraseFiles {
                     // A beat list beside the audio was written by somebody; a tracker's was not.
                     phrase.tempo = phrase.tempo.or(features.tempo_bpm.map(tempo));
                 }
-                Role::MotionNpy | Role::MotionCapture => {
-                    let bytes = bytes_of(&file, content)?;
-                    let (format, motion) = if role == Role::MotionNpy {
-                        ("npy", read_trajectory(path, &bytes)?)
-                    } else {
-                        let read = read_motion(path, &bytes, phrase.beats.as_ref(), rules.up)?;
-                        phrase.capture = read.account;
-                        (read.format, read.trajectory)
-                    };
-                    motion.check(&rules.limits).map_err(|e| Failure::of(path, e.kind(), &e))?;
-                    phrase.motion = Some(motion);
-                    phrase.motion_format = Some(format);
+                Role::MotionNpy => {
+                    let dancers = read_dancers(path, &bytes_of(&file, content)?)?;
+                    let read = ReadMotion { dancers, format: "npy", account: None };
+                    phrase.take_motion(path, read, rules)?;
                     path.clone_into(&mut motion_path);
                 }
+                Role::MotionCapture => {
+                    let bytes = bytes_of(&file, content)?;
+                    let read = read_motion(path, &bytes, phrase.beats.as_ref(), rules.up)?;
+                    phrase.take_motion(path, read, rules)?;
+                    path.clone_into(&mut motion_path);
+                }
+                Role::Dancer(_) => of_dancers.push((path.to_owned(), bytes_of(&file, content)?)),
             }
+        }
+        if let Some((first, _)) = of_dancers.first() {
+            let folder = first.rsplit_once('/').map_or(first.as_str(), |(folder, _)| folder);
+            let read = read_group(&of_dancers, phrase.beats.as_ref(), rules.up)?;
+            phrase.take_motion(folder, read, rules)?;
+            folder.clone_into(&mut motion_path);
         }
         check_lengths(&phrase, rules, &motion_path)?;
         Ok(phrase)

@@ -4,11 +4,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::io::Read as _;
 
 use anyhow::bail;
-use ndarray::{Array3, ArrayView3};
+use ndarray::Array3;
 
 use super::StoreContents;
 use crate::motion::choreography::{PrimitiveError, Repertoire};
-use crate::motion::{Axis, ChannelLimits, Trajectory};
+use crate::motion::{Axis, ChannelLimits, Dancers, Trajectory};
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::ingest::{CAPTURE_EXTENSIONS, ReadMotion, notes_of, read_motion};
 use crate::store::{
@@ -133,15 +133,19 @@ impl Captures {
                         place.store()
                     );
                 }
-                let mut groups: BTreeMap<String, Array3<f32>> = BTreeMap::new();
+                let mut frames: BTreeMap<String, Array3<f32>> = BTreeMap::new();
                 let wanted = ids.keys().cloned().collect();
                 place.table(tables::motion())?.visit_groups(&wanted, |id, found| {
-                    groups.insert(id.to_owned(), found);
+                    frames.insert(id.to_owned(), found);
                     Ok::<_, StoreError>(())
                 })?;
                 let mut reading = CaptureReading::default();
-                for (id, group) in groups {
-                    let added = guarded(&id, || reading.add_group(&id, group.view()));
+                for (id, frames) in frames {
+                    let added = guarded(&id, || {
+                        let dancers = Dancers::of_frames(frames);
+                        let dancers = dancers.map_err(|e| Failure::of(&id, e.kind(), &e))?;
+                        reading.add_all(&id, dancers)
+                    });
                     reading.settle(&id, &place.store().url_of(&id), added);
                 }
                 Ok(reading.finish(self.fingerprint))
@@ -162,8 +166,8 @@ impl Captures {
                     let added = bytes_of(file, content).and_then(|bytes| {
                         hashes += &format!("{} {path}\n", digest(&bytes));
                         guarded(path, || {
-                            let (motion, notes) = read(path, &bytes, up)?;
-                            reading.add(path, motion)?;
+                            let (dancers, notes) = read(path, &bytes, up)?;
+                            reading.add_all(path, dancers)?;
                             reading.noted.extend(notes.map(|notes| (path.to_owned(), notes)));
                             Ok(())
                         })
@@ -188,6 +192,16 @@ struct CaptureReading {
 }
 
 impl CaptureReading {
+    /// Adds the motion of a capture; of a group that of each dancer, whose steps are as good as a soloist's.
+    fn add_all(&mut self, path: &str, dancers: Dancers) -> Result<(), Failure> {
+        let is_group = dancers.n_dancers() > 1;
+        for (dancer, motion) in dancers.into_trajectories().into_iter().enumerate() {
+            let of_dancer = format!("{path}, dancer {dancer}");
+            self.add(if is_group { &of_dancer } else { path }, motion)?;
+        }
+        Ok(())
+    }
+
     fn add(&mut self, path: &str, motion: Trajectory) -> Result<(), Failure> {
         motion.check(&ChannelLimits::Wide).map_err(|e| Failure::of(path, e.kind(), &e))?;
         let refused = |e: PrimitiveError| {
@@ -198,24 +212,6 @@ impl CaptureReading {
             Failure::new(kind, path, format!("{path}: {e}"))
         };
         self.repertoire.add(&motion).map(|_| ()).map_err(refused)
-    }
-
-    /// Adds every dancer of a group, `[N, T, 25]`, as a capture of its own.
-    ///
-    /// # Errors
-    /// The first failure, where no dancer can be added.
-    fn add_group(&mut self, path: &str, group: ArrayView3<'_, f32>) -> Result<(), Failure> {
-        let mut first = None;
-        let mut n_added = 0;
-        for dancer in group.outer_iter() {
-            let motion = Trajectory::new(dancer.to_owned());
-            let added = motion.map_err(|e| Failure::of(path, e.kind(), &e));
-            match added.and_then(|motion| self.add(path, motion)) {
-                Ok(()) => n_added += 1,
-                Err(failure) => first = first.or(Some(failure)),
-            }
-        }
-        first.filter(|_| n_added == 0).map_or(Ok(()), Err)
     }
 
     fn settle(&mut self, name: &str, url: &str, added: Result<(), Failure>) {
@@ -266,11 +262,7 @@ fn is_npy(path: &str) -> bool {
 }
 
 /// Reads a motion, and what a reader should know of it.
-fn read(
-    path: &str,
-    bytes: &[u8],
-    up: Option<Axis>,
-) -> Result<(Trajectory, Option<String>), Failure> {
-    let ReadMotion { trajectory, account, .. } = read_motion(path, bytes, None, up)?;
-    Ok((trajectory, account.as_ref().and_then(notes_of)))
+fn read(path: &str, bytes: &[u8], up: Option<Axis>) -> Result<(Dancers, Option<String>), Failure> {
+    let ReadMotion { dancers, account, .. } = read_motion(path, bytes, None, up)?;
+    Ok((dancers, account.as_ref().and_then(notes_of)))
 }

@@ -106,7 +106,7 @@ impl Summary for TrainSummary {
     }
 
     fn n_failed(&self) -> u64 {
-        self.left_out.len() as u64
+        self.left_out.iter().filter(|one| !one.is_for_other_models()).count() as u64
     }
 
     fn is_stopped(&self) -> bool {

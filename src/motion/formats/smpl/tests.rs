@@ -108,7 +108,7 @@ fn what_is_no_motion_of_smpl_is_refused_with_both_values() {
     assert_eq!(
         refusal(std::slice::from_ref(&pose)),
         (
-            "npz has no translation: it holds poses, expected smpl_trans, trans or transl; save them with \
+            "npz has no translation: it holds poses, expected smpl_trans, trans, transl or root_trans; save them with \
              numpy.savez(path, poses=…, trans=…, mocap_framerate=…)"
                 .to_owned(),
             "missing_key"

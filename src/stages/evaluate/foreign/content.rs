@@ -15,8 +15,9 @@ use crate::store::{NumberColumnsError, number_columns};
 
 /// Numbers of a pose: position x, y, z and quaternion w, x, y, z.
 const POSE_DIM: usize = 7;
-/// The column that counts frames in tables.
+/// The columns that count frames and dancers in tables.
 const FRAME: &str = "frame";
+const DANCER: &str = "dancer";
 
 /// How motion is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -131,10 +132,16 @@ fn of_parquet(place: &str, bytes: Vec<u8>) -> Result<(Array2<f32>, FileContent),
     let refused = |reason: &dyn std::fmt::Display| {
         Failure::new(FailureKind::ParquetFormat, place, format!("{place}: {reason}"))
     };
-    let mut wanted = vec![FRAME];
+    let mut wanted = vec![FRAME, DANCER];
     wanted.extend(CHANNEL_NAMES);
     let columns =
         number_columns(bytes.into(), &wanted).map_err(|e: NumberColumnsError| refused(&e))?;
+    if let Some(other) = columns.get(DANCER).and_then(|d| d.iter().find(|&&x| x != d[0])) {
+        return Err(refused(&format!(
+            "has frames of dancer {other} behind those of dancer {}; write the motion of one dancer into a file",
+            columns[DANCER][0]
+        )));
+    }
     if let Some(frame) = columns.get(FRAME) {
         let first = frame.first().copied().unwrap_or(0.0);
         let wrong = frame.iter().zip(0..).find(|&(&x, t)| x != first + f64::from(t));
