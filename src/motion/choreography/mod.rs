@@ -35,7 +35,7 @@ pub use beat_grid::{Beat, BeatGrid};
 pub use floor::Turn;
 pub use group::{
     Formation, GROUP_SIZES, GroupDance, GroupPhrase, GroupRules, Unison, choreograph_group,
-    group_phrase,
+    draw_group_size, group_phrase,
 };
 pub use primitive::{Primitive, PrimitiveError, Repertoire};
 pub use selection::DanceStep;

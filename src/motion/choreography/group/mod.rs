@@ -42,9 +42,16 @@ use voice::Voice;
 pub const GROUP_SIZES: RangeInclusive<usize> = 1..=MAX_DANCERS;
 /// Half the time in which a dancer goes over from one part to the next, about a border of spans, s.
 const HALF_CHANGE_S: f64 = 0.5;
-/// Stream of chance of the plan, and that of the first voice but one.
+/// Streams of chance: of the plan, of the number of dancers, and of the first voice but one.
 const PLAN_STREAM: u64 = 2;
+const SIZE_STREAM: u64 = 3;
 const VOICES_STREAM: u64 = 16;
+
+/// Returns a number of dancers of a range, each equally likely; the same seed gives the same.
+pub fn draw_group_size(sizes: RangeInclusive<usize>, seed: u64) -> usize {
+    let n = (sizes.end() + 1).saturating_sub(*sizes.start());
+    sizes.start() + Chance::new(seed, SIZE_STREAM).below(n)
+}
 
 /// What is asked of a group's dance beside the song.
 #[derive(Clone, Copy, Debug, PartialEq)]

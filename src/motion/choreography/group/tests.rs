@@ -306,6 +306,16 @@ fn phrases_lie_about_the_origin_and_tell_their_kinds() {
 }
 
 #[test]
+fn every_size_of_a_range_is_drawn_alike() {
+    let mut counts = [0_usize; 4];
+    (0..2000).for_each(|seed| counts[draw_group_size(2..=5, seed) - 2] += 1);
+    // Three standard deviations: 3 √(2000 · 0.25 · 0.75) = 58.
+    assert!(counts.iter().all(|n| n.abs_diff(500) <= 58), "{counts:?}");
+    assert_eq!(draw_group_size(2..=16, 7), draw_group_size(2..=16, 7));
+    assert_eq!(draw_group_size(3..=3, 1), 3);
+}
+
+#[test]
 fn a_dance_depends_on_its_rules_alone() {
     let (music, repertoire) = (Music::new(110.0, 4, 30.0), repertoire());
     let song = music.song();
