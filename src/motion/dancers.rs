@@ -4,10 +4,8 @@ use ndarray::{Array3, Axis};
 use thiserror::Error;
 
 use super::channels::MOTION_DIM;
+use super::group::MAX_DANCERS;
 use super::trajectory::{ChannelLimits, Trajectory, TrajectoryError};
-
-/// Most dancers of a group.
-pub const MAX_DANCERS: usize = 16;
 
 /// Frames by which the dancers of a group may differ in length; what is longer is cut.
 const LENGTH_TOLERANCE_FRAMES: usize = 1;

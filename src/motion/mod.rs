@@ -49,7 +49,7 @@ pub use capture::{
 };
 pub use channels::{CHANNEL_NAMES, Channel, MOTION_DIM, channel_unit};
 pub use clock::{CLOCK_DIM, CLOCK_NAMES, clock};
-pub use dancers::{Dancers, DancersError, MAX_DANCERS};
+pub use dancers::{Dancers, DancersError};
 pub use kinematics::Poses;
 pub use normalizer::Normalizer;
 pub use phase::{Beats, BeatsError, BeatsPerBarSource, bar_phase};

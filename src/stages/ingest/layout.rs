@@ -6,7 +6,7 @@ mod tests;
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::audio::formats::is_audio_extension as is_audio;
-use crate::motion::MAX_DANCERS;
+use crate::motion::group::MAX_DANCERS;
 use crate::store::{Listing, SourceFile, SourceProblem, SourceProblemKind};
 
 use super::motion::CAPTURE_EXTENSIONS;
