@@ -6,7 +6,7 @@
 use thiserror::Error;
 
 use super::super::capture::RigidTrack;
-use super::super::dancers::MAX_DANCERS;
+use super::super::group::MAX_DANCERS;
 use super::super::npy::NpyArray;
 use super::super::npz::{Npz, NpzError};
 use super::super::quaternion::from_rotation_vector;
