@@ -289,6 +289,10 @@ fn what_is_no_card_of_a_group_is_refused() {
         refusal("\"family\": \"group\"", "\"family\": \"tokens\""),
         "card: is a model of the family tokens, and one of the family group is needed"
     );
+    assert!(
+        refusal("\"n_steps\": 1000", "\"n_steps\": 30000000")
+            .contains("make a table of 1440000000 values")
+    );
     assert_eq!(
         refusal("\"width\": 48", "\"width\": 4800000"),
         "card: width is 4800000; it must be at most 16384"

@@ -29,8 +29,13 @@ mod units;
 #[allow(dead_code, unused_imports, reason = "this target reaches a part of the modules")]
 mod generation {
     mod card;
+    mod group {
+        mod card;
+        pub use card::*;
+    }
     mod learned;
     pub use card::*;
+    pub use group::GroupCard;
     pub use learned::*;
 }
 #[path = "../../src/onnx"]
@@ -46,6 +51,9 @@ use generation::ModelCard;
 const SOUND: &str = include_str!("../../models/pretrained/model.json");
 
 fn check(bytes: &[u8]) {
+    if let Ok(card) = generation::GroupCard::read(bytes, "m") {
+        let _ = model::GroupNetworks::new(&card.group);
+    }
     match ModelCard::read(bytes, "m") {
         Ok(card) => {
             assert!(card.files.len() <= generation::ModelFileName::ALL.len());

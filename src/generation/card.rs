@@ -20,7 +20,7 @@ pub const MODEL_FORMAT: u32 = 1;
 /// Largest card that is read, in bytes: the digests of ten million songs and phrases.
 pub const MAX_CARD_BYTES: u64 = 256 << 20;
 /// Parameters that a network may have, 8 GiB in f32.
-const MAX_PARAMETERS: usize = 1 << 31;
+pub(super) const MAX_PARAMETERS: usize = 1 << 31;
 /// Bytes of a file beside eight for each parameter and each value of the table of steps.
 const MAX_GRAPH_BYTES: u64 = 64 << 20;
 /// Longest window, in frames: over half an hour.

@@ -13,7 +13,7 @@ use std::sync::Arc;
 use ndarray::Array2;
 
 pub use config::{ConfigError, Preset, UNetConfig};
-pub(super) use config::{MAX_BLOCKS, MAX_WIDTH};
+pub(super) use config::{MAX_BLOCKS, MAX_TABLE_VALUES, MAX_WIDTH};
 
 use super::graph::{Activation, Graph, Result};
 use super::layers::{AttentionBlock, Conv1d, GroupNorm, Linear, ResBlock};

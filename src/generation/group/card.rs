@@ -5,8 +5,9 @@ use serde::{Deserialize, Serialize};
 use crate::audio::{FEATURE_DIM, FeatureScale};
 use crate::diffusion::DiffusionConfig;
 use crate::generation::card::{
-    CardError, FileEntry, Head, MAX_WINDOW_FRAMES, MODEL_FORMAT, ModelFileName, SamplingDefaults,
-    check_file_list, check_layout, check_scales, is_name, most_bytes, name_problem,
+    CardError, FileEntry, Head, MAX_PARAMETERS, MAX_WINDOW_FRAMES, MODEL_FORMAT, ModelFileName,
+    SamplingDefaults, check_file_list, check_layout, check_scales, is_name, most_bytes,
+    name_problem,
 };
 use crate::generation::learned::LearnedFrom;
 use crate::model::{Family, GroupConfig, GroupNetworks};
@@ -95,6 +96,7 @@ impl GroupCard {
         Ok(card)
     }
 
+    /// Refuses networks that do not fit this program, or any memory.
     fn check_networks(&self) -> Result<(), String> {
         let Self { group, diffusion, .. } = self;
         group.check().map_err(|e| e.to_string())?;
@@ -109,6 +111,12 @@ impl GroupCard {
                     "{name} is {found}, expected {expected}; export the model again"
                 ));
             }
+        }
+        let n = GroupNetworks::new(group).1.n_elements();
+        if n > MAX_PARAMETERS {
+            return Err(format!(
+                "the networks have {n} parameters, at most {MAX_PARAMETERS} are read; export the model again"
+            ));
         }
         Ok(())
     }

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::audio::FEATURE_DIM;
 use crate::model::condition::ConditionConfig;
-use crate::model::unet::{ConfigError, MAX_BLOCKS, MAX_WIDTH, Preset};
+use crate::model::unet::{ConfigError, MAX_BLOCKS, MAX_TABLE_VALUES, MAX_WIDTH, Preset};
 use crate::motion::MOTION_DIM;
 use crate::motion::group::MAX_DANCERS;
 
@@ -96,7 +96,7 @@ impl GroupConfig {
             ("score_patch_frames", self.score_patch_frames, MAX_BLOCKS),
             ("audio_cond_dim", self.audio_cond_dim, MAX_WIDTH),
             ("max_dancers", self.max_dancers, MAX_DANCERS),
-            ("n_steps", self.n_steps, MAX_STEPS),
+            ("n_steps", self.n_steps, MAX_TABLE_VALUES),
         ] {
             if value == 0 {
                 return refuse(format!("{name} is 0; it must be at least 1"));
@@ -104,6 +104,15 @@ impl GroupConfig {
             if value > most {
                 return refuse(format!("{name} is {value}; it must be at most {most}"));
             }
+        }
+        // Both are bounded by now, so that the product cannot overflow.
+        let n_table = self.n_steps * self.width;
+        if n_table > MAX_TABLE_VALUES {
+            return refuse(format!(
+                "n_steps {} and width {} make a table of {n_table} values; at most {MAX_TABLE_VALUES} are kept, so \
+                 lower one of the two",
+                self.n_steps, self.width
+            ));
         }
         if !self.width.is_multiple_of(2 * self.heads) {
             return refuse(format!(
@@ -117,9 +126,6 @@ impl GroupConfig {
         Ok(())
     }
 }
-
-/// Steps of the diffusion that a table of them may have.
-const MAX_STEPS: usize = 1 << 16;
 
 #[cfg(test)]
 mod tests {
@@ -150,6 +156,11 @@ mod tests {
         assert_eq!(
             refusal(|c| c.heads = 7),
             "a width of 48 does not divide into pairs of 7 heads; change heads or the width"
+        );
+        assert_eq!(
+            refusal(|c| (c.n_steps, c.width) = (1 << 20, 64)),
+            "n_steps 1048576 and width 64 make a table of 67108864 values; at most 33554432 are kept, so lower one \
+             of the two"
         );
         assert_eq!(refusal(|c| c.dropout = -0.1), "dropout is -0.1; it must lie in [0, 1)");
     }

@@ -213,7 +213,7 @@ pub(in crate::model) const MAX_WIDTH: usize = 16_384;
 /// Blocks that a level or a decoder may have.
 pub(in crate::model) const MAX_BLOCKS: usize = 64;
 /// Values of the table of steps, 256 MB in f64.
-const MAX_TABLE_VALUES: usize = 1 << 25;
+pub(in crate::model) const MAX_TABLE_VALUES: usize = 1 << 25;
 
 /// Sizes of which no network can be made.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
