@@ -86,7 +86,10 @@ fn generate(store: &Path, audio: &Path, into: &Path, more: &[&str]) -> Output {
     let mut command = motiongen();
     command.arg("generate").arg("--model").arg(store.join("models/group"));
     command.arg("--audio").arg(audio).arg("--output").arg(into);
-    command.args(["--steps=4", "--overlap=9", "--quiet"]).args(more);
+    command.args(["--steps=4", "--quiet"]).args(more);
+    if !more.iter().any(|flag| flag.starts_with("--overlap")) {
+        command.arg("--overlap=9");
+    }
     finish(&mut command)
 }
 

@@ -184,7 +184,7 @@ fn what_is_not_read_is_refused_with_the_way_out() {
         (
             "songs",
             "missing_key",
-            "motion/songs/motion.npz: npz has no pose: it holds mel, expected smpl_poses, poses, root_orient \
+            "motion/songs/motion.npz: npz has no pose: it holds mel, expected smpl_orients, smpl_poses, poses, root_orient \
              or global_orient; save them with numpy.savez(path, poses=…, trans=…, mocap_framerate=…)",
         ),
         (

@@ -233,7 +233,7 @@ class GroupDenoiser(nn.Module):
             rows = torch.cat([token[:, None], w[:, None], h], 1)
             rows = block.get_submodule("global")(rows, all_places, everyone)
             token, h = rows[:, 0], rows[:, TOKENS:]
-            weights = (counts / counts.sum(1, keepdim=True))[..., None]
+            weights = (counts.double() / counts.sum(1, keepdim=True))[..., None]
             mean = (weights * h).sum(1, keepdim=True)
             variance = (weights * (h - mean) ** 2).sum(1, keepdim=True)
             h = film((h - mean) / torch.sqrt(variance + 1e-8), block.modulation(w), 0)
@@ -293,7 +293,7 @@ class GroupScore(nn.Module):
             x = rows[:, 1:].reshape(batch, n * frames, -1)
             rows = torch.cat([group[:, None], self.numbers[number.long()][:, None], x], 1)
             x = layer["global"](rows, places, everyone)[:, TOKENS:].unflatten(1, (n, frames))
-        weights = (counts / counts.sum(1, keepdim=True))[..., None]
+        weights = (counts.double() / counts.sum(1, keepdim=True))[..., None]
         return self.out((weights * x.flatten(1, 2)).sum(1))[:, 0]
 
 
