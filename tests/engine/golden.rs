@@ -72,6 +72,9 @@ impl Golden {
     ) -> f64 {
         const N_SAMPLES: usize = 16;
         const FLOOR: f64 = 1e-4;
+        // A gradient that is zero by an invariance of the loss, as that of a bias under a softmax, is a sum whose
+        // terms cancel: rounding leaves of it what it leaves of the whole, and it is compared with the whole.
+        const ZERO: f64 = 1e-12;
         let n = self.parameters.len();
         let rows =
             |kind: &str, width: usize| &self.values(&format!("{prefix}.{kind}"))[row * n * width..];
@@ -84,7 +87,7 @@ impl Golden {
             let probe = uniform(&format!("probe.{name}"), got.len());
             let probe_norm = probe.iter().map(|x| x * x).sum::<f64>().sqrt();
             let dot = got.iter().zip(&probe).map(|(x, p)| x * p).sum::<f64>();
-            let scale = norms[i].max(FLOOR * total);
+            let scale = if norms[i] < ZERO * total { total } else { norms[i].max(FLOOR * total) };
             let mut check = |what: &str, got: f64, wanted: f64, scale: f64| {
                 let error = (got - wanted).abs() / scale;
                 worst = worst.max(error);

@@ -162,6 +162,8 @@ def differentiated(name: str, case: Case) -> dict[str, np.ndarray]:
         if key in ("x", "audio", "style", "z") and tensor is not None:
             tensor.requires_grad_()
     output, loss = case.loss()
+    # Before the check moves parameters.
+    more = dict(case.more) if isinstance(case, GroupCase) else {}
     loss.backward()
     # The null context has no gradient where no sample goes without music: zeros, here.
     gradients = {
@@ -174,8 +176,7 @@ def differentiated(name: str, case: Case) -> dict[str, np.ndarray]:
         "loss": loss.detach().numpy(),
         **statistics("grad", gradients),
     }
-    if isinstance(case, GroupCase):
-        found |= {key: value.detach().contiguous().numpy() for key, value in case.more.items()}
+    found |= {key: value.detach().contiguous().numpy() for key, value in more.items()}
     is_large = network.count(case.network) > 10_000_000
     for key, tensor in case.inputs.items():
         if tensor is None:
