@@ -2,7 +2,7 @@
 //!
 //! Source: Le, Pham, Do, Tjiputra, Tran, Nguyen, "Music-Driven Group Choreography", CVPR 2023, section 5.1:
 //! kinetic features pooled over the dancers. There they are of 24 joints; here of the four markers of
-//! [`kinetic::marker_features`], in the intended formula. The distance is
+//! [`marker_features`], in the intended formula. The distance is
 //! [`frechet_distance`](crate::evaluation::frechet::frechet_distance) of the features' normal distributions.
 
 use ndarray::{Array2, Axis};

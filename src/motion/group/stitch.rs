@@ -76,7 +76,7 @@ pub fn blend(left: ArrayView3<f32>, right: ArrayView3<f32>) -> Array3<f32> {
 ///
 /// `[N, T, 25]` each in metres, in one frame of reference; `shift` frames of the earlier piece come before
 /// the first of the later one. The later piece's dancers are put in the order of the earlier one's, and the
-/// shared frames of both become their [`blend`].
+/// shared frames of both become their [`blend()`].
 ///
 /// # Panics
 /// When numbers of dancers or channels differ, or no frame is shared.

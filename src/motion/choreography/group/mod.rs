@@ -1,10 +1,10 @@
 //! Groups: several dancers to one song, whose formation and unison are known at every moment.
 //!
 //! * Dancers stand in [`Formation`]s. These change on downbeats; everybody goes straight to the place that
-//!   the assignment of least squared distance gives ([`plan`]).
-//! * In every span the steps belong together in one known way, their [`Unison`] ([`unison`]).
-//! * A dancer stays about its place: of its own wandering the quick part is kept ([`voice`]), within a
-//!   leeway that keeps any two bodies apart at every moment ([`floor_plan`]).
+//!   the assignment of least squared distance gives (`plan`).
+//! * In every span the steps belong together in one known way, their [`Unison`] (`unison`).
+//! * A dancer stays about its place: of its own wandering the quick part is kept (`voice`), within a
+//!   leeway that keeps any two bodies apart at every moment (`floor_plan`).
 //! * Everybody rises and falls with the bar as a soloist does, and all channels follow from the poses.
 
 mod floor_plan;
