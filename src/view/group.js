@@ -135,6 +135,7 @@ function nameDancers() {
     swatch.style.color = colorOf(i);
     const name = element('span', {}, [swatch, `${i}  `]);
     name.style.whiteSpace = 'pre';
+    name.style.display = 'inline-block'; // a line may end between two names
     return name;
   });
   const shown = Math.max(0, group.followed);
