@@ -123,8 +123,9 @@ pub struct Params {
     /// Dancers, for a model of the family group [default: 3]
     #[arg(long, value_name = "N", help_heading = "Groups")]
     pub dancers: Option<usize>,
-    /// How alike dancers move, from -1 (each in a way of their own) to 1 (in unison), for a model of the family
-    /// group; other than 0 it takes three times as long [default: 0]
+    /// Guidance by the score of a model of the family group, from -1 (away from one group, meant for dancers who go
+    /// each a way of their own) to 1 (towards one group, meant for unison); docs/groups.md has what it was seen to
+    /// do; other than 0 it takes three times as long [default: 0]
     #[arg(long, value_name = "GAMMA", allow_hyphen_values = true, help_heading = "Groups")]
     pub consistency: Option<f64>,
     /// Let bodies touch where they were sampled so, instead of moving them apart.
