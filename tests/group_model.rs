@@ -110,10 +110,11 @@ fn groups_are_learned_from_and_danced_in_files() {
     assert_eq!(steps.len(), 7);
     for row in &steps {
         assert_eq!(row.stage, "group");
-        let of = |value: Option<f64>| value.expect("a loss");
-        let [simple, markers, contrast] = [of(row.diffusion), of(row.markers), of(row.contrast)];
+        let loss_of = |value: Option<f64>| value.expect("a loss");
+        let [simple, markers, contrast] =
+            [loss_of(row.diffusion), loss_of(row.markers), loss_of(row.contrast)];
         let total = simple + markers + 0.01 * contrast;
-        assert!((of(row.loss) - total).abs() < 1e-5 * total, "{row:?}");
+        assert!((loss_of(row.loss) - total).abs() < 1e-5 * total, "{row:?}");
         // Of one group and two mixed ones nothing is known at first: ln 3.
         assert!((0.5..2.5).contains(&contrast), "{contrast}");
     }

@@ -126,7 +126,8 @@ impl GroupEngine {
         let x = inputs.x.as_standard_layout();
         self.workers.with(|GroupWorker { threads, arena }| {
             threads.run(|| {
-                let given = Given { inputs, audio: &audio, x: x.as_slice().expect("in order") };
+                let given =
+                    ForwardInputs { inputs, audio: &audio, x: x.as_slice().expect("in order") };
                 if inputs.consistency == 0.0 {
                     let mut g = Eager::new(&self.parameters, arena);
                     let x = g.constant(inputs.x.shape(), given.x);
@@ -162,7 +163,8 @@ impl GroupEngine {
         let x = inputs.x.as_standard_layout();
         self.workers.with(|GroupWorker { threads, arena }| {
             threads.run(|| {
-                let given = Given { inputs, audio: &audio, x: x.as_slice().expect("in order") };
+                let given =
+                    ForwardInputs { inputs, audio: &audio, x: x.as_slice().expect("in order") };
                 let mut g = Eager::new(&self.parameters, arena);
                 let x = g.constant(inputs.x.shape(), given.x);
                 let (_, w) = self.estimate(&mut g, &given, &x)?;
@@ -175,10 +177,10 @@ impl GroupEngine {
     fn estimate<I: Interpreter<Element = f32>>(
         &self,
         g: &mut I,
-        given: &Given,
+        given: &ForwardInputs,
         x: &Tensor<f32>,
     ) -> GraphResult<(Tensor<f32>, Tensor<f32>)> {
-        let Given { inputs, audio, .. } = given;
+        let ForwardInputs { inputs, audio, .. } = given;
         let groups = audio.dim().0;
         let t = g.constant(&[groups], &vec![inputs.t as f32; groups]);
         let audio = g.constant(audio.shape(), audio.as_slice().expect("in order"));
@@ -212,7 +214,7 @@ impl GroupEngine {
     fn log_ratio<I: Interpreter<Element = f32>>(
         &self,
         g: &mut I,
-        given: &Given,
+        given: &ForwardInputs,
         x0: &Tensor<f32>,
         w: &Tensor<f32>,
     ) -> GraphResult<Tensor<f32>> {
@@ -223,7 +225,7 @@ impl GroupEngine {
     fn logits<I: Interpreter<Element = f32>>(
         &self,
         g: &mut I,
-        given: &Given,
+        given: &ForwardInputs,
         x0: &Tensor<f32>,
         w: &Tensor<f32>,
     ) -> GraphResult<Tensor<f32>> {
@@ -236,13 +238,13 @@ impl GroupEngine {
 }
 
 /// Inputs whose music is scaled.
-struct Given<'a, 'b> {
+struct ForwardInputs<'a, 'b> {
     inputs: &'a GroupEngineInputs<'b>,
     audio: &'a Array3<f32>,
     x: &'a [f32],
 }
 
-impl Given<'_, '_> {
+impl ForwardInputs<'_, '_> {
     fn number<I: Interpreter<Element = f32>>(&self, g: &I, config: &GroupConfig) -> Tensor<f32> {
         let groups = self.audio.dim().0;
         let row = config.embedded_number(self.inputs.n_dancers) as f32;

@@ -4,8 +4,8 @@
 //! its dancers in the batch, \[B N, T, …\]; folding between the two moves no number.
 //!
 //! Queries and keys are turned by the frame of their dancer (rotary position embedding), so that frames of one
-//! time have one place whoever dances them. The reference turns inputs before their projection, and frames of one
-//! dancer alone.
+//! time have one position, of whichever dancer they are. The reference turns inputs before their projection, and
+//! frames of one dancer alone.
 
 use crate::model::graph::{Activation, Attention, Channels, Graph, Result};
 use crate::model::layers::{LayerNorm, Linear};

@@ -99,18 +99,18 @@ impl Windows {
         if let Some(poses) = dancers(group) {
             self.features.push(kinetic_features(&poses));
         }
-        let locking = |music: &WindowMusic| {
-            let of = group.outer_iter().map(|dancer| {
+        let mean_locking = |music: &WindowMusic| {
+            let locking = group.outer_iter().map(|dancer| {
                 let vertical = dancer.column(Channel::Velocity.range().start + 1);
                 let vertical: Vec<f64> = vertical.iter().map(|&v| f64::from(v)).collect();
                 let n = vertical.len().min(music.phase.len());
                 locking_above_chance(&vertical[..n], &music.phase[..n])
             });
-            let of: Vec<f64> = of.collect();
-            (!of.is_empty()).then(|| of.iter().sum::<f64>() / of.len() as f64)
+            let locking: Vec<f64> = locking.collect();
+            (!locking.is_empty()).then(|| locking.iter().sum::<f64>() / locking.len() as f64)
         };
-        self.locking.push(locking(music));
-        self.other_locking.push(other.and_then(locking));
+        self.locking.push(mean_locking(music));
+        self.other_locking.push(other.and_then(mean_locking));
         self.songs.push(music.song);
     }
 

@@ -282,7 +282,7 @@ fn checks(
         Case { n_groups: 2, n_dancers: 3, n_frames: window / 2 + 17 },
         Case { n_groups: 1, n_dancers: 16, n_frames: 31 },
     ] {
-        let given = Given::new(case, &network.group, n_steps);
+        let given = CheckInputs::new(case, &network.group, n_steps);
         let (found, onnx_s) = timed(|| denoiser.run(&given.of_denoiser(), GroupNames::X0))?;
         let (w, _) = timed(|| denoiser.run(&given.of_denoiser(), GroupNames::W))?;
         let (wanted, eager_s) = timed(|| given.estimate(&networks, &parameters, &arena, trained))?;
@@ -345,7 +345,7 @@ fn read_back(
 }
 
 /// Numbers that both engines are given.
-struct Given {
+struct CheckInputs {
     case: Case,
     width: usize,
     has_clock: bool,
@@ -357,7 +357,7 @@ struct Given {
     z: Vec<f32>,
 }
 
-impl Given {
+impl CheckInputs {
     fn new(case: Case, config: &crate::model::GroupConfig, n_steps: usize) -> Self {
         let Case { n_groups, n_dancers, n_frames } = case;
         let normal = |n: usize, seed: u64| {

@@ -144,15 +144,16 @@ mod tests {
         let x = g.input(&[1, 3, MOTION_DIM], &values);
         let y = markers(&mut g, &normalizer, &x).expect("shapes fit");
         for (row, found) in values.chunks(MOTION_DIM).zip(y.data().chunks(12)) {
-            let of = |i: usize| {
+            let unnormalized = |i: usize| {
                 row[i] * f64::from(normalizer.scale[i]) + f64::from(normalizer.centre[i])
             };
-            let q: [f64; 4] = std::array::from_fn(|i| of(Channel::Quaternion.range().start + i));
+            let q: [f64; 4] =
+                std::array::from_fn(|i| unnormalized(Channel::Quaternion.range().start + i));
             let norm = q.iter().map(|x| x * x).sum::<f64>().sqrt();
             for (found, m) in found.chunks(3).zip(MARKERS_M) {
                 let turned = rotate(q.map(|x| x / norm), m);
                 for i in 0..3 {
-                    assert!((found[i] - (of(i) + turned[i])).abs() < 1e-12, "{found:?}");
+                    assert!((found[i] - (unnormalized(i) + turned[i])).abs() < 1e-12, "{found:?}");
                 }
             }
         }

@@ -200,21 +200,21 @@ mod tests {
 
     #[test]
     fn formations_have_their_shapes() {
-        let of = |formation: Formation, n: usize| formation.places(n, &mut Chance::new(3, 0));
-        let line = of(Formation::Line, 5);
+        let places = |formation: Formation, n: usize| formation.places(n, &mut Chance::new(3, 0));
+        let line = places(Formation::Line, 5);
         assert!(line.iter().all(|p| p.z_m.abs() < 1e-12 && p.yaw_rad == 0.0));
         assert!(line.windows(2).all(|p| p[1].x_m - p[0].x_m >= MIN_SPACING_M - 1e-12));
         let ranks: std::collections::BTreeSet<i64> =
-            of(Formation::Line, 11).iter().map(|p| (p.z_m * 1e6) as i64).collect();
+            places(Formation::Line, 11).iter().map(|p| (p.z_m * 1e6) as i64).collect();
         assert_eq!(ranks.len(), 2);
-        let circle = of(Formation::Circle, 7);
+        let circle = places(Formation::Circle, 7);
         let radius = circle[0].x_m.hypot(circle[0].z_m);
         assert!(circle.iter().all(|p| (p.x_m.hypot(p.z_m) - radius).abs() < 1e-9));
-        let rows = of(Formation::Rows, 5);
+        let rows = places(Formation::Rows, 5);
         assert_eq!(rows.iter().filter(|p| p.yaw_rad == FRAC_PI_2).count(), 3);
         // Who faces +X stands at the side of -X.
         assert!(rows.iter().all(|p| p.x_m * p.yaw_rad < 0.0), "{rows:?}");
-        let v = of(Formation::V, 5);
+        let v = places(Formation::V, 5);
         assert!((v[1].x_m + v[2].x_m - 2.0 * v[0].x_m).abs() < 1e-12);
         assert!((v[3].z_m - 2.0 * v[1].z_m + v[0].z_m).abs() < 1e-12);
         let names = Formation::ALL.map(Formation::name);
