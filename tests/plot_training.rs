@@ -53,6 +53,7 @@ fn row(run: &str, stage: &str, kind: RowKind, epoch: i32, step: i64) -> Training
         speed_ratio: None,
         markers: None,
         contrast: None,
+        sampled_distance: None,
         gradient_norm: None,
         skipped: false,
         samples_per_s: None,

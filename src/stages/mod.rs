@@ -26,6 +26,7 @@ mod seen;
 pub mod train;
 mod trained;
 pub mod vacuum;
+mod validation_motion;
 pub mod view;
 
 use std::io::{self, Write};

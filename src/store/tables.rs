@@ -123,7 +123,7 @@ rows! {
 
 rows! {
     "One row per training step, epoch and validation of a run."
-    TrainingLogRow in "training_log" version 2 reads 1 sorted by [segment, step]
+    TrainingLogRow in "training_log" version 3 reads 1 sorted by [segment, step]
     {
         segment: String, "", "The stretch of the log, from one checkpoint to the next: `run/stage/` and the steps done before it.";
         run: String, "", "Name of the run.";
@@ -151,6 +151,7 @@ rows! {
         speed_ratio: Option<f64>, "", "Of a validation in finetune: mean speed of sampled motion, over that of the phrases; far below 1 where motion agrees with itself because it stands still.";
         markers: Option<f64>, "m²", "Of a model of groups: mean squared error of points fixed to each body. This and `contrast` are none in rows of version 1.";
         contrast: Option<f64>, "", "Of a model of groups: cross-entropy of telling a group from mixed ones.";
+        sampled_distance: Option<f64>, "", "Of a validation in diffusion: root mean square of the logarithms of how motion sampled for validation windows moves, over how real motion moves: locking to the bar, speed along each axis, jerk, turning and changes of turning; 0 is alike. The checkpoint with the least is kept. None in rows before version 3.";
         gradient_norm: Option<f64>, "", "Norm of the gradient before it was clipped.";
         skipped: bool, "", "Whether the step was skipped because something was not finite.";
         samples_per_s: Option<f64>, "1/s", "Windows learned from per second.";

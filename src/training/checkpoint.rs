@@ -59,6 +59,22 @@ pub struct Progress {
 pub struct Best {
     pub step: u64,
     pub loss: f64,
+    /// Distance of sampled motion from real motion; none where none is sampled, and in checkpoints of 0.1.
+    #[serde(default)]
+    pub distance: Option<f64>,
+}
+
+impl Best {
+    /// Returns whether a validation is better than another: by the distance of sampled motion where both have one, else
+    /// by the loss.
+    pub fn is_better_than(&self, other: &Self) -> bool {
+        match (self.distance, other.distance) {
+            (Some(distance), Some(of_other)) => distance < of_other,
+            (Some(_), None) => true,
+            (None, Some(_)) => false,
+            (None, None) => self.loss < other.loss,
+        }
+    }
 }
 
 impl<C: Serialize + DeserializeOwned> State<C> {

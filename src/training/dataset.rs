@@ -62,6 +62,8 @@ pub struct Phrase {
     pub song_hash: Option<Arc<str>>,
     /// Digest of the phrase's files, or of its motion and features.
     pub content_hash: Arc<str>,
+    /// Digest of the features: phrases to the same stretch of music have the same.
+    pub music: Arc<str>,
     /// Frames of each dancer, which may be more than have features.
     motion_frames: usize,
     motion_row: u64,
@@ -293,6 +295,7 @@ impl Dataset {
                 beats_per_bar: beats_per_bar(&row),
                 song_hash: row.song_hash.map(Into::into),
                 content_hash: row.content_hash.into(),
+                music: features.digest.into(),
                 motion_frames: motion.n_frames,
                 motion_row: motion.row,
                 feature_row: features.row,
@@ -368,6 +371,7 @@ impl Dataset {
                 beats_per_bar: DEFAULT_BEATS_PER_BAR,
                 song_hash: None,
                 content_hash: content_hash.into(),
+                music: b.into(),
                 motion_frames,
                 motion_row: motion.append(rows.view())?,
                 feature_row: features.append(of_features.view())?,

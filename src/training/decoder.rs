@@ -12,6 +12,7 @@ use crate::motion::{Channel, ChannelLimits, MOTION_DIM, Normalizer};
 use crate::weights::{Archive, Section};
 
 use super::averaged::NetworkState;
+use super::batch::Batch;
 use super::checkpoint::Progress;
 use super::config::DecoderTraining;
 use super::diffusion::tape_seed;
@@ -19,7 +20,7 @@ use super::drive::{Learner, Losses, NoReduction, Reducer, StepResult, Validation
 use super::error::TrainingError;
 use super::objective::{Reconstruction, reconstruction};
 use super::sampling::{Condition, Denoiser, motion_view};
-use super::window::{Batch, Windows};
+use super::window::Windows;
 
 /// Windows of a validation.
 const N_VALIDATION: usize = 64;
@@ -272,7 +273,7 @@ impl Learner for DecoderLearner<'_> {
         let threads = Arc::clone(&self.threads);
         let losses = threads.run(|| self.validation_losses(self.network.average()))?;
         let live = threads.run(|| self.validation_losses(self.network.live()))?.total;
-        Ok(Validation { losses, live: Some(live) })
+        Ok(Validation { losses, live: Some(live), distance: None })
     }
 
     fn sections(&self) -> Vec<Section<'_, f32>> {

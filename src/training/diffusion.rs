@@ -12,13 +12,15 @@ use crate::motion::{MOTION_DIM, Normalizer};
 use crate::weights::{Archive, Section};
 
 use super::averaged::NetworkState;
+use super::batch::Batch;
 use super::checkpoint::Progress;
 use super::config::{DiffusionTraining, NetworkConfig};
 use super::drive::{Learner, Losses, NoReduction, Reducer, StepResult, Validation};
 use super::error::TrainingError;
+use super::judge::{SampleJudge, sampled_distance};
 use super::objective::Objective;
 use super::sampling::{Denoiser, is_partial, motion_view};
-use super::window::{Batch, Windows};
+use super::window::Windows;
 
 /// Windows of one validation: all of them, or these many with noise and steps of their own.
 const MIN_VALIDATION_WINDOWS: usize = 256;
@@ -52,6 +54,7 @@ pub struct DiffusionLearner {
     seed: u64,
     windows: Arc<Windows>,
     reducer: Box<dyn Reducer>,
+    judge: Option<Box<dyn SampleJudge>>,
 }
 
 impl DiffusionLearner {
@@ -82,12 +85,19 @@ impl DiffusionLearner {
             seed,
             windows: Arc::clone(windows),
             reducer: Box::new(NoReduction),
+            judge: None,
         })
     }
 
     /// Has steps run on threads; the results are the same on any.
     pub fn on(mut self, threads: &Arc<Threads>) -> Self {
         self.threads = Arc::clone(threads);
+        self
+    }
+
+    /// Has validations sample motion, by whose distance the best is chosen.
+    pub fn judged_by(mut self, judge: impl SampleJudge + 'static) -> Self {
+        self.judge = Some(Box::new(judge));
         self
     }
 
@@ -205,6 +215,13 @@ impl DiffusionLearner {
             count += weight;
         }
         Ok(sums.map(|sum| sum / count.max(1.0)))
+    }
+
+    fn sampled_distance(&self) -> Result<Option<f64>, TrainingError> {
+        let Some(judge) = &self.judge else { return Ok(None) };
+        let (denoiser, normalizer) = (self.denoiser(), self.windows.normalizer());
+        let distance = || sampled_distance(judge.as_ref(), &denoiser, &self.schedule, normalizer);
+        self.threads.run(distance)
     }
 
     /// Returns the UNet with its averaged weights, for sampling.
@@ -421,8 +438,11 @@ impl Learner for DiffusionLearner {
     fn validate(&mut self) -> Result<Validation, TrainingError> {
         let loss = self.validation_loss(self.network.average())?;
         let live = self.validation_loss(self.network.live())?;
-        let losses = Losses { total: loss, parts: vec![("diffusion", loss)] };
-        Ok(Validation { losses, live: Some(live) })
+        let mut parts = vec![("diffusion", loss)];
+        let distance = self.sampled_distance()?;
+        parts.extend(distance.map(|distance| ("sampled_distance", distance)));
+        let losses = Losses { total: loss, parts };
+        Ok(Validation { losses, live: Some(live), distance })
     }
 
     fn sections(&self) -> Vec<Section<'_, f32>> {
@@ -451,7 +471,7 @@ impl Learner for DiffusionLearner {
 mod tests {
     use super::*;
     use crate::motion::CLOCK_DIM;
-    use crate::training::window::Chances;
+    use crate::training::batch::Chances;
 
     #[test]
     fn the_clock_alone_is_withheld_by_chance() {

@@ -9,11 +9,11 @@ use crate::autodiff::Gradients;
 use crate::store::{Patience, StoreError};
 use crate::weights::{Archive, Section};
 
+use super::batch::Batch;
 use super::checkpoint::{Best, CheckpointKind, Checkpoints, Progress, State};
 use super::error::TrainingError;
 use super::journal::{Entry, Journal, RowKind};
 use super::loader::Loader;
-use super::window::Batch;
 
 /// Steps in a row that may be skipped because something is not finite.
 const MAX_SKIPPED_IN_A_ROW: u32 = 10;
@@ -70,6 +70,8 @@ pub struct Validation {
     pub losses: Losses,
     /// Of the weights themselves, where they are not the ones that would be used.
     pub live: Option<f64>,
+    /// Distance of sampled motion from real motion, where motion is sampled.
+    pub distance: Option<f64>,
 }
 
 /// Gradients on their way from the tape to the optimizer.
@@ -391,19 +393,22 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
         let progress = &mut self.state.progress;
         let epoch = self.plan.epoch(progress.step.saturating_sub(1));
         let loss = found.losses.total;
-        let is_better = loss.is_finite() && progress.best.is_none_or(|best| loss < best.loss);
+        let now = Best { step: progress.step, loss, distance: found.distance };
+        let is_better =
+            loss.is_finite() && progress.best.is_none_or(|best| now.is_better_than(&best));
         let kind = RowKind::Validation;
         self.journal.add(Entry::of_epoch(kind, epoch, progress, &found.losses, found.live));
         if is_better {
-            progress.best = Some(Best { step: progress.step, loss });
+            progress.best = Some(now);
             progress.n_stale = 0;
         } else {
             progress.n_stale += 1;
         }
         let step = progress.step;
         self.watch.note(&format!(
-            "{}: step {step}, validation loss {loss:.4}{}",
+            "{}: step {step}, validation loss {loss:.4}{}{}",
             L::STAGE,
+            found.distance.map_or(String::new(), |d| format!(", sampled distance {d:.3}")),
             if is_better { ", the best so far" } else { "" }
         ));
         if is_better {

@@ -22,6 +22,7 @@ use crate::units::FPS;
 use crate::weights::{Archive, Section};
 
 use super::averaged::{MOMENTS, section};
+use super::batch::Batch;
 use super::checkpoint::Progress;
 use super::config::{FinetuneConfig, NetworkConfig};
 use super::decoder::DECODER;
@@ -32,7 +33,7 @@ use super::objective::{Objective, reconstruction};
 use super::pipeline::{Pipeline, weighted_sum};
 use super::sampling::motion_view;
 use super::temporal::{TemporalLosses, temporal_losses};
-use super::window::{Batch, Windows};
+use super::window::Windows;
 
 /// Windows of a validation.
 const N_VALIDATION: usize = 64;
@@ -377,7 +378,7 @@ impl Learner for FinetuneLearner {
             ]);
             sum.add(&losses, 1.0 / n as f64);
         }
-        Ok(Validation { losses: sum, live: None })
+        Ok(Validation { losses: sum, live: None, distance: None })
     }
 
     fn sections(&self) -> Vec<Section<'_, f32>> {

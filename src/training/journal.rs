@@ -173,6 +173,7 @@ impl<'a> Journal<'a> {
             speed_ratio: part("speed_ratio"),
             markers: part("markers"),
             contrast: part("contrast"),
+            sampled_distance: part("sampled_distance"),
             gradient_norm: entry.taken.and_then(|taken| finite(taken.gradient_norm)),
             skipped: entry.is_skipped,
             samples_per_s: entry.samples_per_s,

@@ -8,7 +8,8 @@ use std::time::{Duration, Instant};
 
 use crate::store::StoreError;
 
-use super::window::{Batch, Windows};
+use super::batch::Batch;
+use super::window::Windows;
 
 /// Batches that each thread makes ahead.
 const AHEAD: usize = 2;

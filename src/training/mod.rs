@@ -5,6 +5,7 @@
 //! and `temporal`. Everything depends on seeds and numbers of steps, nothing on threads or clocks.
 
 mod averaged;
+mod batch;
 mod checkpoint;
 mod config;
 mod dataset;
@@ -17,14 +18,17 @@ mod estimate;
 mod finetune;
 mod group;
 mod journal;
+mod judge;
 mod learning_rate;
 mod loader;
 mod objective;
+mod pairs;
 mod pipeline;
 mod sampling;
 mod temporal;
 mod window;
 
+pub use batch::{Batch, Chances, PAIR};
 pub use checkpoint::{Best, CheckpointKind, Checkpoints, Progress, State};
 pub use config::{
     DecoderTraining, DiffusionTraining, FinetuneConfig, NetworkConfig, OptimizerConfig,
@@ -44,9 +48,10 @@ pub use group::{
     GROUP, GroupLearner, GroupLosses, GroupNetworkConfig, GroupTrainConfig, GroupTraining,
 };
 pub use journal::{Journal, RowKind};
+pub use judge::SampleJudge;
 pub use learning_rate::{LearningRate, LearningRateSchedule};
 pub use loader::Loader;
 pub use objective::{ChannelWeights, Objective, Reconstruction, reconstruction};
 pub use sampling::{Condition, Denoiser};
 pub use temporal::{TemporalConfig, TemporalLosses, temporal_losses};
-pub use window::{Augmentation, Batch, Chances, Scales, Windows, fit_scales};
+pub use window::{Augmentation, Scales, Windows, fit_scales};

@@ -10,12 +10,12 @@ use crate::model::{Graph, MotionDecoder, ParameterList, Scope, UNet1D, UNetInput
 use crate::motion::MOTION_DIM;
 use crate::motion::style::STYLE_DIM;
 
+use super::batch::Batch;
 use super::config::NetworkConfig;
 use super::decoder::DECODER;
 use super::diffusion::UNET;
 use super::error::TrainingError;
 use super::sampling::is_partial;
-use super::window::Batch;
 
 /// Both networks, over one list of parameters.
 #[derive(Clone, Debug)]

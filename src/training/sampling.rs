@@ -8,8 +8,8 @@ use crate::model::{UNet1D, UNetInputs};
 use crate::motion::MOTION_DIM;
 use crate::motion::style::STYLE_DIM;
 
+use super::batch::Batch;
 use super::error::TrainingError;
-use super::window::Batch;
 
 /// A UNet with its weights.
 #[derive(Clone, Copy)]

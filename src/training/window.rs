@@ -11,11 +11,12 @@ use crate::model::ConditionConfig;
 use crate::motion::augment::{
     mirror_x, rotate_yaw, stretch_features, stretch_motion, stretched_frames,
 };
-use crate::motion::style::STYLE_DIM;
 use crate::motion::{CLOCK_DIM, Channel, MOTION_DIM, Normalizer, Placement};
 use crate::store::StoreError;
 
+use super::batch::{Batch, Chances, PAIR};
 use super::dataset::{Dataset, Phrase, Split};
+use super::pairs::in_pairs;
 
 /// Augmentation of windows; zero and false leave them as they are.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -34,135 +35,6 @@ impl Default for Augmentation {
     fn default() -> Self {
         // A handful of songs has a handful of tempi: stretched, they have all those between.
         Self { condition_noise: 0.1, mirror: true, yaw_deg: 0.0, stretch: 0.15 }
-    }
-}
-
-/// Windows side by side.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Batch {
-    pub n_windows: usize,
-    pub n_frames: usize,
-    /// Places for dancers in every window; 1 for soloists.
-    pub n_slots: usize,
-    /// Dancers of each window, in the first of its places.
-    pub n_dancers: Vec<usize>,
-    /// Normalised motion, `[n_windows, n_slots, n_frames, 25]`, 0 in places without a dancer; beyond a phrase's end its last frame is held.
-    pub motion: Vec<f32>,
-    /// Features in units of their spread and, for a network that hears it, the clock, `[n_windows, n_frames,
-    /// condition_dim]`, held likewise.
-    pub audio: Vec<f32>,
-    /// 1 for frames of the phrase and 0 for held ones, `[n_windows, n_frames]`.
-    pub mask: Vec<f32>,
-    /// Mean of the normalised style channels, `[n_windows, 8]`.
-    pub style: Vec<f32>,
-    /// Standard normal noise, `[n_windows, n_slots, n_frames, 25]`.
-    pub noise: Vec<f32>,
-    pub chances: Vec<Chances>,
-    pub phrase_ids: Vec<Arc<str>>,
-}
-
-/// Random decisions for each window, as numbers uniform in \[0, 1).
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Chances {
-    /// How much noise is added: step ⌊u T⌋.
-    pub step: f64,
-    /// Whether the music is withheld.
-    pub no_audio: f64,
-    /// Whether the style is withheld.
-    pub no_style: f64,
-    /// Whether the clock alone is withheld.
-    pub no_clock: f64,
-}
-
-impl Batch {
-    fn empty(n_windows: usize, n_frames: usize, n_slots: usize, condition_dim: usize) -> Self {
-        let zeros = |width: usize| Vec::with_capacity(n_windows * n_frames * width);
-        Self {
-            n_windows: 0,
-            n_frames,
-            n_slots,
-            n_dancers: Vec::with_capacity(n_windows),
-            motion: zeros(n_slots * MOTION_DIM),
-            audio: zeros(condition_dim),
-            mask: zeros(1),
-            style: Vec::with_capacity(n_windows * STYLE_DIM),
-            noise: zeros(n_slots * MOTION_DIM),
-            chances: Vec::with_capacity(n_windows),
-            phrase_ids: Vec::with_capacity(n_windows),
-        }
-    }
-
-    /// Returns some windows of the batch.
-    ///
-    /// # Panics
-    /// When it has fewer.
-    pub fn windows(&self, range: std::ops::Range<usize>) -> Self {
-        let part = |values: &[f32]| {
-            let width = values.len() / self.n_windows;
-            values[range.start * width..range.end * width].to_vec()
-        };
-        Self {
-            n_windows: range.len(),
-            n_frames: self.n_frames,
-            n_slots: self.n_slots,
-            n_dancers: self.n_dancers[range.clone()].to_vec(),
-            motion: part(&self.motion),
-            audio: part(&self.audio),
-            mask: part(&self.mask),
-            style: part(&self.style),
-            noise: part(&self.noise),
-            chances: self.chances[range.clone()].to_vec(),
-            phrase_ids: self.phrase_ids[range.clone()].to_vec(),
-        }
-    }
-}
-
-impl Batch {
-    /// Returns how many frames of dancers count.
-    pub(super) fn weight(&self) -> f64 {
-        let frames = self.mask.chunks_exact(self.n_frames.max(1));
-        let of_window = |(mask, &n): (&[f32], &usize)| {
-            n as f64 * mask.iter().map(|&w| f64::from(w)).sum::<f64>()
-        };
-        frames.zip(&self.n_dancers).map(of_window).sum()
-    }
-
-    /// Returns the same windows in order of their number of dancers.
-    pub(super) fn by_number_of_dancers(&self) -> Self {
-        let mut order: Vec<usize> = (0..self.n_windows).collect();
-        order.sort_by_key(|&i| self.n_dancers[i]);
-        let sorted = |values: &[f32]| -> Vec<f32> {
-            let width = values.len() / self.n_windows.max(1);
-            order.iter().flat_map(|&i| &values[i * width..][..width]).copied().collect()
-        };
-        Self {
-            n_windows: self.n_windows,
-            n_frames: self.n_frames,
-            n_slots: self.n_slots,
-            n_dancers: order.iter().map(|&i| self.n_dancers[i]).collect(),
-            motion: sorted(&self.motion),
-            audio: sorted(&self.audio),
-            mask: sorted(&self.mask),
-            style: sorted(&self.style),
-            noise: sorted(&self.noise),
-            chances: order.iter().map(|&i| self.chances[i]).collect(),
-            phrase_ids: order.iter().map(|&i| Arc::clone(&self.phrase_ids[i])).collect(),
-        }
-    }
-
-    /// Returns the same windows with as many places as the largest of their groups needs.
-    pub(super) fn without_empty_slots(self) -> Self {
-        let n_slots = self.n_dancers.iter().copied().max().unwrap_or(1).max(1);
-        if n_slots == self.n_slots {
-            return self;
-        }
-        let size = self.n_frames * MOTION_DIM;
-        let kept = |values: &[f32]| -> Vec<f32> {
-            let windows = values.chunks_exact(self.n_slots * size);
-            windows.flat_map(|window| &window[..n_slots * size]).copied().collect()
-        };
-        let (motion, noise) = (kept(&self.motion), kept(&self.noise));
-        Self { n_slots, motion, noise, ..self }
     }
 }
 
@@ -191,6 +63,8 @@ pub struct Windows {
     has_clock: bool,
     /// Places for dancers in every window.
     n_slots: usize,
+    /// Whether windows come in pairs to the same music.
+    is_paired: bool,
     seed: u64,
     /// Training windows of an epoch: the phrase of each; longer phrases have several.
     train: Vec<u32>,
@@ -205,6 +79,7 @@ const AUDIO_NOISE: u64 = 3 << 60;
 const CHANCES: u64 = 4 << 60;
 const NOISE: u64 = 5 << 60;
 const VALIDATION_NOISE: u64 = 6 << 60;
+const PAIR_STEP: u64 = 7 << 60;
 
 /// The golden ratio's fraction: multiples of it are spread evenly over \[0, 1), however many there are.
 const GOLDEN: f64 = 0.618_033_988_749_894_9;
@@ -241,6 +116,7 @@ impl Windows {
             n_frames,
             has_clock,
             n_slots,
+            is_paired: false,
             seed,
             train,
             validation,
@@ -250,6 +126,22 @@ impl Windows {
     /// Gives windows what a network hears: the clock too, where its configuration says so.
     pub fn heard_by(self, config: impl Into<ConditionConfig>) -> Self {
         Self { has_clock: config.into().clock, ..self }
+    }
+
+    /// Gives windows in pairs, as groups are learned from: 2k and 2k + 1 are of two phrases to the same music, cut and
+    /// changed alike and with the same step of noise, so that dancers of one are strangers in the other for no reason
+    /// but their steps. Phrases whose music no other phrase has are paired with each other.
+    pub fn paired(mut self) -> Self {
+        let phrases = self.dataset.phrases();
+        let music = |phrase: u32| &*phrases[phrase as usize].music;
+        self.validation = in_pairs(&self.validation, |w| w.0, |w| (music(w.0), w.1));
+        self.is_paired = true;
+        self
+    }
+
+    /// Returns the number that windows of a pair share, of their numbers.
+    fn shared(&self, number: u64) -> u64 {
+        if self.is_paired { number / PAIR as u64 } else { number }
     }
 
     pub fn dataset(&self) -> &Dataset {
@@ -270,7 +162,10 @@ impl Windows {
 
     /// Returns how many windows an epoch has.
     pub fn n_train(&self) -> usize {
-        self.train.len()
+        match self.is_paired {
+            true => self.train.len().next_multiple_of(PAIR),
+            false => self.train.len(),
+        }
     }
 
     /// Returns how many validation windows there are.
@@ -288,6 +183,10 @@ impl Windows {
         for i in (1..order.len()).rev() {
             order.swap(i, (numbers[i] * (i + 1) as f64) as usize);
         }
+        if self.is_paired {
+            let phrases = self.dataset.phrases();
+            order = in_pairs(&order, |phrase| phrase, |phrase| &*phrases[phrase as usize].music);
+        }
         order
     }
 
@@ -304,7 +203,12 @@ impl Windows {
             self.push(&mut batch, phrase, dancers, audio);
             let mut drawn = [0.0_f64; 4];
             Stream::new(self.seed, CHANCES + number).uniform(0, &mut drawn);
-            let [step, no_audio, no_style, no_clock] = drawn;
+            let [mut step, no_audio, no_style, no_clock] = drawn;
+            if self.is_paired {
+                let mut drawn = [0.0_f64];
+                Stream::new(self.seed, PAIR_STEP + self.shared(number)).uniform(0, &mut drawn);
+                [step] = drawn;
+            }
             batch.chances.push(Chances { step, no_audio, no_style, no_clock });
             push_noise(&mut batch, Stream::new(self.seed, NOISE + number));
         }
@@ -334,7 +238,7 @@ impl Windows {
             self.scales.features.apply(audio.view_mut());
             place(&mut dancers);
             self.push(&mut batch, phrase, dancers, audio);
-            let step = ((number as f64 + 0.5) * GOLDEN).fract();
+            let step = ((self.shared(number as u64) as f64 + 0.5) * GOLDEN).fract();
             batch.chances.push(Chances { step, no_audio: 1.0, no_style: 1.0, no_clock: 1.0 });
             push_noise(&mut batch, Stream::new(0, VALIDATION_NOISE + number as u64));
         }
@@ -359,7 +263,7 @@ impl Windows {
         number: u64,
     ) -> Result<(Vec<Array2<f32>>, Array2<f32>), StoreError> {
         let mut drawn = [0.0_f64; 4];
-        Stream::new(self.seed, CROP + number).uniform(0, &mut drawn);
+        Stream::new(self.seed, CROP + self.shared(number)).uniform(0, &mut drawn);
         let [crop, speed, turn, side] = drawn;
         let Augmentation { condition_noise, mirror, yaw_deg, stretch } = self.augmentation;
         let rate = 1.0 + stretch * (2.0 * speed - 1.0);

@@ -1,6 +1,7 @@
 //! `train`: the UNet learns to remove noise from motion, then the decoder to make motion of latents.
 
 mod group;
+mod judge;
 mod params;
 pub mod session;
 mod summary;
@@ -24,6 +25,7 @@ use crate::training::{
     GroupLearner, Journal, Learner, Loader, Plan, State, TrainConfig, TrainingEnd, TrainingError,
     Windows,
 };
+use judge::ValidationJudge;
 use session::{
     MachineParams, ProgressWatch, check_run_name, claim, claim_path, lease_of, read_phrases, scales,
 };
@@ -293,6 +295,11 @@ impl<'a> Run<'a> {
         let mut learner =
             DiffusionLearner::new(&config.network, &config.diffusion, &augmented, params.seed)?
                 .on(&threads);
+        if let Some(judge) =
+            ValidationJudge::new(&config.network, &phrases.dataset, &scales.features)?
+        {
+            learner = learner.judged_by(judge);
+        }
         // Only now is it certain that there is something to train and to train on.
         if params.force {
             self.clear()?;
