@@ -27,8 +27,8 @@ pub use control::{Constraints, ControlError, Miss, REACH_FRAMES, WantedValue, co
 pub use eager::EagerEngine;
 pub use engine::{Engine, EngineError, EngineInputs};
 pub use group::{
-    GroupCard, GroupEngine, GroupEngineInputs, GroupGenerator, GroupProvenance, GroupTrack,
-    consistency_factor,
+    ConsistencyForm, GroupCard, GroupEngine, GroupEngineInputs, GroupGenerator, GroupProvenance,
+    GroupTrack,
 };
 pub use learned::{LearnedFrom, MusicDigests, MusicSplit, Purpose, ShortDigest};
 pub use pool::Pool;

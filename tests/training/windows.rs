@@ -131,6 +131,67 @@ fn validation_windows_follow_each_other_and_come_again_with_other_noise() {
 }
 
 #[test]
+fn windows_in_pairs_are_of_two_dances_to_the_same_music_cut_alike() {
+    // Three dances to music a, two to music b, one to c; motion of dance i is a constant i in the style channels.
+    let phrase = |name: &'static str, i: usize, music: f32, split: Split| {
+        let mut motion = Array2::<f32>::zeros((61, MOTION_DIM));
+        motion.column_mut(Channel::Quaternion.range().start).fill(1.0);
+        motion.column_mut(Channel::Style.range().start).fill(i as f32);
+        let features = Array2::from_shape_fn((61, 163), |(t, _)| 100.0 * music + t as f32);
+        (name, split, motion, features)
+    };
+    let phrases = [
+        phrase("a.t00", 0, 1.0, Split::Train),
+        phrase("a.t01", 1, 1.0, Split::Train),
+        phrase("a.t02", 2, 1.0, Split::Train),
+        phrase("b.t00", 3, 2.0, Split::Train),
+        phrase("b.t01", 4, 2.0, Split::Train),
+        phrase("v.t00", 5, 3.0, Split::Validation),
+        phrase("w.t00", 6, 4.0, Split::Validation),
+        phrase("v.t01", 7, 3.0, Split::Validation),
+    ];
+    let dataset = Arc::new(Dataset::in_memory(phrases).expect("in memory"));
+    let windows = Windows::new(dataset, Normalizer::identity(), PLAIN, 24, 7).paired();
+    // Five phrases of two windows each.
+    assert_eq!(windows.n_train(), 10);
+    let music = |phrase: u32| u32::from(phrase >= 3);
+    for epoch in 0..9 {
+        let order = windows.order(epoch);
+        let mut counts = BTreeMap::new();
+        order.iter().for_each(|&phrase| *counts.entry(phrase).or_insert(0) += 1);
+        assert_eq!(counts.into_values().collect::<Vec<_>>(), [2; 5]);
+        let pairs: Vec<_> = order.chunks(2).collect();
+        let of_one_music = |pair: &&&[u32]| pair[0] != pair[1] && music(pair[0]) == music(pair[1]);
+        // Of six windows of a and four of b at most one pair is left over.
+        assert!(pairs.iter().filter(of_one_music).count() >= 4, "{order:?}");
+        let numbered: Vec<(u64, u32)> = (epoch * 10..).zip(order.iter().copied()).collect();
+        let batch = windows.train(&numbered).expect("at hand");
+        for (pair, phrases) in batch.chances.chunks(2).zip(&pairs) {
+            assert_eq!(pair[0].step, pair[1].step);
+            assert_ne!(pair[0].no_audio, pair[1].no_audio);
+            assert_eq!(phrases.len(), 2);
+        }
+        let steps: Vec<f64> = batch.chances.iter().step_by(2).map(|c| c.step).collect();
+        assert!(steps.windows(2).all(|pair| pair[0] != pair[1]), "{steps:?}");
+        let size = 24 * 163;
+        for (i, pair) in pairs.iter().enumerate() {
+            let [a, b] = [2 * i, 2 * i + 1].map(|i| &batch.audio[i * size..][..size]);
+            if music(pair[0]) == music(pair[1]) {
+                assert_eq!(a, b, "partners hear the same frames");
+            }
+        }
+        let size = 24 * MOTION_DIM;
+        assert_ne!(batch.noise[..size], batch.noise[size..2 * size]);
+    }
+    // Validation: both windows of v with each other, and those of w, which nobody else dances to.
+    let batch = windows.validation(0..windows.n_validation()).expect("at hand");
+    let ids: Vec<&str> = batch.phrase_ids.iter().map(|id| &**id).collect();
+    assert_eq!(ids, ["v.t00", "v.t01", "v.t00", "v.t01", "w.t00", "w.t00"]);
+    let steps: Vec<f64> = batch.chances.iter().map(|c| c.step).collect();
+    assert!(steps.chunks(2).all(|pair| pair[0] == pair[1]) && steps[0] != steps[2]);
+}
+
+#[test]
 fn every_augmentation_leaves_motion_coherent() {
     let all = Augmentation { condition_noise: 0.3, mirror: true, yaw_deg: 90.0, stretch: 0.2 };
     for augmentation in [

@@ -3,6 +3,7 @@
 use std::num::NonZeroUsize;
 
 use ndarray::{Array2, Array3, ArrayView3};
+use serde::{Deserialize, Serialize};
 
 use crate::audio::FeatureScale;
 use crate::autodiff::op::reduce::{Over, Reduce};
@@ -44,19 +45,49 @@ pub struct GroupEngineInputs<'a> {
     pub z: &'a [f32],
     /// 1 follows the music, more exaggerates it, 0 ignores it.
     pub guidance: f64,
-    /// Factor of ∇ log f that is added to the estimate; 0 for none. See [`consistency_factor`].
-    pub consistency: f64,
+    /// What is moved along ∇ log f, and the factor of the gradient, [`ConsistencyForm::factor`]; 0 for none.
+    pub consistency: (ConsistencyForm, f64),
 }
 
-/// Returns by how much ∇_{x_t} log f moves the estimate of clean motion at a step.
+/// What is moved along the gradient of log f, the score of the estimate x̂0 of a step.
 ///
-/// The paper moves the mean of the posterior: μ̂ = μ + γ Σ ∇ log f(x_t, w) (section 4.4). With DDIM, whose code base
-/// is the published one's, the gradient goes into ε̂ (Dhariwal and Nichol, "Diffusion Models Beat GANs", NeurIPS 2021,
-/// algorithm 2): ε̂' = ε̂ − √(1−ᾱ) γ ∇ log f. Then x̂0' = (x_t − √(1−ᾱ) ε̂') / √ᾱ = x̂0 + γ (1−ᾱ)/√ᾱ ∇ log f, which
-/// every sampler can use.
-pub fn consistency_factor(schedule: &Schedule, t: usize, gamma: f64) -> f64 {
-    let level = schedule.level(Some(t));
-    gamma * level.noise * level.noise / level.signal
+/// The paper moves the mean of the posterior: μ̂ = μ + γ Σ ∇_{x_t} log f (section 4.4), Σ = β̃_t. As a guidance of the
+/// estimate, which every sampler can use, each form is x̂0' = x̂0 + γ k_t ∇ log f.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ConsistencyForm {
+    /// ∇ is by x̂0, k_t = 1 − ᾱ_t.
+    ///
+    /// Guidance by f^γ asks for E[x0 | x_t, f^γ] = x̂0 + γ (1−ᾱ)/√ᾱ ∇_{x_t} log f. By the chain rule
+    /// ∇_{x_t} log f(x̂0) = Jᵀ ∇_{x̂0} log f, and J = ∂x̂0/∂x_t = √ᾱ/(1−ᾱ) Cov[x0 | x_t] (Tweedie's second order), so
+    /// the move is γ Cov[x0 | x_t] ∇_{x̂0} log f. Of normalised motion, whose prior is near N(0, I), the covariance is
+    /// near (1−ᾱ) I. The move is bounded at every step, and nothing goes back through the denoiser.
+    #[default]
+    Estimate,
+    /// ∇ is by x_t, k_t = (1−ᾱ_t)/√ᾱ_t.
+    ///
+    /// The code base of the published code moves ε̂ (Dhariwal and Nichol, "Diffusion Models Beat GANs", NeurIPS 2021,
+    /// algorithm 2): ε̂' = ε̂ − √(1−ᾱ) γ ∇ log f. Then x̂0' = (x_t − √(1−ᾱ) ε̂') / √ᾱ.
+    Noise,
+    /// ∇ is by x_t, k_t = (1−ᾱ_{t−1})/√ᾱ_{t−1}.
+    ///
+    /// The paper's: with μ = √ᾱ_{t−1} β_t/(1−ᾱ_t) x̂0 + … and β̃_t = β_t (1−ᾱ_{t−1})/(1−ᾱ_t).
+    Mean,
+}
+
+impl ConsistencyForm {
+    /// Returns γ k_t.
+    pub fn factor(self, schedule: &Schedule, t: usize, gamma: f64) -> f64 {
+        let ratio = |t: Option<usize>| {
+            let level = schedule.level(t);
+            gamma * level.noise * level.noise / level.signal
+        };
+        match self {
+            Self::Estimate => gamma * schedule.level(Some(t)).noise.powi(2),
+            Self::Noise => ratio(Some(t)),
+            Self::Mean => ratio(t.checked_sub(1)),
+        }
+    }
 }
 
 impl GroupEngine {
@@ -128,22 +159,30 @@ impl GroupEngine {
             threads.run(|| {
                 let given =
                     ForwardInputs { inputs, audio: &audio, x: x.as_slice().expect("in order") };
-                if inputs.consistency == 0.0 {
+                let (form, factor) = inputs.consistency;
+                let follows_noise = factor != 0.0 && form != ConsistencyForm::Estimate;
+                let mut tape = Tape::new(&self.parameters, arena, None);
+                let (x0, w, by) = if follows_noise {
+                    let x = tape.input(inputs.x.shape(), given.x);
+                    let (x0, w) = self.estimate(&mut tape, &given, &x)?;
+                    (x0, w, x)
+                } else {
                     let mut g = Eager::new(&self.parameters, arena);
                     let x = g.constant(inputs.x.shape(), given.x);
-                    let (x0, _) = self.estimate(&mut g, &given, &x)?;
-                    return Ok(to_array(&x0));
-                }
-                let mut tape = Tape::new(&self.parameters, arena, None);
-                let x = tape.input(inputs.x.shape(), given.x);
-                let (x0, w) = self.estimate(&mut tape, &given, &x)?;
+                    let (x0, w) = self.estimate(&mut g, &given, &x)?;
+                    if factor == 0.0 {
+                        return Ok(to_array(&x0));
+                    }
+                    let x0 = tape.input(x0.shape(), x0.data());
+                    (x0.clone(), tape.constant(w.shape(), w.data()), x0)
+                };
                 let log_f = self.log_ratio(&mut tape, &given, &x0, &w)?;
                 let mut moved = to_array(&x0);
                 drop((x0, w));
                 let mut unused = Gradients::new(&self.parameters);
                 let found = tape.backward(log_f, &mut unused)?;
-                if let Some(gradient) = found.of(&x) {
-                    let factor = inputs.consistency as f32;
+                if let Some(gradient) = found.of(&by) {
+                    let factor = factor as f32;
                     moved.iter_mut().zip(gradient.data()).for_each(|(x, &g)| *x += factor * g);
                 }
                 Ok(moved)

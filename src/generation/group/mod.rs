@@ -5,5 +5,5 @@ mod engine;
 mod track;
 
 pub use card::{GroupCard, GroupProvenance};
-pub use engine::{GroupEngine, GroupEngineInputs, consistency_factor};
+pub use engine::{ConsistencyForm, GroupEngine, GroupEngineInputs};
 pub use track::{GroupGenerator, GroupTrack};

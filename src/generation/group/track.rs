@@ -7,7 +7,7 @@
 
 use ndarray::{Array3, ArrayView2, ArrayView3, Axis, s};
 
-use super::engine::{GroupEngine, GroupEngineInputs, consistency_factor};
+use super::engine::{ConsistencyForm, GroupEngine, GroupEngineInputs};
 use crate::autodiff::Stream;
 use crate::diffusion::{SamplerConfig, Schedule, sample_refined};
 use crate::generation::engine::EngineError;
@@ -29,6 +29,7 @@ pub struct GroupGenerator<'a> {
     pub guidance: f64,
     /// γ: above 0 dancers move alike, below 0 each in a way of their own.
     pub consistency: f64,
+    pub form: ConsistencyForm,
     pub normalizer: &'a Normalizer,
     /// Frames of a window, as the model was trained.
     pub window_frames: usize,
@@ -120,7 +121,7 @@ impl GroupGenerator<'_> {
                 n_dancers,
                 z,
                 guidance: self.guidance,
-                consistency: consistency_factor(self.schedule, t, self.consistency),
+                consistency: (self.form, self.form.factor(self.schedule, t, self.consistency)),
             })
         };
         let mut refine = |x0: &mut Array3<f32>| {

@@ -16,7 +16,7 @@ use crate::autodiff::Parameters;
 use crate::diffusion::{Sampler, SamplerConfig, Schedule};
 use crate::evaluation::{derivative_error, score};
 use crate::generation::{
-    EngineError, GroupCard, GroupEngine, GroupGenerator, GroupTrack, ModelFileName,
+    ConsistencyForm, EngineError, GroupCard, GroupEngine, GroupGenerator, GroupTrack, ModelFileName,
 };
 use crate::model::{GroupNetworks, Parameter, condition};
 use crate::motion::group::{MAX_DANCERS, RADIUS_M, separate};
@@ -59,6 +59,8 @@ struct GroupSettings {
     n_dancers: usize,
     /// γ: how alike dancers move.
     consistency: f64,
+    /// What γ moves.
+    consistency_form: ConsistencyForm,
     sampler: SamplerConfig,
     /// 1 follows the music, more exaggerates it, 0 ignores it.
     guidance: f64,
@@ -123,6 +125,7 @@ impl GroupSettings {
             output_version: OUTPUT_VERSION,
             n_dancers,
             consistency,
+            consistency_form: params.consistency_form.into(),
             sampler,
             guidance,
             overlap_frames: params.overlap,
@@ -174,6 +177,7 @@ pub fn run(
             schedule: &schedule,
             guidance: settings.guidance,
             consistency: settings.consistency,
+            form: settings.consistency_form,
             normalizer: &card.normalizer,
             window_frames: card.window_frames,
             overlap_frames: settings.overlap_frames,

@@ -11,6 +11,7 @@ use super::constraints_file::ConstraintsRequest;
 use super::outputs::MotionFormat;
 use super::settings::{MotionSettings, OUTPUT_VERSION};
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
+use crate::generation::ConsistencyForm;
 use crate::generation::{ModelCard, OVERLAP_FRAMES};
 use crate::motion::postprocess::{
     Coherence, FusionVariances, Hemisphere, PostProcessConfig, SavitzkyGolay,
@@ -33,6 +34,25 @@ pub enum SamplerName {
     /// DPM-Solver++(2M): 8 to 20 steps.
     #[default]
     DpmSolver,
+}
+
+/// The forms of --consistency by the names of the flag.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum ConsistencyFormName {
+    #[default]
+    Estimate,
+    Noise,
+    Mean,
+}
+
+impl From<ConsistencyFormName> for ConsistencyForm {
+    fn from(name: ConsistencyFormName) -> Self {
+        match name {
+            ConsistencyFormName::Estimate => Self::Estimate,
+            ConsistencyFormName::Noise => Self::Noise,
+            ConsistencyFormName::Mean => Self::Mean,
+        }
+    }
 }
 
 /// Which phrases of a store.
@@ -128,6 +148,10 @@ pub struct Params {
     /// do; other than 0 it takes three times as long [default: 0]
     #[arg(long, value_name = "GAMMA", allow_hyphen_values = true, help_heading = "Groups")]
     pub consistency: Option<f64>,
+    /// What --consistency moves at every step: the estimate, by its own gradient; or, three times as slow, the noise
+    /// that is predicted (Dhariwal and Nichol) or the mean of the step (the paper), by the gradient through the network.
+    #[arg(long, value_name = "FORM", value_enum, default_value_t, help_heading = "Groups")]
+    pub consistency_form: ConsistencyFormName,
     /// Let bodies touch where they were sampled so, instead of moving them apart.
     #[arg(long, help_heading = "Groups")]
     pub no_separation: bool,

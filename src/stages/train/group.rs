@@ -13,7 +13,7 @@ use crate::stages::train::Train;
 use crate::stages::{Progress, Stage as _, Summary};
 use crate::store::Location;
 use crate::training::{
-    Augmentation, CheckpointKind, GroupLearner, GroupTrainConfig, Learner as _, TrainingEnd,
+    Augmentation, CheckpointKind, GroupLearner, GroupTrainConfig, Learner as _, PAIR, TrainingEnd,
     Windows,
 };
 
@@ -64,6 +64,13 @@ fn check_numbers(config: &GroupTrainConfig) -> anyhow::Result<()> {
     {
         ensure!(x.is_finite() && x >= 0.0, "{flag} {x} is no weight; give 0 or more");
     }
+    let n = training.batch_size;
+    ensure!(
+        n.is_multiple_of(PAIR) || training.losses.contrast == 0.0,
+        "--batch-size {n} is odd; groups are told from mixed ones in pairs to the same music, so give {} or {}",
+        n - 1,
+        n + 1
+    );
     let peak = training.learning_rate.peak;
     ensure!(
         peak > 0.0 && peak.is_finite(),
@@ -95,7 +102,8 @@ impl Run<'_> {
             Augmentation::default(),
             config.network.window_frames,
             0,
-        );
+        )
+        .paired();
         let n_elements = GroupNetworks::new(&config.network.group).1.n_elements();
         Ok(Box::new(TrainDryRun {
             run: self.params.run.clone(),
@@ -134,7 +142,7 @@ impl Run<'_> {
             n_frames,
             params.seed,
         );
-        let windows = Arc::new(windows.heard_by(config.network.group.condition()));
+        let windows = Arc::new(windows.paired().heard_by(config.network.group.condition()));
         let mut account = TrainSummary::new(&params.run, self.store, phrases.left_out.clone());
         let mut learner =
             GroupLearner::new(&config.network, &config.group, &windows, params.seed)?.on(&threads);

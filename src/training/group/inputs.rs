@@ -11,16 +11,16 @@ use crate::diffusion::Schedule;
 use crate::model::{
     Graph, GroupConfig, GroupInputs, GroupNetworks, GroupScoreInputs, Result as GraphResult,
 };
-use crate::motion::{MOTION_DIM, Normalizer};
+use crate::motion::{Channel, MOTION_DIM, Normalizer};
+use crate::training::batch::Batch;
 use crate::training::diffusion::without_clock;
 use crate::training::drive::Losses;
 use crate::training::error::TrainingError;
 use crate::training::sampling::motion_view;
-use crate::training::window::Batch;
 
 use super::GroupTraining;
 use super::markers::markers;
-use super::negatives::mixed;
+use super::negatives::{MixedGroups, mixed};
 
 /// Streams of random numbers of a batch, told apart by their use.
 const EMBEDDING_NOISE: u64 = 1 << 61;
@@ -215,12 +215,41 @@ impl<'a> GroupBatch<'a> {
             })
             .collect();
         let mask = g.constant(&[n_groups, slots * patches], &mask);
+        let moves = self.moves(x0.data(), &mixed);
         let x0 = g.apply(TakeSamples::new(mixed.dancers), &[x0])?;
+        let moves = g.constant(x0.shape(), &moves);
+        let x0 = g.add(&x0, &moves)?;
         let w = g.apply(TakeSamples::new(mixed.groups), &[w])?;
         let inputs = GroupScoreInputs { x0: &x0, t: &t, w: &w, number: &number, mask: Some(&mask) };
         let logits = networks.score.forward(g, &inputs)?;
         let logits = g.apply(Reshape::new(&[n, 1 + n_negatives]), &[&logits])?;
         let labels = g.constant(&[n], &vec![0.0; n]);
         g.apply(CrossEntropy::default(), &[&logits, &labels]).map(Some)
+    }
+
+    /// Returns what is added to dancers of mixed groups that dance in the place of another: the difference of their mean
+    /// places on the floor, \[rows, T, 25\].
+    fn moves(&self, x0: &[f32], mixed: &MixedGroups) -> Vec<f32> {
+        let frames = self.batch.n_frames;
+        let mean = |dancer: usize, channel: usize| -> f32 {
+            let (mask, rows) = (&self.mask[dancer * frames..], &x0[dancer * frames * MOTION_DIM..]);
+            let rows = rows.chunks_exact(MOTION_DIM).zip(mask).take(frames);
+            let (sum, n) = rows.fold((0.0_f64, 0.0), |(sum, n), (row, &w)| {
+                (sum + f64::from(w * row[channel]), n + f64::from(w))
+            });
+            (sum / f64::max(n, 1.0)) as f32
+        };
+        let mut moves = vec![0.0; mixed.dancers.len() * frames * MOTION_DIM];
+        let of_dancer = moves.chunks_exact_mut(frames * MOTION_DIM);
+        for ((rows, &dancer), &floor) in of_dancer.zip(&mixed.dancers).zip(&mixed.floor) {
+            if dancer != floor {
+                let first = Channel::Position.range().start;
+                for channel in [first, first + 2] {
+                    let by = mean(floor, channel) - mean(dancer, channel);
+                    rows.chunks_exact_mut(MOTION_DIM).for_each(|row| row[channel] = by);
+                }
+            }
+        }
+        moves
     }
 }

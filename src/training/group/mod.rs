@@ -14,11 +14,12 @@ use crate::model::{GroupConfig, GroupNetworks};
 use crate::weights::{Archive, Section};
 
 use super::averaged::NetworkState;
+use super::batch::{Batch, PAIR};
 use super::checkpoint::Progress;
 use super::diffusion::tape_seed;
 use super::drive::{Learner, Losses, NoReduction, Reducer, StepResult, Validation};
 use super::error::TrainingError;
-use super::window::{Batch, Windows};
+use super::window::Windows;
 pub use config::{GroupLosses, GroupNetworkConfig, GroupTrainConfig, GroupTraining};
 use inputs::{GroupBatch, WithholdAll};
 
@@ -85,13 +86,15 @@ impl GroupLearner {
 
     /// Computes the gradients of a batch, part by part; returns its losses.
     ///
-    /// Windows are sorted by their number of dancers, so that a part has few places without one.
+    /// Pairs of windows are sorted by their number of dancers, so that a part has few places without one, and stay
+    /// together.
     fn differentiate(&mut self, batch: &Batch, step: u64) -> Result<Losses, TrainingError> {
         let side_by_side = self.gradients.len();
-        let n_parts = (self.config.accumulate * side_by_side).clamp(1, batch.n_windows);
+        let n_pairs = batch.n_windows.div_ceil(PAIR);
+        let n_parts = (self.config.accumulate * side_by_side).clamp(1, n_pairs);
         let batch = batch.by_number_of_dancers();
         let all = batch.weight();
-        let at = |part: usize| part * batch.n_windows / n_parts;
+        let at = |part: usize| (part * n_pairs / n_parts * PAIR).min(batch.n_windows);
         let Self {
             gradients,
             arenas,
@@ -188,7 +191,7 @@ impl Learner for GroupLearner {
     fn validate(&mut self) -> Result<Validation, TrainingError> {
         let losses = self.validation_losses(self.network.average())?;
         let live = self.validation_losses(self.network.live())?;
-        Ok(Validation { losses, live: Some(live.total) })
+        Ok(Validation { losses, live: Some(live.total), distance: None })
     }
 
     fn sections(&self) -> Vec<Section<'_, f32>> {
