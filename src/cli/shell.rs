@@ -6,6 +6,7 @@ use clap::{Arg, ArgMatches, Command};
 use clap_complete::Shell;
 use clap_mangen::Man;
 
+use super::help::in_one_tier;
 use crate::stages::Summary;
 
 const COMPLETIONS: &str = "completions";
@@ -75,7 +76,7 @@ fn page(program: Command, stage: Option<&str>) -> io::Result<Vec<u8>> {
         None => program,
     };
     let mut text = Vec::new();
-    Man::new(page).render(&mut text)?;
+    Man::new(in_one_tier(page)).render(&mut text)?;
     Ok(text)
 }
 

@@ -18,7 +18,7 @@ use super::learned;
 use super::model_files::{POINTER, current_folder, folder_of, is_model_name, pointer_to, sha256};
 use super::train::session::{MachineParams, ProgressWatch, check_run_name, read_phrases};
 use super::trained::{TrainedRun, WeightsChoice};
-use super::{ClientParams, Contract, Progress, Stage, Summary, lease};
+use super::{ClientParams, Contract, Progress, RARE, Stage, Summary, lease};
 use crate::generation::{ModelFileName, file_names};
 use crate::model::Family;
 use crate::motion::rates::MotionRange;
@@ -59,10 +59,10 @@ pub struct Params {
     pub licence: String,
     /// Leave out the decoder's last layer, which fuses poses with velocities: decoded channels then contradict each
     /// other, and agree only after post-processing.
-    #[arg(long)]
+    #[arg(long, hide_short_help = RARE)]
     pub no_fusion: bool,
     /// Largest weights that lie within the .onnx file itself, in MB; larger ones lie beside it.
-    #[arg(long, value_name = "MB", default_value_t = 1000)]
+    #[arg(long, value_name = "MB", default_value_t = 1000, hide_short_help = RARE)]
     pub embed_mb: usize,
     /// Replace a model of the same name.
     #[arg(long)]
@@ -71,7 +71,7 @@ pub struct Params {
     #[arg(long)]
     pub dry_run: bool,
     /// Library of onnxruntime [default: ORT_DYLIB_PATH, else beside the program, in .runtime, of the system]
-    #[arg(long, value_name = "FILE", help_heading = "Machine")]
+    #[arg(long, value_name = "FILE", help_heading = "Machine", hide_short_help = RARE)]
     pub ort_lib: Option<PathBuf>,
     #[command(flatten)]
     pub machine: MachineParams,

@@ -11,7 +11,7 @@ use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::time::Instant;
 
-use super::{ClientParams, Contract, LinkParams, Progress, Stage, Summary, all_threads};
+use super::{ClientParams, Contract, LinkParams, Progress, RARE, Stage, Summary, all_threads};
 use crate::store::tables::PhraseRow;
 use crate::store::{
     Cache, Ledger, Location, Row as _, Shard, Source, StoreError, StoreSnapshot, checkpoint, digest,
@@ -60,13 +60,15 @@ pub struct Params {
     #[arg(long, value_name = "N", default_value_t = all_threads())]
     pub workers: NonZeroUsize,
     /// Phrases committed together, about; also how many a kill can cost each worker.
-    #[arg(long, value_name = "N", default_value_t = NonZeroUsize::new(512).expect("512 is not 0"))]
+    #[arg(long, value_name = "N", default_value_t = NonZeroUsize::new(512).expect("512 is not 0"),
+          hide_short_help = RARE)]
     pub batch_phrases: NonZeroUsize,
     /// Keep copies of remote files in this folder and read them from there next time.
     #[arg(long, value_name = "DIR", help_heading = "Remote storage")]
     pub cache: Option<PathBuf>,
     /// Size of the cache in GB (10^9 bytes); the least recently used files leave first.
-    #[arg(long, value_name = "GB", default_value_t = 20.0, help_heading = "Remote storage")]
+    #[arg(long, value_name = "GB", default_value_t = 20.0, help_heading = "Remote storage",
+          hide_short_help = RARE)]
     pub cache_size_gb: f64,
     #[command(flatten)]
     pub links: LinkParams,

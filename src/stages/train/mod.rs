@@ -13,7 +13,7 @@ use anyhow::{bail, ensure};
 use super::failure::quoted;
 use super::learned::{learned_path, remember};
 use super::trained::best;
-use super::{ClientParams, Contract, Progress, Stage, Summary};
+use super::{ClientParams, Contract, Progress, RARE, Stage, Summary};
 use crate::autodiff::{Arena, Parameters};
 use crate::diffusion::Schedule;
 use crate::model::{Family, UNet1D};
@@ -45,7 +45,7 @@ pub struct Params {
     #[arg(long, value_name = "NAME")]
     pub run: String,
     /// Refuse to start a run that does not exist.
-    #[arg(long)]
+    #[arg(long, hide_short_help = RARE)]
     pub resume: bool,
     #[command(flatten)]
     pub budget: BudgetParams,
@@ -79,23 +79,28 @@ pub struct BudgetParams {
     #[arg(long, value_name = "M", help_heading = "Budget")]
     pub minutes: Option<f64>,
     /// Steps of the decoder.
-    #[arg(long, value_name = "N", default_value_t = 2000, help_heading = "Budget")]
+    #[arg(long, value_name = "N", default_value_t = 2000, help_heading = "Budget",
+          hide_short_help = RARE)]
     pub decoder_steps: u64,
     /// Epochs from one validation to the next.
-    #[arg(long, value_name = "N", default_value_t = 5, help_heading = "Budget")]
+    #[arg(long, value_name = "N", default_value_t = 5, help_heading = "Budget",
+          hide_short_help = RARE)]
     pub validate_every: u64,
     /// Validations without improvement after which training ends; 0 for never.
-    #[arg(long, value_name = "N", default_value_t = 0, help_heading = "Budget")]
+    #[arg(long, value_name = "N", default_value_t = 0, help_heading = "Budget",
+          hide_short_help = RARE)]
     pub patience: u64,
     /// Epochs from one checkpoint to the next.
-    #[arg(long, value_name = "N", default_value_t = 10, help_heading = "Budget")]
+    #[arg(long, value_name = "N", default_value_t = 10, help_heading = "Budget",
+          hide_short_help = RARE)]
     pub save_every: u64,
     /// Steps from one checkpoint to the next, beside --save-every.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..),
-          help_heading = "Budget")]
+          help_heading = "Budget", hide_short_help = RARE)]
     pub save_every_steps: Option<u64>,
     /// Longest time between two checkpoints, in minutes.
-    #[arg(long, value_name = "M", default_value_t = 10.0, help_heading = "Budget")]
+    #[arg(long, value_name = "M", default_value_t = 10.0, help_heading = "Budget",
+          hide_short_help = RARE)]
     pub save_every_minutes: f64,
 }
 
