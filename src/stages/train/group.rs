@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use anyhow::{Context as _, ensure};
 
+use super::budget::StageBudget;
 use super::session::{ProgressWatch, claim, lease_of, read_phrases, scales};
 use super::{Params, Run, TrainDryRun, TrainSummary, resume_command};
 use crate::model::{Family, GroupNetworks};
@@ -144,7 +145,7 @@ impl Run<'_> {
         }
         claim(self.store, &params.run, Train::NAME, config, machine.patience(), self.watch)?;
         let steps =
-            super::StageBudget { share: 1.0, ..self.steps_of_diffusion(config.group.batch_size) };
+            StageBudget { share: 1.0, ..params.budget.of_denoiser(config.group.batch_size) };
         let end = self.stage(config, steps, &mut learner, &windows, &mut account)?;
         if end == TrainingEnd::Interrupted {
             return Ok(Box::new(account.interrupted(&resume_command(params))));
