@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 
 pub use super::model_folder::{
-    ModelFolder, POINTER, current_folder, folder_of, is_model_name, pointer_to, sha256,
+    ModelFolder, POINTER, current_folder, folder_of, is_model_name, pointer_to, sha256, sha256_of,
 };
 use super::{RARE, all_threads};
 use crate::autodiff::Parameters;

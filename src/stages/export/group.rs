@@ -3,26 +3,27 @@
 mod checks;
 mod summary;
 
-use std::collections::BTreeMap;
 use std::num::NonZeroUsize;
 
-use anyhow::{Context as _, bail};
+use anyhow::Context as _;
 use bytes::Bytes;
 
-use super::files::weights_sha256;
-use super::{Export, MAX_TRAIN_PHRASES, Params, card_path, motion_range, publish, record, tuning};
+use super::files::{
+    ExportedFiles, NetworkFile, alphas_cumprod, encode, entries, program, weights_sha256,
+};
+use super::{Export, MAX_TRAIN_PHRASES, Params, motion_range, put_in_place, tuning};
 use crate::autodiff::Parameters;
-use crate::diffusion::Schedule;
 use crate::generation::{
-    FileEntry, GroupCard, GroupEngine, GroupProvenance, ModelFileName, own_channels, own_features,
+    FamilyCard as _, GroupCard, GroupEngine, GroupProvenance, MODEL_FORMAT, ModelFileName,
+    own_channels, own_features,
 };
 use crate::model::{Family, GroupNetworks, ParameterId, ParameterList};
-use crate::onnx::{EncodedModel, Model, ModelFile, Runtime, check, group_denoiser, group_score};
+use crate::onnx::{group_denoiser, group_score};
 use crate::stages::learned;
-use crate::stages::model_files::{folder_of, sha256};
+use crate::stages::model_files::folder_of;
 use crate::stages::train::session::{ProgressWatch, read_phrases};
-use crate::stages::{Progress, Stage as _, Summary, lease};
-use crate::store::{Location, checkpoint};
+use crate::stages::{Progress, Stage as _, Summary};
+use crate::store::Location;
 use crate::training::{
     CheckpointKind, Checkpoints, GROUP, GroupLearner, GroupTrainConfig, Learner as _, State,
     TrainingError,
@@ -79,10 +80,10 @@ pub fn run(
     drop(engine);
     let range = motion_range(dataset)?;
     let mut card = GroupCard {
-        format: GroupCard::own_format(),
+        format: MODEL_FORMAT,
         family: Family::Group,
         name: params.model.clone(),
-        program: format!("{} {}", env!("CARGO_PKG_NAME"), env!("CARGO_PKG_VERSION")),
+        program: program(),
         provenance: GroupProvenance {
             run: params.run.clone(),
             step: trained.step,
@@ -93,10 +94,7 @@ pub fn run(
         precision: params.precision,
         group: network.group.clone(),
         diffusion: network.diffusion.clone(),
-        alphas_cumprod: {
-            let schedule = Schedule::new(&network.diffusion)?;
-            (0..schedule.len()).map(|t| schedule.alpha_bar(t)).collect()
-        },
+        alphas_cumprod: alphas_cumprod(&network.diffusion)?,
         n_parameters: trained.parameters.list().n_elements(),
         weights_sha256: weights_sha256(&trained.parameters),
         window_frames: network.window_frames,
@@ -110,46 +108,25 @@ pub fn run(
         licence: params.licence.clone(),
         files: Vec::new(),
     };
-    let files = files(&trained, params, &card)?;
-    card.files = files
-        .iter()
-        .map(|(name, bytes)| FileEntry {
-            name: *name,
-            n_bytes: bytes.len() as u64,
-            sha256: sha256(bytes),
-        })
-        .collect();
-    let mut text = serde_json::to_vec_pretty(&card)?;
-    text.push(b'\n');
-    let card_text = Bytes::from(text);
+    let bytes = files(&trained, params, &card)?;
+    card.files = entries(&bytes);
+    let files = ExportedFiles::new(card, bytes)?;
     let place = store.url_of(&folder_of(&params.model));
-    let told = |is_up_to_date, checks| {
-        let (card, place) = (card.clone(), place.clone());
+    let summary = |is_up_to_date, checks| {
+        let (card, place) = (files.card.clone(), place.clone());
         Box::new(GroupExportSummary { card, place, checks, is_up_to_date, is_dry_run })
     };
     if is_dry_run {
-        return Ok(told(false, Vec::new()));
+        return Ok(summary(false, Vec::new()));
     }
-    let (folder, what) = (folder_of(&params.model), format!("model {}", params.model));
-    let (lease, _) = lease::take(store, &folder, &what, &|text| progress.note(text))?;
-    match store.read_if_there(&card_path(store, &params.model)?)? {
-        Some(there) if there == card_text => return Ok(told(true, Vec::new())),
-        Some(_) if !params.force => bail!(
-            "store {store} has a model \"{}\" of other weights or settings; give another --model name, or \
-             replace it with --force",
-            params.model
-        ),
-        _ => {}
-    }
-    let runtime = Runtime::load(params.ort_lib.as_deref())?;
-    let results = checks(&trained, params, &files, &runtime)?;
-    progress.is_interrupted();
-    record(store, params, &card_text, &results)?;
-    checkpoint(store, &[Export::NAME]);
-    results.require(&params.model)?;
-    lease.check()?;
-    publish(store, &params.model, (&files, &card_text))?;
-    Ok(told(false, results.rows))
+    let results =
+        put_in_place(params, store, (&files.bytes, &files.card_text), progress, |runtime| {
+            checks(&trained, params, &files.bytes, runtime)
+        })?;
+    Ok(match results {
+        Some(results) => summary(false, results.rows),
+        None => summary(true, Vec::new()),
+    })
 }
 
 /// A run that was trained.
@@ -201,33 +178,16 @@ fn files(
     let (_, list) = crate::model::GroupScore::new(config);
     let weights = |id: ParameterId| trained.values(false, &list, id);
     let score = group_score(config, &weights, storage)?;
-    let entries = [
-        ("model", card.name.clone()),
-        ("family", card.family.name().to_owned()),
-        ("run", card.provenance.run.clone()),
-        ("data", card.provenance.data.clone()),
-        ("licence", card.licence.clone()),
-        ("precision", card.precision.name().to_owned()),
-        ("fps", card.fps.to_string()),
-        ("window_frames", card.window_frames.to_string()),
-        ("channels", card.channels.join(",")),
-        ("features", card.features.join(",")),
-        ("diffusion", serde_json::to_string(&card.diffusion)?),
-        ("normalizer", serde_json::to_string(&card.normalizer)?),
-        ("group", serde_json::to_string(&card.group)?),
-        ("weights_sha256", card.weights_sha256.clone()),
-    ];
-    let metadata: BTreeMap<String, String> =
-        entries.into_iter().map(|(key, value)| (format!("motiongen.{key}"), value)).collect();
-    let mut files = Vec::new();
-    for (graph, name) in [(denoiser, ModelFileName::Denoiser), (score, ModelFileName::Score)] {
-        let description = format!("{} of {}, by {}", graph.name, card.name, card.program);
-        let file = ModelFile { graph, metadata: metadata.clone(), description };
+    let own =
+        [("family", card.family.name().to_owned()), ("group", serde_json::to_string(&card.group)?)];
+    let network = |graph, name| NetworkFile {
+        graph,
+        name,
+        weights_sha256: &card.weights_sha256,
         // The largest preset has 250 MB.
-        let EncodedModel { model, .. } = file.encode("", usize::MAX);
-        let read = Model::read(model.clone(), None, name.name())?;
-        check(&read, name.name()).map_err(|e| anyhow::anyhow!("{e}; please report this"))?;
-        files.push((name, model));
-    }
-    Ok(files)
+        weights_beside: None,
+    };
+    let networks =
+        vec![network(denoiser, ModelFileName::Denoiser), network(score, ModelFileName::Score)];
+    encode(networks, card.shared(), &own)
 }
