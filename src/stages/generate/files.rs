@@ -9,7 +9,8 @@ use anyhow::{Context as _, bail};
 use ndarray::ArrayView2;
 
 use super::GenerateTally;
-use super::maker::{GeneratedMotion, MotionMaker, PhraseMusic};
+use super::maker::{GeneratedMotion, MotionMaker};
+use super::music::PhraseMusic;
 use super::outputs::{self, MotionFormat, MotionOutput};
 use super::receipt::{Receipt, digest_of_song};
 use crate::motion::exchange::{csv_header, write_csv_rows};

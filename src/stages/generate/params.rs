@@ -11,7 +11,7 @@ use super::constraints_file::ConstraintsRequest;
 use super::outputs::MotionFormat;
 use super::settings::{MotionSettings, OUTPUT_VERSION};
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
-use crate::generation::{ModelCard, OVERLAP_FRAMES};
+use crate::generation::{FamilyCard, ModelCard, OVERLAP_FRAMES};
 use crate::motion::postprocess::{
     Coherence, FusionVariances, Hemisphere, PostProcessConfig, SavitzkyGolay,
 };
@@ -260,6 +260,47 @@ impl PostProcessParams {
     }
 }
 
+/// How windows are sampled, by a model of any family.
+pub struct SamplingSettings {
+    pub sampler: SamplerConfig,
+    /// 1 follows the music, more exaggerates it, 0 ignores it.
+    pub guidance: f64,
+    /// Frames that neighbouring windows share.
+    pub overlap_frames: usize,
+}
+
+impl Params {
+    /// Returns how windows of a model are sampled.
+    ///
+    /// # Errors
+    /// One sentence for what this model or any sampler cannot do.
+    pub fn sampling(&self, card: &impl FamilyCard) -> anyhow::Result<SamplingSettings> {
+        let model = card.shared();
+        let n_train = Schedule::new(model.diffusion)?.len();
+        let sampler = match self.sampler {
+            SamplerName::Ddpm => Sampler::Ddpm,
+            SamplerName::Ddim => Sampler::Ddim { eta: self.eta },
+            SamplerName::DpmSolver => Sampler::DpmSolver,
+        };
+        let n_steps = self.steps.unwrap_or_else(|| sampler.usual_steps(n_train));
+        let sampler = SamplerConfig { sampler, n_steps, spacing: self.spacing, clip: true };
+        sampler.check(n_train)?;
+        let guidance = self.guidance.unwrap_or_else(|| card.guidance());
+        ensure!(
+            guidance >= 0.0 && guidance.is_finite(),
+            "--guidance {guidance} is below 0; give 1 to follow the music, more to exaggerate it"
+        );
+        let overlap_frames = self.overlap;
+        ensure!(
+            overlap_frames < model.window_frames,
+            "--overlap {overlap_frames} is not below the {} frames of a window of model {}; give a smaller number",
+            model.window_frames,
+            model.name
+        );
+        Ok(SamplingSettings { sampler, guidance, overlap_frames })
+    }
+}
+
 /// How sampling begins from the library's motion.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Prime {
@@ -294,27 +335,7 @@ impl Settings {
     /// # Errors
     /// One sentence for what this model or any sampler cannot do.
     pub fn new(params: &Params, card: &ModelCard) -> anyhow::Result<Self> {
-        let schedule = Schedule::new(&card.diffusion)?;
-        let sampler = match params.sampler {
-            SamplerName::Ddpm => Sampler::Ddpm,
-            SamplerName::Ddim => Sampler::Ddim { eta: params.eta },
-            SamplerName::DpmSolver => Sampler::DpmSolver,
-        };
-        let n_steps = params.steps.unwrap_or_else(|| sampler.usual_steps(schedule.len()));
-        let sampler = SamplerConfig { sampler, n_steps, spacing: params.spacing, clip: true };
-        sampler.check(schedule.len())?;
-        let guidance = params.guidance.unwrap_or_else(|| card.guidance());
-        ensure!(
-            guidance >= 0.0 && guidance.is_finite(),
-            "--guidance {guidance} is below 0; give 1 to follow the music, more to exaggerate it"
-        );
-        ensure!(
-            params.overlap < card.window_frames,
-            "--overlap {} is not below the {} frames of a window of model {}; give a smaller number",
-            params.overlap,
-            card.window_frames,
-            card.name
-        );
+        let SamplingSettings { sampler, guidance, overlap_frames } = params.sampling(card)?;
         let strength = params.constraint_strength;
         ensure!(
             (0.0..=1.0).contains(&strength),
@@ -332,7 +353,7 @@ impl Settings {
             seed: params.seed,
             best_of: params.best_of.get(),
             style: style(&params.style, card)?,
-            overlap_frames: params.overlap,
+            overlap_frames,
             prime: None,
             postprocess: params.postprocess.config((card.motion_range, card.fusion_variances()))?,
             constraints,
@@ -370,14 +391,6 @@ impl Settings {
         );
         self.prime = Some(Prime { n_left, library: library.to_owned() });
         Ok(())
-    }
-
-    /// Returns η, for a sampler that has one.
-    pub fn eta(&self) -> Option<f64> {
-        match self.sampler.sampler {
-            Sampler::Ddim { eta } => Some(eta),
-            Sampler::Ddpm | Sampler::DpmSolver => None,
-        }
     }
 
     /// Returns the settings as `generations` keeps them: without seed and weights, and of constraints the
