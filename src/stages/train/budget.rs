@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use crate::stages::RARE;
-use crate::training::Plan;
+use crate::training::{Patience, Plan};
 
 /// Share of a time budget that the decoder gets.
 const DECODER_SHARE: f64 = 0.1;
@@ -71,7 +71,7 @@ impl BudgetParams {
 
     /// Returns the plan of a stage that trains on `n_train` windows, for a store that is waited for as long as
     /// `store_patience`.
-    pub fn plan(&self, budget: StageBudget, n_train: usize, store_patience: Duration) -> Plan {
+    pub fn plan(&self, budget: StageBudget, n_train: usize, store_patience: Patience) -> Plan {
         let minutes = |m: f64| Duration::try_from_secs_f64(m * 60.0).unwrap_or(Duration::MAX);
         let StageBudget { n_steps, n_epochs, share, batch_size } = budget;
         Plan {
