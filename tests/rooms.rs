@@ -4,17 +4,18 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Which rooms a room may use.
-const MAY_USE: [(&str, &[&str]); 20] = [
+const MAY_USE: [(&str, &[&str]); 21] = [
     ("units", &[]),
-    ("audio", &["instructions", "units"]),
+    ("audio", &["excerpt", "instructions", "units"]),
     ("autodiff", &["instructions", "model"]),
     ("chance", &[]),
     ("diffusion", &[]),
-    ("evaluation", &["motion", "units"]),
+    ("evaluation", &["chance", "motion", "units"]),
+    ("excerpt", &[]),
     ("generation", &["audio", "autodiff", "diffusion", "model", "motion", "onnx", "units"]),
     ("instructions", &[]),
     ("model", &["audio", "motion", "units"]),
-    ("motion", &["chance", "units"]),
+    ("motion", &["chance", "excerpt", "units"]),
     ("music", &["audio", "chance"]),
     ("onnx", &["audio", "model", "motion"]),
     ("plot", &["motion", "units"]),

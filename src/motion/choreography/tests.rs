@@ -1,6 +1,6 @@
 //! What the dance owes to the music, measured on songs whose beats and loudness are known.
 
-use super::accent::{LEVER_ARM_M, norm};
+use super::accent::LEVER_ARM_M;
 use super::floor::HALF_FLOOR_M;
 use super::selection::RATES;
 use super::*;
@@ -8,6 +8,7 @@ use crate::motion::locking::bar_locking;
 use crate::motion::phase::bar_phase_at_tempo;
 use crate::motion::quaternion::{from_axis_angle, make_sign_continuous, mul, normalize};
 use crate::motion::trajectory::{ChannelLimits, Trajectory};
+use crate::motion::vector::norm;
 use crate::units::FPS;
 use std::f64::consts::TAU;
 
@@ -180,7 +181,7 @@ fn accents_fall_on_beats() {
     let effort: Vec<f64> = vectors(&dance.frames, Channel::Velocity)
         .iter()
         .zip(vectors(&dance.frames, Channel::AngularVelocity))
-        .map(|(v, w)| v[0].hypot(v[2]) + LEVER_ARM_M * norm(&w))
+        .map(|(v, w)| v[0].hypot(v[2]) + LEVER_ARM_M * norm(w))
         .collect();
     let mean = effort.iter().sum::<f64>() / effort.len() as f64;
     let ends: Vec<f64> = dance
@@ -221,7 +222,7 @@ fn every_frame_obeys_the_identities_and_moves_as_people_do() {
         }
         let acceleration = vectors(&dance, Channel::Acceleration);
         let jerk = forward_differences(&acceleration);
-        let mean = jerk.iter().map(norm).sum::<f64>() / jerk.len() as f64;
+        let mean = jerk.iter().copied().map(norm).sum::<f64>() / jerk.len() as f64;
         // The range of 64 real captures.
         assert!((5.0..=404.0).contains(&mean), "{tempo_bpm}: {mean}");
         let phase = bar_phase(&music.times_s, &music.beats);
