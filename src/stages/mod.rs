@@ -1,5 +1,6 @@
 //! Stages: what the user runs. Each has a contract, parameters, a run and a summary.
 
+mod batch;
 pub mod beats;
 pub mod compact;
 pub mod evaluate;
@@ -18,6 +19,7 @@ mod model_files;
 mod model_folder;
 mod motion_source;
 pub mod plot;
+mod pool;
 mod pretrained;
 #[cfg(feature = "query")]
 pub mod query;

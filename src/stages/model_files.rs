@@ -11,7 +11,8 @@ pub use super::model_folder::{
 use super::{RARE, all_threads};
 use crate::autodiff::Parameters;
 use crate::generation::{
-    EagerEngine, Engine, ModelCard, ModelFileName, OnnxEngine, SessionPlan, file_names,
+    EagerEngine, Engine, FamilyCard as _, ModelCard, ModelFileName, OnnxEngine, SessionPlan,
+    file_names,
 };
 use crate::model::{MotionDecoder, ParameterList, UNet1D};
 use crate::onnx::{Device, Model, OnnxError, PINNED_VERSION, Runtime, Session, check, values_of};

@@ -10,8 +10,8 @@ use sha2::{Digest as _, Sha256};
 use super::pretrained;
 pub use crate::generation::is_name as is_model_name;
 use crate::generation::{
-    CardError, FileEntry, GroupCard, MAX_CARD_BYTES, ModelCard, ModelFileName, family_of,
-    file_names,
+    CardError, FamilyCard as _, FileEntry, GroupCard, MAX_CARD_BYTES, ModelCard, ModelFileName,
+    family_of, file_names,
 };
 use crate::model::Family;
 use crate::store::{Location, StoreError, prepared};

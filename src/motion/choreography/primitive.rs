@@ -13,6 +13,7 @@ use super::super::quaternion::{
 };
 use super::super::spline::{CubicSpline, SplineError};
 use super::super::trajectory::Trajectory;
+use super::super::vector::norm;
 use super::accent::{cuts, effort, energy, held_differences};
 use super::activity::mid_rank;
 use crate::units::{FPS, frames_to_s};

@@ -268,7 +268,7 @@ fn record(
 #[cfg(all(test, feature = "pretrained"))]
 mod tests {
     use super::*;
-    use crate::generation::ModelCard;
+    use crate::generation::{FamilyCard as _, ModelCard};
     use crate::stages::pretrained;
     use crate::store::ClientOptions;
 

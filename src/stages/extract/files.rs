@@ -7,13 +7,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
 use super::one::{ExtractedFeatures, Origin, extract, needed_bytes};
-use super::pool::{self, Budget, lock};
 use super::{ExtractJob, ExtractTally};
 use crate::audio::FEATURE_DIM;
 use crate::audio::header::read_header_from;
 use crate::motion::npz::NpzWriter;
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::feature_file::write_blocks;
+use crate::stages::pool::{self, Budget, lock};
 use crate::store::{
     Content, PartWriter, SourceFile, StoreError, is_standard_output, replace_file, tables,
     temporary_beside,

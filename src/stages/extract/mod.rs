@@ -3,7 +3,6 @@
 mod files;
 mod one;
 mod phrases;
-pub(in crate::stages) mod pool;
 
 use std::io::{self, Write};
 use std::num::NonZeroUsize;

@@ -17,7 +17,7 @@ use crate::autodiff::Parameters;
 use crate::diffusion::{SamplerConfig, Schedule};
 use crate::evaluation::{derivative_error, score};
 use crate::generation::{
-    EngineError, GroupCard, GroupEngine, GroupGenerator, GroupTrack, ModelFileName,
+    EngineError, FamilyCard as _, GroupCard, GroupEngine, GroupGenerator, GroupTrack, ModelFileName,
 };
 use crate::model::{GroupNetworks, Parameter};
 use crate::motion::Channel;

@@ -14,9 +14,10 @@ use std::time::Instant;
 use super::{ClientParams, Contract, LinkParams, Progress, RARE, Stage, Summary, all_threads};
 use crate::store::tables::PhraseRow;
 use crate::store::{
-    Cache, Ledger, Location, Row as _, Shard, Source, StoreError, StoreSnapshot, checkpoint, digest,
+    Cache, Location, Row as _, Shard, Source, StoreError, StoreSnapshot, checkpoint, digest,
 };
 
+use super::batch::BatchJob;
 use super::failure::{Failure, failures_json, write_failures, write_notes};
 use super::seen::SeenContent;
 pub(in crate::stages) use crate::audio::formats::is_audio_extension as is_audio;
@@ -121,11 +122,18 @@ impl Stage for Ingest {
 
         let mine: Vec<_> = plan.phrases.iter().filter(|p| shard.takes(&p.id)).collect();
         let origin = source.location().url();
+        let batches = BatchJob {
+            store: &store,
+            stage: Self::NAME,
+            params_hash: &params_hash,
+            origin,
+            ledger: &ledger,
+        };
         let is_done = |p: &PlannedPhrase| {
             !params.force
                 && !params.verify
                 && !unidentified.contains(&p.id)
-                && is_settled(p, &ledger, &seen, &params_hash, origin)
+                && is_settled(p, &batches, &seen)
         };
         let (done, todo): (Vec<_>, Vec<_>) = mine.into_iter().partition(|p| is_done(p));
         tracing::info!(
@@ -156,24 +164,22 @@ impl Stage for Ingest {
         } else {
             snapshot.checkpoint();
             progress.start("ingest", "phrases", todo.len() as u64);
-            let batches = batch::batches(&plan.phrases, todo, params.batch_phrases.get());
+            let todo = batch::batches(&plan.phrases, todo, params.batch_phrases.get());
             let job = batch::IngestJob {
                 source: &source,
-                store: &store,
-                ledger: &ledger,
+                batches,
                 seen: &seen,
                 rules: &params.rules,
-                params_hash: &params_hash,
                 progress,
                 unidentified: &unidentified,
                 force: params.force,
             };
-            report.tally.add(job.run(&batches, params.workers.get())?);
+            report.tally.add(job.run(&todo, params.workers)?);
             if !report.tally.is_stopped {
                 job.forget_failures(&plan.phrases, shard)?;
             }
             // The plan and the catalogue of a million phrases are not needed at once.
-            drop(batches);
+            drop(todo);
             drop((plan.phrases, ledger, seen));
             checkpoint(&store, &[Self::NAME]);
             progress.finish();
@@ -200,22 +206,12 @@ fn params_hash(rules: &IngestRules) -> String {
 /// Returns whether the store has a phrase's rows for these files and rules.
 ///
 /// Size and time tell a file's versions apart, not the files of two sources.
-fn is_settled(
-    planned: &PlannedPhrase,
-    ledger: &Ledger,
-    seen: &SeenContent,
-    params_hash: &str,
-    origin: &str,
-) -> bool {
-    let fingerprint = batch::fingerprint(planned);
-    let refused = ledger.get(&batch::contested(&planned.id, origin));
-    let is_refused = refused.is_some_and(|known| known.item.failure.is_some());
-    !is_refused
-        && ledger.get(&planned.id).is_some_and(|known| {
+fn is_settled(planned: &PlannedPhrase, batches: &BatchJob, seen: &SeenContent) -> bool {
+    let (origin, fingerprint) = (batches.origin, batch::fingerprint(planned));
+    !batches.has_failed(&batch::contested(&planned.id, origin))
+        && batches.known(&planned.id).is_some_and(|known| {
             let is_same = known.origin == origin && known.item.fingerprint == fingerprint;
-            known.params_hash == params_hash
-                && known.item.succeeded()
-                && (is_same || seen.has(known, origin, &fingerprint))
+            known.item.succeeded() && (is_same || seen.has(known, origin, &fingerprint))
         })
 }
 

@@ -3,7 +3,8 @@
 use std::time::Duration;
 
 use crate::stages::RARE;
-use crate::training::{Patience, Plan};
+use crate::store::Patience;
+use crate::training::Plan;
 
 /// Share of a time budget that the decoder gets.
 const DECODER_SHARE: f64 = 0.1;

@@ -1,7 +1,5 @@
 //! The files of a model of groups, held against the interpreter that trained its networks.
 
-use std::io::Write as _;
-
 use anyhow::Context as _;
 use bytes::Bytes;
 use ndarray::Array3;
