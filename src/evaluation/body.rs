@@ -118,12 +118,4 @@ mod tests {
         assert_eq!(poses(frames.view()), None);
         assert_eq!(poses(Array2::zeros((0, MOTION_DIM)).view()), Some(Poses::default()));
     }
-
-    #[test]
-    fn products_are_those_of_the_axes() {
-        assert_eq!(cross([0.0, 0.0, 1.0], [1.0, 0.0, 0.0]), [0.0, 1.0, 0.0]);
-        assert_eq!(inner([1.0, 2.0, 3.0], [4.0, -5.0, 6.0]), 12.0);
-        assert_eq!(norm([2.0, -3.0, 6.0]), 7.0);
-        assert_eq!(minus([1.0, 2.0, 3.0], [3.0, 2.0, 1.0]), [-2.0, 0.0, 2.0]);
-    }
 }

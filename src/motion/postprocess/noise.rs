@@ -89,7 +89,7 @@ pub fn noisy(poses: &Poses, variances: &FusionVariances, seed: u64) -> FusionMea
     }
     for q in &mut measured.orientation {
         let error = from_rotation_vector(noise.vector(&variances.orientation_rad2));
-        let sign = if noise.uniform() < 0.3 { -1.0 } else { 1.0 };
+        let sign = if noise.0.uniform() < 0.3 { -1.0 } else { 1.0 };
         *q = mul(error, *q).map(|c| sign * c);
     }
     measured
