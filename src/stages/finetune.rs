@@ -2,12 +2,12 @@
 
 use std::num::NonZeroUsize;
 use std::sync::Arc;
-use std::time::Duration;
 
 use anyhow::ensure;
 
 use super::failure::quoted;
 use super::learned::{learned_path, remember};
+use super::train::budget::{SavingParams, minutes};
 use super::train::session::{
     MachineParams, ProgressWatch, check_run_name, claim, claim_path, lease_of, read_phrases,
 };
@@ -57,18 +57,8 @@ pub struct Params {
     #[arg(long, value_name = "N", default_value_t = 1, help_heading = "Budget",
           hide_short_help = RARE)]
     pub validate_every: u64,
-    /// Epochs from one checkpoint to the next.
-    #[arg(long, value_name = "N", default_value_t = 10, help_heading = "Budget",
-          hide_short_help = RARE)]
-    pub save_every: u64,
-    /// Steps from one checkpoint to the next, beside --save-every.
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..),
-          help_heading = "Budget", hide_short_help = RARE)]
-    pub save_every_steps: Option<u64>,
-    /// Longest time between two checkpoints, in minutes.
-    #[arg(long, value_name = "M", default_value_t = 10.0, help_heading = "Budget",
-          hide_short_help = RARE)]
-    pub save_every_minutes: f64,
+    #[command(flatten)]
+    pub saving: SavingParams,
     /// Windows of a step.
     #[arg(long, value_name = "N", default_value_t = NonZeroUsize::new(8).expect("not 0"),
           help_heading = "Optimizer")]
@@ -257,9 +247,10 @@ impl Params {
             self.start
         );
         self.temporal.check()?;
-        for (flag, x) in
-            [("--minutes", self.minutes), ("--save-every-minutes", Some(self.save_every_minutes))]
-        {
+        for (flag, x) in [
+            ("--minutes", self.minutes),
+            ("--save-every-minutes", Some(self.saving.save_every_minutes)),
+        ] {
             let is_positive = x.is_none_or(|x| x > 0.0 && x.is_finite());
             ensure!(is_positive, "{flag} is not above 0; give a positive number");
         }
@@ -267,7 +258,6 @@ impl Params {
     }
 
     fn plan(&self, windows: &Windows) -> Plan {
-        let minutes = |m: f64| Duration::try_from_secs_f64(m * 60.0).unwrap_or(Duration::MAX);
         let is_bounded = self.steps.is_some() || self.minutes.is_some();
         Plan {
             n_steps: self.steps,
@@ -277,9 +267,9 @@ impl Params {
             batch_size: self.batch_size.get() as u64,
             validate_first: true,
             validate_every_epochs: self.validate_every,
-            save_every_epochs: self.save_every,
-            save_every_steps: self.save_every_steps,
-            save_every: minutes(self.save_every_minutes),
+            save_every_epochs: self.saving.save_every,
+            save_every_steps: self.saving.save_every_steps,
+            save_every: minutes(self.saving.save_every_minutes),
             patience: (self.patience > 0).then_some(self.patience),
             store_patience: self.machine.patience(),
         }

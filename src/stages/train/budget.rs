@@ -33,6 +33,13 @@ pub struct BudgetParams {
     #[arg(long, value_name = "N", default_value_t = 0, help_heading = "Budget",
           hide_short_help = RARE)]
     pub patience: u64,
+    #[command(flatten)]
+    pub saving: SavingParams,
+}
+
+/// When checkpoints are written.
+#[derive(Clone, Debug, clap::Args)]
+pub struct SavingParams {
     /// Epochs from one checkpoint to the next.
     #[arg(long, value_name = "N", default_value_t = 10, help_heading = "Budget",
           hide_short_help = RARE)]
@@ -45,6 +52,11 @@ pub struct BudgetParams {
     #[arg(long, value_name = "M", default_value_t = 10.0, help_heading = "Budget",
           hide_short_help = RARE)]
     pub save_every_minutes: f64,
+}
+
+/// Returns so many minutes, or the longest time that there is.
+pub fn minutes(m: f64) -> Duration {
+    Duration::try_from_secs_f64(m * 60.0).unwrap_or(Duration::MAX)
 }
 
 /// How long a network is trained: by steps, epochs, or its share of the time.
@@ -73,7 +85,6 @@ impl BudgetParams {
     /// Returns the plan of a stage that trains on `n_train` windows, for a store that is waited for as long as
     /// `store_patience`.
     pub fn plan(&self, budget: StageBudget, n_train: usize, store_patience: Patience) -> Plan {
-        let minutes = |m: f64| Duration::try_from_secs_f64(m * 60.0).unwrap_or(Duration::MAX);
         let StageBudget { n_steps, n_epochs, share, batch_size } = budget;
         Plan {
             n_steps,
@@ -83,9 +94,9 @@ impl BudgetParams {
             batch_size: batch_size as u64,
             validate_first: false,
             validate_every_epochs: self.validate_every,
-            save_every_epochs: self.save_every,
-            save_every_steps: self.save_every_steps,
-            save_every: minutes(self.save_every_minutes),
+            save_every_epochs: self.saving.save_every,
+            save_every_steps: self.saving.save_every_steps,
+            save_every: minutes(self.saving.save_every_minutes),
             patience: (self.patience > 0).then_some(self.patience),
             store_patience,
         }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use anyhow::{Context as _, ensure};
 
 use super::budget::StageBudget;
-use super::session::{ProgressWatch, claim, lease_of, read_phrases, scales};
+use super::session::{ProgressWatch, claim, lease_of, scales};
 use super::{Params, Run, TrainDryRun, TrainSummary, resume_command};
 use crate::model::{Family, GroupNetworks};
 use crate::motion::Normalizer;
@@ -79,17 +79,7 @@ impl Run<'_> {
         config: &GroupTrainConfig,
         progress: &dyn Progress,
     ) -> anyhow::Result<Box<dyn Summary>> {
-        let machine = &self.params.machine;
-        let dancers = Family::Group;
-        let phrases = read_phrases(
-            self.store,
-            Train::NAME,
-            (machine, dancers),
-            None,
-            progress,
-            self.watch,
-            true,
-        )?;
+        let phrases = self.phrases(Family::Group, progress)?;
         let windows = Windows::new(
             phrases.dataset,
             Normalizer::identity(),
@@ -115,16 +105,7 @@ impl Run<'_> {
     ) -> anyhow::Result<Box<dyn Summary>> {
         let params = self.params;
         let machine = &params.machine;
-        let dancers = Family::Group;
-        let phrases = read_phrases(
-            self.store,
-            Train::NAME,
-            (machine, dancers),
-            None,
-            progress,
-            self.watch,
-            false,
-        )?;
+        let phrases = self.phrases(Family::Group, progress)?;
         let threads = Arc::new(machine.start_threads()?);
         let n_frames = config.network.window_frames;
         let scales = scales(&phrases.dataset, n_frames, self.watch)?;

@@ -1,6 +1,6 @@
 //! `train`: the UNet learns to remove noise from motion, then the decoder to make motion of latents.
 
-mod budget;
+pub mod budget;
 mod group;
 mod params;
 pub mod session;
@@ -26,7 +26,8 @@ use crate::training::{
 };
 use budget::{BudgetParams, StageBudget};
 use session::{
-    MachineParams, ProgressWatch, check_run_name, claim, claim_path, lease_of, read_phrases, scales,
+    MachineParams, ProgressWatch, TrainingPhrases, check_run_name, claim, claim_path, lease_of,
+    read_phrases, scales,
 };
 pub use summary::{StageSummary, TrainDryRun, TrainSummary};
 
@@ -146,7 +147,7 @@ fn check_numbers(params: &Params, config: &TrainConfig) -> anyhow::Result<()> {
     };
     positive("--learning-rate", d.learning_rate.peak)?;
     positive("--decoder-learning-rate", config.decoder.learning_rate.peak)?;
-    positive("--save-every-minutes", params.budget.save_every_minutes)?;
+    positive("--save-every-minutes", params.budget.saving.save_every_minutes)?;
     params.budget.minutes.map_or(Ok(()), |minutes| positive("--minutes", minutes))?;
     ensure!(
         d.augmentation.condition_noise >= 0.0 && d.augmentation.yaw_deg >= 0.0,
@@ -176,6 +177,13 @@ impl<'a> Run<'a> {
         })
     }
 
+    /// Reads the phrases that networks of a family learn from.
+    fn phrases(&self, family: Family, progress: &dyn Progress) -> anyhow::Result<TrainingPhrases> {
+        let Params { machine, dry_run, .. } = self.params;
+        let (store, watch) = (self.store, self.watch);
+        read_phrases(store, Train::NAME, (machine, family), None, progress, watch, *dry_run)
+    }
+
     /// Removes what the run has left, so that it can begin anew.
     fn clear(&mut self) -> anyhow::Result<()> {
         for stage in
@@ -199,16 +207,7 @@ impl<'a> Run<'a> {
         config: &TrainConfig,
         progress: &dyn Progress,
     ) -> anyhow::Result<Box<dyn Summary>> {
-        let machine = &self.params.machine;
-        let phrases = read_phrases(
-            self.store,
-            Train::NAME,
-            (machine, Family::Unet),
-            None,
-            progress,
-            self.watch,
-            true,
-        )?;
+        let phrases = self.phrases(Family::Unet, progress)?;
         let n_frames = config.network.window_frames;
         let windows = Windows::new(
             phrases.dataset,
@@ -234,16 +233,7 @@ impl<'a> Run<'a> {
         progress: &dyn Progress,
     ) -> anyhow::Result<Box<dyn Summary>> {
         let params = self.params;
-        let machine = &params.machine;
-        let phrases = read_phrases(
-            self.store,
-            Train::NAME,
-            (machine, Family::Unet),
-            None,
-            progress,
-            self.watch,
-            false,
-        )?;
+        let phrases = self.phrases(Family::Unet, progress)?;
         let threads = Arc::new(params.machine.start_threads()?);
         let n_frames = config.network.window_frames;
         let scales = scales(&phrases.dataset, n_frames, self.watch)?;

@@ -12,6 +12,7 @@ use serde::de::DeserializeOwned;
 use crate::autodiff::Threads;
 use crate::model::Family;
 use crate::motion::group::MAX_DANCERS;
+use crate::stages::model_folder::is_model_name;
 use crate::stages::{Progress, RARE, all_threads, lease};
 use crate::store::tables::FailureRow;
 use crate::store::{
@@ -22,9 +23,6 @@ use crate::training::{
     Dataset, DatasetOptions, Ensemble, ExcludedPhrase, Scales, TrainingError, Watch, differences,
     fit_scales,
 };
-
-/// Longest name of a run.
-const MAX_NAME: usize = 100;
 
 /// Where failures of phrases come from.
 const ITEMS_FROM: &str = "phrases";
@@ -70,13 +68,9 @@ impl MachineParams {
 
 /// Refuses a name that could not be a folder everywhere.
 pub fn check_run_name(run: &str) -> anyhow::Result<()> {
-    let is_plain = |c: char| c.is_ascii_alphanumeric() || ['-', '_', '.'].contains(&c);
     ensure!(
-        !run.is_empty()
-            && run.len() <= MAX_NAME
-            && run.chars().all(is_plain)
-            && !run.starts_with('.'),
-        "--run {run:?} is no name for a run; use 1 to {MAX_NAME} letters, digits, -, _ and ., and no . \
+        is_model_name(run),
+        "--run {run:?} is no name for a run; use 1 to 100 letters, digits, -, _ and ., and no . \
          at the beginning"
     );
     Ok(())
