@@ -133,3 +133,92 @@ impl BatchCommit<'_> {
         if self.commit.is_empty() { Ok(()) } else { self.commit.publish().map(|_| ()) }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::stages::failure::FailureKind;
+    use crate::store::tables::BeatRow;
+    use crate::store::{ClientOptions, StoreSnapshot};
+
+    const STAGE: &str = "test";
+
+    fn item(id: &str, failure: Option<&Failure>) -> Item {
+        let failure = failure.map(Failure::digest);
+        Item { id: id.to_owned(), fingerprint: "f".to_owned(), input_hash: "i".to_owned(), failure }
+    }
+
+    fn beat(id: &str) -> BeatRow {
+        BeatRow {
+            phrase_id: id.to_owned(),
+            beat: 0,
+            frame: 3,
+            time_s: 0.1,
+            number: None,
+            source: None,
+        }
+    }
+
+    fn failed(store: &Location) -> Vec<(String, String, String)> {
+        let snapshot = StoreSnapshot::take(store).expect("commits");
+        let rows: Vec<FailureRow> =
+            snapshot.table(FailureRow::schema()).expect("a table").rows().expect("rows");
+        rows.into_iter().map(|row| (row.phrase_id, row.source, row.message)).collect()
+    }
+
+    #[test]
+    fn batches_are_as_many_as_their_number_or_their_weight_asks_for() {
+        for (by_count, by_weight, expected) in
+            [(0, 0, 1), (1, 1, 1), (3, 1, 4), (2, 5, 8), (8, 3, 8), (9, 16, 16)]
+        {
+            assert_eq!(n_batches(by_count, by_weight), expected, "{by_count}, {by_weight}");
+        }
+    }
+
+    #[test]
+    fn a_batch_is_committed_whole_and_its_failures_are_listed_in_order_and_forgotten() {
+        let store = Location::open("memory://batches", &ClientOptions::default()).expect("a store");
+        let failure = Failure::new(FailureKind::Layout, "b", "b: is no song");
+        let ledger = Ledger::default();
+        let job = BatchJob {
+            store: &store,
+            stage: STAGE,
+            params_hash: "p",
+            origin: "o",
+            ledger: &ledger,
+        };
+        // What settles nothing leaves no trace, whatever was listed.
+        let mut commit = job.start();
+        commit.list_failure("z", "url", &failure);
+        commit.publish().expect("nothing to publish");
+        assert_eq!(store.list("").expect("a listing"), []);
+
+        let mut commit = job.start();
+        commit.rows(&[beat("a")]).expect("rows");
+        commit.rows::<BeatRow>(&[]).expect("no rows");
+        commit.settle(item("a", None));
+        // Listed in another order than they are settled in.
+        commit.list_failure("b @ o", "url of b", &failure);
+        commit.list_failure("a @ o", "url of a", &failure);
+        commit.settle(item("a @ o", Some(&failure)));
+        commit.settle(item("b @ o", Some(&failure)));
+        commit.publish().expect("published");
+        let row =
+            |id: &str| (format!("{id} @ o"), format!("url of {id}"), "b: is no song".to_owned());
+        assert_eq!(failed(&store), [row("a"), row("b")]);
+
+        let ledger = Ledger::read(&store, STAGE).expect("commits");
+        let job = BatchJob { ledger: &ledger, ..job };
+        assert!(job.known("a").is_some_and(|known| known.item == item("a", None)));
+        assert!(job.has_rows("a") && !job.has_failed("a") && job.has_failed("b @ o"));
+        assert!(!job.has_rows("c") && !job.has_failed("c"));
+        // With other parameters an item is not known, but its failure still is one.
+        let other = BatchJob { params_hash: "q", ..job };
+        assert!(other.known("a").is_none() && other.has_failed("b @ o") && other.has_rows("a"));
+        // From elsewhere nothing is forgotten.
+        BatchJob { origin: "elsewhere", ..job }.forget_failures(|_| true).expect("nothing to do");
+        assert_eq!(failed(&store).len(), 2);
+        job.forget_failures(|id| id == "a @ o").expect("published");
+        assert_eq!(failed(&store), [row("b")]);
+    }
+}
