@@ -57,3 +57,48 @@ pub fn is_setting(arg: &Arg) -> bool {
     );
     arg.get_long().is_some() && !is_question
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_rare_flag_is_left_out_of_the_short_help_and_of_no_other() {
+        let flag = |name: &'static str, heading: &'static str| {
+            Arg::new(name).long(name).help_heading(heading).help(format!("about {name}"))
+        };
+        let kind = Command::new("kind").arg(flag("depth", "Sizes").hide_short_help(true));
+        let command = Command::new("stage")
+            .long_about("about")
+            .args([flag("store", "Options"), flag("beta", "Noise").hide_short_help(true)])
+            .arg(flag("gamma", "Noise").hide_short_help(true))
+            .arg(flag("quiet", GENERAL).hide_short_help(true))
+            .subcommand(kind);
+        let mut command = in_tiers(command, "The end.");
+        command.build();
+        let short = command.render_help().to_string();
+        assert!(short.contains("--store") && short.contains("--help-all"), "{short}");
+        for rare in ["--beta", "--gamma", "--quiet", "about beta"] {
+            assert!(!short.contains(rare), "{rare}: {short}");
+        }
+        assert!(short.ends_with("More flags with --help-all: Noise.\n\nThe end.\n"), "{short}");
+        let long = command.render_long_help().to_string();
+        for text in ["--store", "--beta", "--gamma", "--quiet", "about beta", "The end."] {
+            assert!(long.contains(text), "{text}: {long}");
+        }
+        let kind = command.find_subcommand_mut("kind").expect("the kind");
+        assert!(kind.render_help().to_string().contains("More flags with --help-all: Sizes."));
+        let page = in_one_tier(command).render_help().to_string();
+        assert!(page.contains("--beta"), "{page}");
+    }
+
+    #[test]
+    fn questions_are_no_settings() {
+        let mut command = in_tiers(Command::new("stage").version("1"), "");
+        command = command.arg(Arg::new("on").long("on").action(ArgAction::SetTrue));
+        command = command.arg(Arg::new("v").long("v").action(ArgAction::Count));
+        command.build();
+        let settings = command.get_arguments().filter(|arg| is_setting(arg));
+        assert_eq!(settings.filter_map(Arg::get_long).collect::<Vec<_>>(), ["on"]);
+    }
+}

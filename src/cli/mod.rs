@@ -107,18 +107,20 @@ pub fn stage<S: Stage>() -> ExitCode {
 /// Runs `motiongen`, which has every stage as a subcommand.
 pub fn front_door() -> ExitCode {
     let entries = entries();
-    let mut command = Command::new(PROGRAM)
+    let hint = format!("{}\n\n{EXIT_CODES}", shell::HINT);
+    let command = Command::new(PROGRAM)
         .version(VERSION)
         .about("Turns a music library into motion, stage by stage.")
         .subcommand_value_name("STAGE")
         .subcommand_help_heading("Stages, in the order of a pipeline")
         .args(general("Take defaults from this TOML file".to_owned()));
+    // Stages have help of their own.
+    let mut command = help::in_tiers(command, &hint);
     for entry in &entries {
         command = command.subcommand((entry.command)());
     }
     let stages: Vec<&'static str> = entries.iter().map(|entry| entry.name).collect();
-    let hint = format!("{}\n\n{EXIT_CODES}", shell::HINT);
-    command = help::in_tiers(command, &hint).subcommands(shell::commands(&stages));
+    let command = command.subcommands(shell::commands(&stages));
     let program = command.clone();
     let arguments: Vec<OsString> = std::env::args_os().collect();
     if arguments.len() < 2 {
