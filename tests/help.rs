@@ -91,6 +91,26 @@ fn help_shows_what_matters_and_help_all_every_flag() {
 }
 
 #[test]
+fn the_program_and_its_commands_for_the_shell_have_help_of_both_kinds() {
+    let front = help(&[], "--help");
+    for text in ["Stages, in the order of a pipeline", "  vacuum ", "--config", "--help-all"] {
+        assert!(front.contains(text), "{text}: {front}");
+    }
+    assert!(!front.contains("--summary") && help(&[], "--help-all").contains("--summary"));
+    for command in ["completions", "man"] {
+        let text = help(&[command], "--help");
+        assert!(
+            text.contains("xample: motiongen man") || text.contains("bash: motiongen"),
+            "{text}"
+        );
+        assert!(flags(&text).iter().any(|flag| flag == "--help-all"), "{text}");
+    }
+    // As a stage's own executable and as a page of the help command.
+    let whole = run(["help", "train"]).stdout;
+    assert!(whole.contains("--beta-start") && whole.contains("Exit codes: 0 done"), "{whole}");
+}
+
+#[test]
 fn the_rare_flags_of_train_are_grouped_and_named_in_the_short_help() {
     let (short, long) = (help(&["train"], "--help"), help(&["train"], "--help-all"));
     let more = "More flags with --help-all: Budget, Networks, Diffusion, Groups, Augmentation, Optimizer, Decoder, \
