@@ -16,9 +16,7 @@ SONG   ?= $(firstword $(sort $(wildcard $(DATA)/music/gunroar/*.ogg)))
 
 .DEFAULT_GOAL := demo
 include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
-
-SOURCES := phrases music
-ANSWERS := $(OUT)/queries.txt
+include $(PIPELINES)songs.mk
 
 .PHONY: demo
 demo:
@@ -32,19 +30,6 @@ demo:
 	@echo "report   $(REPORT) (open it in a browser)"
 	@echo "verdicts $(MOTIONGEN) query --store $(STORE) \"select verdict, test, outcome, message from verdicts \
 	where split = 'held_out'\""
-
-# ingest: both sources into one store.
-$(foreach s,$(SOURCES),$(call watch,$(s),$(DATA)/$(s),$(STORE)))
-$(call prune)
-WITH := $(CONFIG) $(PROGRAM) $(MOTIONGEN)
-INGESTED := $(SOURCES:%=$(STAMPS)/ingest-%.done)
-$(INGESTED): $(STAMPS)/ingest-%.done: | $(STAMPS)/%.list $(WITH)
-	$(call stage,$(MOTIONGEN) ingest --config $(CONFIG) --source $(DATA)/$* --store $(STORE))
-
-# extract: the audio features of every song.
-EXTRACTED := $(STAMPS)/extract.done
-$(EXTRACTED): | $(INGESTED) $(WITH)
-	$(call stage,$(MOTIONGEN) extract --config $(CONFIG) --store $(STORE))
 
 # library: phrases to train on, constructed from the songs and the captures.
 LIBRARY := $(STAMPS)/library.done
@@ -130,14 +115,6 @@ define VERDICTS
 select verdict, verdict_outcome, test, outcome, round(value, 3) as value, rule, round(threshold, 3) as threshold, against
 from verdicts where split = '\''held_out'\'' order by verdict, test
 endef
-# Lines become spaces on the way to the shell.
-define newline
-
-
-endef
-comma := ,
-ask = @{ echo; echo '$(1)'; $(MOTIONGEN) query --config $(CONFIG) --store $(STORE) \
-	'$(subst $(newline), ,$($(2)))'; } | tee --append $(ANSWERS).new
 
 ANSWERED := $(STAMPS)/answers.done
 $(ANSWERED): | $(INGESTED) $(EXTRACTED) $(LIBRARY) $(TRAINED) $(EXPORTED) $(PLOTTED) $(GENERATED) $(SHOWN) \

@@ -15,9 +15,8 @@ SONG   ?= $(firstword $(sort $(wildcard $(DATA)/music/gunroar/*.ogg)))
 
 .DEFAULT_GOAL := demo-group
 include $(dir $(lastword $(MAKEFILE_LIST)))common.mk
+include $(PIPELINES)songs.mk
 
-SOURCES := phrases music
-ANSWERS := $(OUT)/queries.txt
 # γ, and how runs are called.
 DEGREES := apart=-1 neutral=0 unison=1
 
@@ -29,17 +28,6 @@ demo-group:
 	@echo "answers  $(ANSWERS)"
 	@echo "model    $(STORE)/models/$(MODEL)"
 	@echo "motion   $(PAGE) (open it in a browser)"
-
-$(foreach s,$(SOURCES),$(call watch,$(s),$(DATA)/$(s),$(STORE)))
-$(call prune)
-WITH := $(CONFIG) $(PROGRAM) $(MOTIONGEN)
-INGESTED := $(SOURCES:%=$(STAMPS)/ingest-%.done)
-$(INGESTED): $(STAMPS)/ingest-%.done: | $(STAMPS)/%.list $(WITH)
-	$(call stage,$(MOTIONGEN) ingest --config $(CONFIG) --source $(DATA)/$* --store $(STORE))
-
-EXTRACTED := $(STAMPS)/extract.done
-$(EXTRACTED): | $(INGESTED) $(WITH)
-	$(call stage,$(MOTIONGEN) extract --config $(CONFIG) --store $(STORE))
 
 # library: groups of two to five dancers.
 LIBRARY := $(STAMPS)/library.done
@@ -72,11 +60,6 @@ $(SHOWN): | $(EXPORTED) $(WITH)
 	$(call stage,$(MOTIONGEN) generate --config $(CONFIG) --model $(STORE)/models/$(MODEL) --audio $(SONG) \
 	  --output $(OUT)/motion --dancers 5 --consistency 0.5 --format npy$(comma)glb$(comma)png$(comma)html,$(PAGE))
 
-comma := ,
-define newline
-
-
-endef
 define UNISON
 select unison, count(*) as phrases, round(avg(n_dancers), 2) as dancers
 from phrases where n_dancers > 1 group by unison order by unison
@@ -88,8 +71,7 @@ join (select distinct run, consistency from generations) g on g.run = m.run
 where m.metric in ('\''unison_index'\'', '\''gmc_correlation'\'', '\''tif'\'', '\''group_locking'\'', '\''gmr'\'')
 and m.variant = '\'''\'' order by m.metric, m.subject, g.consistency
 endef
-ask = @{ echo; echo '$(1)'; $(MOTIONGEN) query --config $(CONFIG) --store $(STORE) \
-	'$(subst $(newline), ,$($(2)))'; } | tee --append $(ANSWERS).new
+
 ANSWERED := $(STAMPS)/answers.done
 $(ANSWERED): | $(EVALUATED) $(SHOWN) $(WITH)
 	@rm -f $(ANSWERS).new

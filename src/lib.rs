@@ -8,6 +8,7 @@ pub mod chance;
 pub mod cli;
 pub mod diffusion;
 pub mod evaluation;
+mod excerpt;
 pub mod generation;
 mod instructions;
 pub mod model;

@@ -5,10 +5,10 @@
 use std::f64::consts::TAU;
 use std::thread;
 
+use motiongen::chance::Draws;
 use motiongen::evaluation::coupling::{
     CoupledPassage, Coupling, CouplingSums, Harmonics, consistency_p, rotation_p,
 };
-use motiongen::evaluation::draws::Draws;
 use motiongen::evaluation::interval::{
     Estimate, clustered_mean_estimate, clustered_share_estimate, jackknife_estimate,
     paired_difference,

@@ -1,6 +1,6 @@
 //! The evaluation's metrics against `tests/golden/metrics/make.py`.
 
-use std::collections::BTreeMap;
+mod golden;
 
 use motiongen::evaluation::beats::{
     BeatScore, beat_alignment, motion_beats, phase_coherence, phase_error, rayleigh,
@@ -27,174 +27,15 @@ use motiongen::evaluation::reference_statistics::{
 use motiongen::evaluation::sanity::checks;
 use motiongen::evaluation::window_range::{Posture, WindowRange, posture};
 use motiongen::motion::rates::MotionRange;
-use motiongen::motion::{Channel, ChannelLimits, MOTION_DIM, Poses};
+use motiongen::motion::{Channel, ChannelLimits};
 use ndarray::{Array2, ArrayView2, s};
-use serde::Deserialize;
+
+use golden::{MotionRow, golden};
 
 /// Of every metric, relative to it; both sides compute in double precision.
 const TOLERANCE: f64 = 1e-6;
 /// Below this a number is nothing but rounding.
 const NOTHING: f64 = 1e-12;
-
-#[derive(Deserialize)]
-struct Golden {
-    motions: Vec<MotionRow>,
-    thresholds: GeometricThresholds,
-    training_range: MotionRange,
-    locking: LockingRows,
-    /// Rotations, and the coefficient on the constructed coupling at each.
-    coupling: Vec<[f64; 2]>,
-    postures: Vec<PostureRow>,
-    window_range: WindowRange,
-    channels: Vec<f64>,
-    features: FeatureRows,
-    control: ControlRows,
-    intervals: IntervalRows,
-}
-
-#[derive(Deserialize)]
-struct MotionRow {
-    n_frames: usize,
-    frames: Vec<f32>,
-    music_s: Vec<f64>,
-    bar_frames: f64,
-    first_frame: f64,
-    seed: u64,
-    checks: BTreeMap<String, f64>,
-    beats: BeatRows,
-    phases: BTreeMap<String, f64>,
-    axes: Vec<f64>,
-    axes_compat: Vec<f64>,
-    markers: Vec<f64>,
-    markers_compat: Vec<f64>,
-    geometric: Vec<f64>,
-    consistency: BTreeMap<String, f64>,
-}
-
-#[derive(Deserialize)]
-struct BeatRows {
-    motion_beats: Vec<usize>,
-    n_music_beats: usize,
-    motion_to_music: Vec<BeatRow>,
-    music_to_motion: Vec<BeatRow>,
-}
-
-#[derive(Deserialize)]
-struct BeatRow {
-    score: f64,
-    chance: f64,
-    lift: f64,
-    z: f64,
-}
-
-#[derive(Deserialize)]
-struct LockingRows {
-    ratios: Vec<f64>,
-    alone: LockingRow,
-    together: LockingRow,
-    mistimed: LockingRow,
-}
-
-#[derive(Deserialize)]
-struct LockingRow {
-    r2: f64,
-    wrong_mean: f64,
-    effect: f64,
-    wrong_share: f64,
-}
-
-#[derive(Deserialize)]
-struct PostureRow {
-    speed_m_s: f64,
-    turn_rate_rad_s: f64,
-    tilt_rad: f64,
-    lowest_m: f64,
-    highest_m: f64,
-    turning_rad_s: f64,
-    jerk_m_s3: f64,
-    axis_speed_m_s: [f64; 3],
-}
-
-#[derive(Deserialize)]
-struct FeatureRows {
-    truth: Vec<Vec<f64>>,
-    other: Vec<Vec<f64>>,
-    flat: Vec<Vec<f64>>,
-    mean: Vec<f64>,
-    deviation: Vec<f64>,
-    covariance: Vec<Vec<f64>>,
-    frechet: f64,
-    frechet_raw: f64,
-    frechet_flat: f64,
-    mean_distance: f64,
-    diversity: f64,
-    diversity_all: f64,
-    conditions: Vec<Vec<Vec<f64>>>,
-    multimodality: f64,
-}
-
-#[derive(Deserialize)]
-struct ControlRows {
-    samples: Vec<SampleRow>,
-    position: Vec<ControlRow>,
-    rotation: Vec<ControlRow>,
-    spread_mm: f64,
-}
-
-#[derive(Deserialize)]
-struct SampleRow {
-    at: Vec<usize>,
-    position: Vec<[f64; 3]>,
-    quaternion: Vec<[f64; 4]>,
-    mm: Vec<f64>,
-    deg: Vec<f64>,
-}
-
-#[derive(Deserialize)]
-struct ControlRow {
-    threshold: f64,
-    trajectory: f64,
-    location: f64,
-    location_by_sample: f64,
-    mean: f64,
-    mean_by_sample: f64,
-}
-
-#[derive(Deserialize)]
-struct IntervalRows {
-    values: Vec<f64>,
-    clusters: Vec<usize>,
-    mean: [f64; 3],
-    clustered: [f64; 3],
-    share: [f64; 3],
-    clustered_share: [f64; 3],
-    jackknife_of_pairs: [f64; 3],
-    p_greater: f64,
-}
-
-fn golden() -> Golden {
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/golden/metrics/metrics.json");
-    let text = std::fs::read_to_string(path).expect("the golden file");
-    serde_json::from_str(&text).expect("what make.py writes")
-}
-
-impl MotionRow {
-    fn frames(&self) -> Array2<f32> {
-        Array2::from_shape_vec((self.n_frames, MOTION_DIM), self.frames.clone()).expect("T × 25")
-    }
-
-    fn poses(&self) -> Poses {
-        poses(self.frames().view()).expect("finite")
-    }
-
-    fn bars(&self) -> Vec<f64> {
-        (0..self.n_frames).map(|t| (t as f64 + self.first_frame) / self.bar_frames).collect()
-    }
-
-    fn column(&self, i: usize) -> Vec<f64> {
-        self.frames().column(i).iter().map(|&x| f64::from(x)).collect()
-    }
-}
 
 fn matrix(rows: &[Vec<f64>]) -> Array2<f64> {
     let dim = rows.first().map_or(0, Vec::len);

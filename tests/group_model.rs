@@ -277,7 +277,7 @@ fn mistakes_are_named() {
 
 #[test]
 fn what_is_no_card_of_a_group_is_refused() {
-    use motiongen::generation::GroupCard;
+    use motiongen::generation::{FamilyCard as _, GroupCard};
     let dir = Dir::new();
     let store = make_store(&dir);
     assert_eq!(train(&store, "run", &[]).code, 0);

@@ -18,6 +18,7 @@ mod foreign_models;
 mod generate;
 mod group_model;
 mod groups;
+mod help;
 mod ingest_bad_input;
 mod ingest_kill;
 mod ingest_local;

@@ -307,7 +307,7 @@ fn help_lists_the_kinds_and_what_each_takes() {
     let output = run(["plot", "--help"]);
     assert_eq!(output.code, 0, "{output:?}");
     assert!(output.stdout.contains("Usage: motiongen plot [OPTIONS] <KIND>"), "{}", output.stdout);
-    let output = run(["plot", "features", "--help"]);
+    let output = run(["plot", "features", "--help-all"]);
     let wanted =
         ["MOTIONGEN_PANEL", "MOTIONGEN_VERBOSE", "[plot.features]", "Writes: an image file"];
     let found = wanted.map(|text| output.stdout.contains(text));

@@ -4,17 +4,18 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Which rooms a room may use.
-const MAY_USE: [(&str, &[&str]); 20] = [
+const MAY_USE: [(&str, &[&str]); 21] = [
     ("units", &[]),
-    ("audio", &["instructions", "units"]),
+    ("audio", &["excerpt", "instructions", "units"]),
     ("autodiff", &["instructions", "model"]),
     ("chance", &[]),
     ("diffusion", &[]),
-    ("evaluation", &["motion", "units"]),
+    ("evaluation", &["chance", "motion", "units"]),
+    ("excerpt", &[]),
     ("generation", &["audio", "autodiff", "diffusion", "model", "motion", "onnx", "units"]),
     ("instructions", &[]),
     ("model", &["audio", "motion", "units"]),
-    ("motion", &["chance", "units"]),
+    ("motion", &["chance", "excerpt", "units"]),
     ("music", &["audio", "chance"]),
     ("onnx", &["audio", "model", "motion"]),
     ("plot", &["motion", "units"]),
@@ -73,17 +74,18 @@ const KEPT_TO: [(&str, &str); 19] = [
     ("prost", "onnx/"),
 ];
 
-fn sources() -> BTreeMap<PathBuf, String> {
-    fn walk(folder: &Path, found: &mut BTreeMap<PathBuf, String>) {
-        for entry in std::fs::read_dir(folder).expect("a folder of sources") {
-            let path = entry.expect("an entry").path();
-            if path.is_dir() {
-                walk(&path, found);
-            } else if path.extension().is_some_and(|e| e == "rs") {
-                found.insert(path.clone(), std::fs::read_to_string(&path).expect("UTF-8"));
-            }
+fn walk(folder: &Path, found: &mut BTreeMap<PathBuf, String>) {
+    for entry in std::fs::read_dir(folder).expect("a folder of sources") {
+        let path = entry.expect("an entry").path();
+        if path.is_dir() {
+            walk(&path, found);
+        } else if path.extension().is_some_and(|e| e == "rs") {
+            found.insert(path.clone(), std::fs::read_to_string(&path).expect("UTF-8"));
         }
     }
+}
+
+fn sources() -> BTreeMap<PathBuf, String> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
     let mut found = BTreeMap::new();
     walk(&root, &mut found);
@@ -183,4 +185,35 @@ fn only_the_command_line_prints_and_only_the_kernel_is_unsafe() {
             );
         }
     }
+}
+
+/// Folders of Rust code.
+const CODE: [&str; 4] = ["src", "tests", "benches", "fuzz/fuzz_targets"];
+/// A file beyond this has a second subject, which goes into a file named after it.
+const MAX_LINES: usize = 500;
+const MAX_MEDIAN_LINES: usize = 165;
+/// A file that is being divided.
+const DIVIDED: [&str; 1] = ["src/training/window.rs"];
+
+#[test]
+fn no_file_has_more_than_500_lines_and_the_median_stays_small() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut found = BTreeMap::new();
+    for folder in CODE {
+        walk(&root.join(folder), &mut found);
+    }
+    let mut sizes: Vec<usize> = Vec::with_capacity(found.len());
+    for (path, text) in found {
+        let path = path.strip_prefix(root).expect("in the folder").to_string_lossy().into_owned();
+        let n_lines = text.lines().count();
+        assert!(
+            n_lines <= MAX_LINES || DIVIDED.contains(&path.as_str()),
+            "{path} has {n_lines} lines: move its second subject to a file named after it"
+        );
+        sizes.push(n_lines);
+    }
+    sizes.sort_unstable();
+    assert!(sizes.len() > 500, "only {} files were seen", sizes.len());
+    let median = sizes[sizes.len() / 2];
+    assert!(median <= MAX_MEDIAN_LINES, "half of all files have {median} lines or more");
 }

@@ -7,6 +7,9 @@ use libfuzzer_sys::fuzz_target;
 #[path = "../../src/instructions.rs"]
 #[allow(dead_code, unused_imports, unused_macros, reason = "this target reaches a part of the module")]
 mod instructions;
+#[path = "../../src/excerpt.rs"]
+#[allow(dead_code, reason = "this target reaches a part of the module")]
+mod excerpt;
 #[path = "../../src/audio/mod.rs"]
 #[allow(dead_code, unused_imports, reason = "this target reaches a part of the modules")]
 mod audio;
@@ -45,7 +48,7 @@ mod onnx {
     pub use storage::Storage;
 }
 
-use generation::ModelCard;
+use generation::{FamilyCard as _, ModelCard};
 
 /// A card that is taken, whose parts the input replaces.
 const SOUND: &str = include_str!("../../models/pretrained/model.json");

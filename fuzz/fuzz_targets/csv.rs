@@ -7,6 +7,9 @@ use libfuzzer_sys::fuzz_target;
 #[path = "../../src/chance.rs"]
 #[allow(dead_code, reason = "this target reaches a part of the module")]
 mod chance;
+#[path = "../../src/excerpt.rs"]
+#[allow(dead_code, reason = "this target reaches a part of the module")]
+mod excerpt;
 #[path = "../../src/motion/mod.rs"]
 #[allow(dead_code, unused_imports, reason = "this target reaches a part of the modules")]
 mod motion;

@@ -11,6 +11,9 @@ use libfuzzer_sys::fuzz_target;
 #[path = "../../src/instructions.rs"]
 #[allow(dead_code, unused_imports, unused_macros, reason = "this target reaches a part of the module")]
 mod instructions;
+#[path = "../../src/excerpt.rs"]
+#[allow(dead_code, reason = "this target reaches a part of the module")]
+mod excerpt;
 #[path = "../../src/audio/mod.rs"]
 #[allow(dead_code, unused_imports, reason = "this target reaches a part of the modules")]
 mod audio;

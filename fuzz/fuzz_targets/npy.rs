@@ -4,6 +4,9 @@
 
 use libfuzzer_sys::fuzz_target;
 
+#[path = "../../src/excerpt.rs"]
+#[allow(dead_code, reason = "this target reaches a part of the module")]
+mod excerpt;
 #[path = "../../src/motion"]
 #[allow(dead_code, reason = "this target reaches a part of the modules")]
 mod motion {

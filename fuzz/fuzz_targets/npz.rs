@@ -7,6 +7,9 @@ use std::io::{Cursor, Write};
 use libfuzzer_sys::fuzz_target;
 use zip::{CompressionMethod, ZipWriter, write::SimpleFileOptions};
 
+#[path = "../../src/excerpt.rs"]
+#[allow(dead_code, reason = "this target reaches a part of the module")]
+mod excerpt;
 #[path = "../../src/motion"]
 #[allow(dead_code, reason = "this target reaches a part of the modules")]
 mod motion {

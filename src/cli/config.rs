@@ -7,9 +7,10 @@ use std::collections::BTreeSet;
 use std::ffi::OsString;
 
 use anyhow::{Context as _, bail};
-use clap::{Arg, ArgAction, Command, Id};
+use clap::{Arg, Command, Id};
 
 use super::environment::{nearest, variable};
+use super::help::is_setting;
 
 /// The flag that names the file.
 pub const FLAG: &str = "config";
@@ -211,9 +212,7 @@ impl File<'_> {
 /// Returns the argument that a key sets.
 fn find(command: &Command, key: &str) -> Option<Id> {
     let flag = key.replace('_', "-");
-    let is_it = |a: &&Arg| {
-        a.get_long() == Some(flag.as_str()) && !matches!(a.get_action(), ArgAction::Count)
-    };
+    let is_it = |a: &&Arg| a.get_long() == Some(flag.as_str()) && is_setting(a);
     command.get_arguments().find(is_it).filter(|_| flag != FLAG).map(|a| a.get_id().clone())
 }
 
@@ -227,9 +226,9 @@ fn keys(command: &Command) -> Vec<&str> {
     let mut seen = BTreeSet::new();
     let own = command
         .get_arguments()
-        .filter(|a| !matches!(a.get_action(), ArgAction::Count))
+        .filter(|a| is_setting(a))
         .filter_map(Arg::get_long)
-        .filter(|flag| !["help", "version", FLAG].contains(flag));
+        .filter(|flag| *flag != FLAG);
     let kind_keys = command.get_subcommands().flat_map(keys);
     own.chain(kind_keys).filter(|flag| seen.insert(*flag)).collect()
 }

@@ -7,6 +7,8 @@ use anyhow::bail;
 use clap::builder::{BoolishValueParser, TypedValueParser};
 use clap::{Arg, ArgAction, Command};
 
+use super::help::is_setting;
+
 /// The prefix of the names of all variables of the program.
 const PREFIX: &str = "MOTIONGEN_";
 /// Variables that are read elsewhere: by the log, by onnxruntime's sessions, by the kernels.
@@ -25,7 +27,7 @@ pub fn variable(flag: &str) -> String {
 pub fn with_environment(mut command: Command) -> Command {
     let flags: Vec<_> = command
         .get_arguments()
-        .filter(|a| has_variable(a))
+        .filter(|a| is_setting(a))
         .map(|a| {
             let name = variable(a.get_long().unwrap_or_default());
             (a.get_id().clone(), name, matches!(a.get_action(), ArgAction::SetTrue))
@@ -38,10 +40,6 @@ pub fn with_environment(mut command: Command) -> Command {
         });
     }
     command.mut_subcommands(with_environment)
-}
-
-fn has_variable(arg: &Arg) -> bool {
-    arg.get_long().is_some() && !matches!(arg.get_action(), ArgAction::Count)
 }
 
 /// Reads a switch: 1, yes, true, on or 0, no, false, off, in any case; empty is off.
@@ -102,8 +100,8 @@ pub fn check(
 }
 
 fn add(command: &Command, known: &mut BTreeSet<String>) {
-    let flags = command.get_arguments().filter(|a| has_variable(a)).filter_map(Arg::get_long);
-    known.extend(flags.filter(|flag| !["help", "version"].contains(flag)).map(variable));
+    let flags = command.get_arguments().filter(|a| is_setting(a)).filter_map(Arg::get_long);
+    known.extend(flags.map(variable));
     command.get_subcommands().for_each(|kind| add(kind, known));
 }
 

@@ -7,6 +7,7 @@ mod config;
 mod environment;
 mod escaped;
 mod exit;
+mod help;
 mod interrupt;
 mod log;
 mod progress;
@@ -106,18 +107,20 @@ pub fn stage<S: Stage>() -> ExitCode {
 /// Runs `motiongen`, which has every stage as a subcommand.
 pub fn front_door() -> ExitCode {
     let entries = entries();
-    let mut command = Command::new(PROGRAM)
+    let hint = format!("{}\n\n{EXIT_CODES}", shell::HINT);
+    let command = Command::new(PROGRAM)
         .version(VERSION)
         .about("Turns a music library into motion, stage by stage.")
         .subcommand_value_name("STAGE")
         .subcommand_help_heading("Stages, in the order of a pipeline")
         .args(general("Take defaults from this TOML file".to_owned()));
+    // Stages have help of their own.
+    let mut command = help::in_tiers(command, &hint);
     for entry in &entries {
         command = command.subcommand((entry.command)());
     }
     let stages: Vec<&'static str> = entries.iter().map(|entry| entry.name).collect();
-    let hint = format!("{}\n\n{EXIT_CODES}", shell::HINT);
-    command = command.after_help(hint).subcommands(shell::commands(&stages));
+    let command = command.subcommands(shell::commands(&stages));
     let program = command.clone();
     let arguments: Vec<OsString> = std::env::args_os().collect();
     if arguments.len() < 2 {
@@ -165,46 +168,47 @@ const VERSION: &str = env!("CARGO_PKG_VERSION");
 /// Returns a stage's command: its parameters and the flags that every stage has.
 fn command<S: Stage>() -> Command {
     use clap::Args as _;
-    let contract = format!(
+    let ending = format!(
         "Reads: {}\nWrites: {}\n\n{AFTER}\n{EXIT_CODES}",
         S::CONTRACT.reads,
         S::CONTRACT.writes
     );
     // The parameters' own doc comment would become the text about the stage, so that comes after.
-    let mut command = S::Params::augment_args(Command::new(S::NAME))
-        .about(S::ABOUT)
-        .long_about(S::ABOUT)
-        .after_help(contract.clone());
+    let mut command =
+        S::Params::augment_args(Command::new(S::NAME)).about(S::ABOUT).long_about(S::ABOUT);
     if command.has_subcommands() {
         command = command
             .subcommand_value_name("KIND")
             .subcommand_help_heading("Kinds")
-            .disable_help_subcommand(true)
-            .mut_subcommands(|kind| kind.after_help(contract.clone()));
+            .disable_help_subcommand(true);
     }
     let config_help = config::help(&command);
-    environment::with_environment(command.args(general(config_help)))
+    help::in_tiers(environment::with_environment(command.args(general(config_help))), &ending)
 }
 
 /// Returns the flags that every stage has, and that may stand before its name.
 fn general(config_help: String) -> [Arg; 4] {
-    let arg = |name: &'static str| Arg::new(name).long(name).help_heading("General").global(true);
+    let arg =
+        |name: &'static str| Arg::new(name).long(name).help_heading(help::GENERAL).global(true);
     [
         arg(config::FLAG).value_name("FILE").help(config_help),
         arg(exit::FLAG)
             .value_name("FORM")
             .value_parser(EnumValueParser::<Form>::new())
             .default_value("text")
+            .hide_short_help(true)
             .help(
                 "What is told at the end, on standard output: text for people, or one JSON object",
             ),
         arg(log::VERBOSE)
             .short('v')
             .action(ArgAction::Count)
+            .hide_short_help(true)
             .help("Log more: -v progress of the work, -vv details, -vvv requests"),
         arg(log::QUIET)
             .short('q')
             .action(ArgAction::SetTrue)
+            .hide_short_help(true)
             .help("Show neither progress nor warnings"),
     ]
 }

@@ -6,6 +6,7 @@ use clap::{Arg, ArgMatches, Command};
 use clap_complete::Shell;
 use clap_mangen::Man;
 
+use super::help::{in_one_tier, in_tiers};
 use crate::stages::Summary;
 
 const COMPLETIONS: &str = "completions";
@@ -13,37 +14,30 @@ const MAN: &str = "man";
 const SHELL: &str = "shell";
 const STAGE: &str = "stage";
 
+const COMPLETIONS_HINT: &str = "bash: motiongen completions bash > ~/.local/share/bash-completion/completions/motiongen\n\
+     zsh: a file _motiongen in a folder of $fpath; fish: ~/.config/fish/completions/motiongen.fish";
+const MAN_HINT: &str =
+    "For example: motiongen man generate > ~/.local/share/man/man1/motiongen-generate.1";
+
 /// How the list of stages names these commands.
 pub const HINT: &str = "For the shell: motiongen completions SHELL, motiongen man [STAGE]";
 
 /// Returns the commands, which are no stages and stand in no list of them.
 pub fn commands(stages: &[&'static str]) -> [Command; 2] {
-    let completions = Command::new(COMPLETIONS)
-        .about("print the completions of a shell")
-        .after_help(
-            "bash: motiongen completions bash > ~/.local/share/bash-completion/completions/motiongen\n\
-             zsh: a file _motiongen in a folder of $fpath; fish: \
-             ~/.config/fish/completions/motiongen.fish",
-        )
-        .arg(
-            Arg::new(SHELL)
-                .value_name("SHELL")
-                .required(true)
-                .value_parser(clap::value_parser!(Shell))
-                .help("Which shell"),
-        );
-    let man = Command::new(MAN)
-        .about("print the manual page of the program or of a stage")
-        .after_help(
-            "For example: motiongen man generate > ~/.local/share/man/man1/motiongen-generate.1",
-        )
-        .arg(
-            Arg::new(STAGE)
-                .value_name("STAGE")
-                .value_parser(clap::builder::PossibleValuesParser::new(stages.iter().copied()))
-                .help("Which stage [default: the program itself]"),
-        );
-    [completions.hide(true), man.hide(true)]
+    let completions = Command::new(COMPLETIONS).about("print the completions of a shell").arg(
+        Arg::new(SHELL)
+            .value_name("SHELL")
+            .required(true)
+            .value_parser(clap::value_parser!(Shell))
+            .help("Which shell"),
+    );
+    let man = Command::new(MAN).about("print the manual page of the program or of a stage").arg(
+        Arg::new(STAGE)
+            .value_name("STAGE")
+            .value_parser(clap::builder::PossibleValuesParser::new(stages.iter().copied()))
+            .help("Which stage [default: the program itself]"),
+    );
+    [in_tiers(completions.hide(true), COMPLETIONS_HINT), in_tiers(man.hide(true), MAN_HINT)]
 }
 
 /// Does what one of these commands asks; none for another.
@@ -75,7 +69,7 @@ fn page(program: Command, stage: Option<&str>) -> io::Result<Vec<u8>> {
         None => program,
     };
     let mut text = Vec::new();
-    Man::new(page).render(&mut text)?;
+    Man::new(in_one_tier(page)).render(&mut text)?;
     Ok(text)
 }
 

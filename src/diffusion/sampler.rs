@@ -36,6 +36,14 @@ impl Sampler {
         }
     }
 
+    /// Returns η, of DDIM.
+    pub fn eta(self) -> Option<f64> {
+        match self {
+            Self::Ddim { eta } => Some(eta),
+            Self::Ddpm | Self::DpmSolver => None,
+        }
+    }
+
     /// Returns the name that people know it by.
     pub fn name(self) -> &'static str {
         match self {

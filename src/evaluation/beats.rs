@@ -7,9 +7,10 @@ use crate::motion::Poses;
 use crate::motion::kinematics::forward_differences;
 use crate::units::frames_to_s;
 
-use super::body::{BODY_RADIUS_M, norm, turn_rates};
-use super::draws::Draws;
+use super::body::{BODY_RADIUS_M, turn_rates};
 use super::interval::mean_and_deviation;
+use crate::chance::Draws;
+use crate::motion::vector::norm;
 
 /// Frames on either side that a beat of motion is slower than; as in GCD at 30 fps.
 pub const MINIMUM_ORDER_FRAMES: usize = 5;

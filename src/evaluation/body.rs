@@ -10,6 +10,7 @@ use ndarray::ArrayView2;
 use crate::motion::quaternion::{
     Quaternion, angular_velocity, dot, make_sign_continuous, normalize,
 };
+use crate::motion::vector::Vector;
 use crate::motion::{Channel, MOTION_DIM, Poses};
 use crate::units::FPS;
 
@@ -18,9 +19,6 @@ pub const BODY_RADIUS_M: f64 = 0.25;
 
 /// Quaternions shorter than this stand for no rotation.
 const MIN_QUATERNION_NORM: f64 = 1e-6;
-
-/// Three coordinates.
-pub type Vector = [f64; 3];
 
 /// Returns positions and unit orientations of motion, `[T, 25]`, with continuous signs.
 ///
@@ -74,26 +72,6 @@ pub fn turn_rates(orientation: &[Quaternion]) -> Vec<Vector> {
     orientation.windows(2).map(|q| angular_velocity(q[0], q[1], FPS)).collect()
 }
 
-/// Length of a vector.
-pub fn norm(v: Vector) -> f64 {
-    inner(v, v).sqrt()
-}
-
-/// Inner product.
-pub fn inner(a: Vector, b: Vector) -> f64 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
-/// Vector product.
-pub fn cross(a: Vector, b: Vector) -> Vector {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-}
-
-/// Difference `a - b`.
-pub fn minus(a: Vector, b: Vector) -> Vector {
-    std::array::from_fn(|i| a[i] - b[i])
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -139,13 +117,5 @@ mod tests {
         frames.row_mut(4).fill(0.0);
         assert_eq!(poses(frames.view()), None);
         assert_eq!(poses(Array2::zeros((0, MOTION_DIM)).view()), Some(Poses::default()));
-    }
-
-    #[test]
-    fn products_are_those_of_the_axes() {
-        assert_eq!(cross([0.0, 0.0, 1.0], [1.0, 0.0, 0.0]), [0.0, 1.0, 0.0]);
-        assert_eq!(inner([1.0, 2.0, 3.0], [4.0, -5.0, 6.0]), 12.0);
-        assert_eq!(norm([2.0, -3.0, 6.0]), 7.0);
-        assert_eq!(minus([1.0, 2.0, 3.0], [3.0, 2.0, 1.0]), [-2.0, 0.0, 2.0]);
     }
 }

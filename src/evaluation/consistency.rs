@@ -10,8 +10,9 @@ use crate::motion::quaternion::{Quaternion, dot, from_axis_angle, mul};
 use crate::motion::{Channel, ChannelLimits};
 use crate::units::FPS;
 
-use super::body::{Vector, minus, norm, poses, vectors};
+use super::body::{poses, vectors};
 use super::control::rotation_error_rad;
+use crate::motion::vector::{Vector, minus, norm};
 
 /// Fewest frames with a third difference.
 const MIN_FRAMES: usize = 4;

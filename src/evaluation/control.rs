@@ -4,9 +4,8 @@
 //! orientations in degrees.
 
 use crate::motion::quaternion::{Quaternion, conj, mul, normalize};
+use crate::motion::vector::{Vector, minus, norm};
 use crate::units::FPS;
-
-use super::body::{Vector, minus, norm};
 
 /// Misses of a position that count, mm; the second is the one that is reported.
 pub const POSITION_THRESHOLDS_MM: [f64; 2] = [200.0, 500.0];

@@ -11,7 +11,7 @@ use std::f64::consts::TAU;
 use crate::motion::choreography::floor::rise_amplitudes_m;
 use crate::units::FPS;
 
-use super::draws::Draws;
+use crate::chance::Draws;
 
 /// Harmonics of the bar that a learned coupling has.
 pub const N_HARMONICS: usize = 4;

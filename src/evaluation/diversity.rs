@@ -4,7 +4,7 @@
 
 use ndarray::{ArrayView1, ArrayView2};
 
-use super::draws::Draws;
+use crate::chance::Draws;
 
 /// Pairs that tell the diversity of a set, as for HumanML3D.
 pub const DIVERSITY_PAIRS: usize = 300;

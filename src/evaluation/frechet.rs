@@ -148,7 +148,7 @@ fn rotate_away(a: &mut Array2<f64>, vectors: &mut Array2<f64>, p: usize, q: usiz
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::evaluation::draws::Draws;
+    use crate::chance::Draws;
     use ndarray::array;
 
     fn gaussian(mean: &[f64], covariance: &Array2<f64>) -> Gaussian {

@@ -12,7 +12,8 @@ use crate::motion::quantile::percentile;
 use crate::motion::quaternion::{conj, rotate};
 use crate::units::FPS;
 
-use super::body::{cross, inner, norm, turn_rates};
+use super::body::turn_rates;
+use crate::motion::vector::{cross, inner, norm};
 
 /// Speed below which a body stands still and has no direction, m/s.
 pub const STILL_M_S: f64 = 0.05;

@@ -10,7 +10,8 @@ use crate::motion::Poses;
 use crate::motion::quaternion::{Quaternion, rotate};
 use crate::units::FPS;
 
-use super::body::{BODY_RADIUS_M, Vector, minus, norm};
+use super::body::BODY_RADIUS_M;
+use crate::motion::vector::{Vector, minus, norm};
 
 /// Frames of a chunk: 2.5 s, as in DanceCamera3D.
 pub const CHUNK_FRAMES: usize = 75;

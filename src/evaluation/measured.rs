@@ -6,11 +6,12 @@ use crate::motion::kinematics::forward_differences;
 use crate::motion::{Channel, ChannelLimits};
 
 use super::beats::motion_beats;
-use super::body::{norm, poses};
+use super::body::poses;
 use super::consistency::{Consistency, consistency};
 use super::reference_statistics::{FeatureSet, ReferenceStatistics};
 use super::sanity::{Check, CheckSet, checks};
 use super::window_range::Posture;
+use crate::motion::vector::norm;
 
 /// The measured numbers of a window of motion.
 #[derive(Clone, Debug)]

@@ -10,7 +10,6 @@ pub mod control;
 pub mod coupling;
 pub mod distribution;
 pub mod diversity;
-pub mod draws;
 pub mod frechet;
 pub mod geometric;
 pub mod group;

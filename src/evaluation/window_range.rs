@@ -8,8 +8,9 @@ use crate::motion::kinematics::forward_differences;
 use crate::motion::quantile::percentile;
 use crate::motion::quaternion::rotate;
 
-use super::body::{norm, poses, turn_rates};
+use super::body::{poses, turn_rates};
 use super::sanity::{Check, CheckSet};
+use crate::motion::vector::norm;
 
 /// Percentage of the training windows that lie below an upper bound, and above a lower one.
 pub const RANGE_PERCENT: f64 = 99.5;

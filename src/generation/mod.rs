@@ -20,8 +20,9 @@ mod walk;
 mod windows;
 
 pub use card::{
-    CardError, FileEntry, MAX_CARD_BYTES, MODEL_FORMAT, ModelCard, ModelFileName, Networks,
-    Provenance, SamplingDefaults, family_of, file_names, is_name, own_channels, own_features,
+    CardError, FamilyCard, FileEntry, MAX_CARD_BYTES, MODEL_FORMAT, ModelCard, ModelFileName,
+    Networks, Provenance, SamplingDefaults, SharedFields, family_of, file_names, is_name,
+    own_channels, own_features,
 };
 pub use control::{Constraints, ControlError, Miss, REACH_FRAMES, WantedValue, continuing, facing};
 pub use eager::EagerEngine;

@@ -41,6 +41,7 @@ pub mod spline;
 pub mod style;
 pub mod text;
 pub mod trajectory;
+pub mod vector;
 
 pub use bvh::{Bvh, BvhError, BvhNote};
 pub use capture::{

@@ -10,8 +10,8 @@ mod tests;
 
 use std::io::{self, Read};
 
+use crate::excerpt::clip;
 pub use error::NpyError;
-pub(crate) use error::{clip, preview};
 use header::{Dtype, DtypeKind, Header};
 
 /// Most bytes one array may take in memory, and most that are read for it: 1 GiB.

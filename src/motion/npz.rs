@@ -12,6 +12,7 @@ use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, DateTime, ZipArchive, ZipWriter};
 
 use super::npy::{self, MAX_ARRAY_BYTES, NpyArray, NpyError, Writable};
+use crate::excerpt::preview;
 
 /// Room for a member's header over the limit on its array.
 const HEADER_ROOM_BYTES: u64 = 128 * 1024;
@@ -293,7 +294,7 @@ fn not_npz(bytes: &[u8]) -> NpzError {
     } else {
         "save the arrays with numpy.savez"
     };
-    NpzError::NotNpz { found: npy::preview(bytes), way_out }
+    NpzError::NotNpz { found: preview(bytes), way_out }
 }
 
 /// The first name that the table of members holds twice, for the message; the `zip` crate says

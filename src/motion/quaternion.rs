@@ -3,6 +3,8 @@
 //! Source for the products and the exponential map: Solà, Quaternion kinematics for the
 //! error-state Kalman filter, arXiv:1711.02508, sections 1 and 2.
 
+use super::vector::cross;
+
 /// A quaternion `w + xi + yj + zk`.
 pub type Quaternion = [f64; 4];
 
@@ -118,10 +120,6 @@ pub fn slerp_as_signed(a: Quaternion, b: Quaternion, s: f64) -> Quaternion {
 /// Returns the one of `q` and `-q` that is nearer to `like`.
 pub fn nearer(like: Quaternion, q: Quaternion) -> Quaternion {
     if dot(like, q) < 0.0 { q.map(|c| -c) } else { q }
-}
-
-fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
 #[cfg(test)]

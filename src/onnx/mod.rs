@@ -8,6 +8,7 @@ mod builder;
 mod check;
 mod error;
 mod file;
+mod frames;
 mod literals;
 mod networks;
 mod operations;

@@ -15,6 +15,7 @@ use crate::model::{
 };
 
 use super::builder::{Axes, Builder, Form, Use, Value, expect};
+use super::frames;
 use super::literals::{float, integer, integers, word};
 use super::proto::DataType;
 
@@ -318,18 +319,7 @@ impl Graph for Builder<'_> {
     }
 
     fn hold_frames(&mut self, x: &Value, multiple: usize) -> Result<Value> {
-        self.begin("hold_frames", None);
-        expect("hold_frames", *x, Axes::Frames)?;
-        if multiple == 1 {
-            return Ok(*x);
-        }
-        let frames = self.n_frames(*x)?;
-        let missing = self.n_missing(&frames, multiple);
-        let name = self.last(*x)?;
-        let (none, axes) = (self.integers(&[0]), self.integers(&[1]));
-        let pads = self.node("Concat", &[&none, &missing], vec![integer("axis", 0)]);
-        let y = self.node("Pad", &[&name, &pads, "", &axes], vec![word("mode", "edge")]);
-        Ok(self.new_last(Axes::Frames, x.channels, y))
+        frames::hold(self, *x, multiple)
     }
 
     fn crop_frames(&mut self, x: &Value, like: &Value) -> Result<Value> {
@@ -342,39 +332,11 @@ impl Graph for Builder<'_> {
     }
 
     fn shift_frames(&mut self, x: &Value, shift: isize, spare: usize) -> Result<Value> {
-        self.begin("shift_frames", None);
-        expect("shift_frames", *x, Axes::Frames)?;
-        let frames = self.n_frames(*x)?;
-        let places = self.places(&frames);
-        let [shift, spare, zero] = [shift as i64, spare as i64 + 1, 0].map(|n| self.integers(&[n]));
-        let last = self.node("Sub", &[&frames, &spare], vec![]);
-        let last = self.node("Max", &[&last, &zero], vec![]);
-        let places = self.node("Add", &[&places, &shift], vec![]);
-        let places = self.node("Max", &[&places, &zero], vec![]);
-        let places = self.node("Min", &[&places, &last], vec![]);
-        let axis = if self.has_last(*x) { 1 } else { self.frames_axis() };
-        self.map(*x, x.channels, |g, x| {
-            g.node("Gather", &[x, &places], vec![integer("axis", axis)])
-        })
+        frames::shift(self, *x, shift, spare)
     }
 
     fn replace_ends(&mut self, x: &Value, first: &Value, last: &Value) -> Result<Value> {
-        self.begin("replace_ends", None);
-        let frames = self.n_frames(*x)?;
-        let places = self.places(&frames);
-        let [zero, one] = [0, 1].map(|n| self.integers(&[n]));
-        let end = self.node("Sub", &[&frames, &one], vec![]);
-        let is_first = self.node("Equal", &[&places, &zero], vec![]);
-        let is_last = self.node("Equal", &[&places, &end], vec![]);
-        // Frames are the last axis in either form.
-        let [x_name, first, last] = [
-            self.first("replace_ends", *x)?,
-            self.first("replace_ends", *first)?,
-            self.first("replace_ends", *last)?,
-        ];
-        let y = self.node("Where", &[&is_first, &first, &x_name], vec![]);
-        let y = self.node("Where", &[&is_last, &last, &y], vec![]);
-        Ok(self.new_first(x.channels, y))
+        frames::replace_ends(self, *x, *first, *last)
     }
 
     fn filter_frames(
@@ -383,50 +345,11 @@ impl Graph for Builder<'_> {
         kernel: &Arc<Array2<f64>>,
         mirror: Mirror,
     ) -> Result<Value> {
-        self.begin("filter_frames", None);
-        let (channels, taps) = kernel.dim();
-        if x.channels != channels || taps % 2 == 0 {
-            let problem = format!(
-                "input has {} channels, the filter has {channels} with {taps} taps, of which an odd number is asked",
-                x.channels
-            );
-            return Err(GraphError::shape("filter_frames", problem));
-        }
-        let name = self.first("filter_frames", *x)?;
-        let frames = self.n_frames(*x)?;
-        let name = self.mirrored(&name, &frames, (taps / 2) as i64, mirror);
-        let numbers: Vec<f32> = kernel.iter().map(|&h| h as f32).collect();
-        let (dims, shape) = match self.form {
-            Form::Line => (vec![channels, 1, taps], vec![taps as i64]),
-            Form::Image => (vec![channels, 1, 1, taps], vec![1, taps as i64]),
-        };
-        let kernel = self.table(&dims, &numbers);
-        let attributes = vec![integers("kernel_shape", &shape), integer("group", channels as i64)];
-        let y = self.node("Conv", &[&name, &kernel], attributes);
-        Ok(self.new_first(channels, y))
+        frames::filter(self, *x, kernel, mirror)
     }
 
     fn frame_mask(&mut self, x: &Value, mask: Option<&Value>, multiple: usize) -> Result<Value> {
-        self.begin("frame_mask", None);
-        let frames = self.n_frames(*x)?;
-        let missing = self.n_missing(&frames, multiple);
-        let y = match mask {
-            Some(mask) => {
-                let mask = self.last(*mask)?;
-                let (none, axes) = (self.integers(&[0]), self.integers(&[1]));
-                let pads = self.node("Concat", &[&none, &missing], vec![integer("axis", 0)]);
-                self.node("Pad", &[&mask, &pads, "", &axes], vec![word("mode", "constant")])
-            }
-            None => {
-                let held = self.node("Add", &[&frames, &missing], vec![]);
-                let places = self.places(&held);
-                let counts = self.node("Less", &[&places, &frames], vec![]);
-                let counts = self.cast(&counts, DataType::Float);
-                let axes = self.integers(&[0]);
-                self.node("Unsqueeze", &[&counts, &axes], vec![])
-            }
-        };
-        Ok(self.new_last(Axes::Mask, 0, y))
+        frames::mask(self, *x, mask.copied(), multiple)
     }
 
     fn stride_mask(&mut self, mask: &Value, stride: usize) -> Result<Value> {
@@ -468,22 +391,7 @@ impl Graph for Builder<'_> {
     }
 
     fn concat_frames(&mut self, parts: &[&Value]) -> Result<Value> {
-        self.begin("concat_frames", None);
-        let Some(&&one) = parts.first() else {
-            return Err(GraphError::shape("concat_frames", "there is nothing to join"));
-        };
-        let axes = self.integers(&[1]);
-        let mut names = Vec::with_capacity(parts.len());
-        for part in parts {
-            let name = self.last(**part)?;
-            names.push(match part.axes {
-                Axes::Samples => self.node("Unsqueeze", &[&name, &axes], vec![]),
-                _ => name,
-            });
-        }
-        let names: Vec<&str> = names.iter().map(String::as_str).collect();
-        let y = self.node("Concat", &names, vec![integer("axis", 1)]);
-        Ok(self.new_last(Axes::Frames, one.channels, y))
+        frames::concat(self, parts)
     }
 
     fn frames(&mut self, x: &Value, first: usize, n: Option<usize>) -> Result<Value> {

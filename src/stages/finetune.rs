@@ -2,18 +2,18 @@
 
 use std::num::NonZeroUsize;
 use std::sync::Arc;
-use std::time::Duration;
 
 use anyhow::ensure;
 
 use super::failure::quoted;
 use super::learned::{learned_path, remember};
+use super::train::budget::{SavingParams, minutes};
 use super::train::session::{
     MachineParams, ProgressWatch, check_run_name, claim, claim_path, lease_of, read_phrases,
 };
 use super::train::{StageSummary, TrainDryRun, TrainSummary, restore};
 use super::trained::{TrainedRun, WeightsChoice};
-use super::{ClientParams, Contract, Progress, Stage, Summary};
+use super::{ClientParams, Contract, Progress, RARE, Stage, Summary};
 use crate::model::Family;
 use crate::store::Location;
 use crate::training::{
@@ -35,7 +35,7 @@ pub struct Params {
     #[arg(long, value_name = "NAME")]
     pub run: String,
     /// Refuse to start fine-tuning that was not begun.
-    #[arg(long)]
+    #[arg(long, hide_short_help = RARE)]
     pub resume: bool,
     /// Times that all phrases are seen [default: 50, without --minutes]
     #[arg(long, value_name = "N", help_heading = "Budget")]
@@ -47,58 +47,60 @@ pub struct Params {
     #[arg(long, value_name = "M", help_heading = "Budget")]
     pub minutes: Option<f64>,
     /// Training phrases to use [default: all]
-    #[arg(long, value_name = "N", help_heading = "Budget")]
+    #[arg(long, value_name = "N", help_heading = "Budget", hide_short_help = RARE)]
     pub num_phrases: Option<NonZeroUsize>,
     /// Validations without improvement after which fine-tuning ends; 0 for never.
-    #[arg(long, value_name = "N", default_value_t = 10, help_heading = "Budget")]
+    #[arg(long, value_name = "N", default_value_t = 10, help_heading = "Budget",
+          hide_short_help = RARE)]
     pub patience: u64,
     /// Epochs from one validation to the next.
-    #[arg(long, value_name = "N", default_value_t = 1, help_heading = "Budget")]
+    #[arg(long, value_name = "N", default_value_t = 1, help_heading = "Budget",
+          hide_short_help = RARE)]
     pub validate_every: u64,
-    /// Epochs from one checkpoint to the next.
-    #[arg(long, value_name = "N", default_value_t = 10, help_heading = "Budget")]
-    pub save_every: u64,
-    /// Steps from one checkpoint to the next, beside --save-every.
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..),
-          help_heading = "Budget")]
-    pub save_every_steps: Option<u64>,
-    /// Longest time between two checkpoints, in minutes.
-    #[arg(long, value_name = "M", default_value_t = 10.0, help_heading = "Budget")]
-    pub save_every_minutes: f64,
+    #[command(flatten)]
+    pub saving: SavingParams,
     /// Windows of a step.
     #[arg(long, value_name = "N", default_value_t = NonZeroUsize::new(8).expect("not 0"),
           help_heading = "Optimizer")]
     pub batch_size: NonZeroUsize,
     /// Learning rate of the UNet (1e-6 in the reference).
-    #[arg(long, value_name = "X", default_value_t = 1e-4, help_heading = "Optimizer")]
+    #[arg(long, value_name = "X", default_value_t = 1e-4, help_heading = "Optimizer",
+          hide_short_help = RARE)]
     pub lr_diffusion: f64,
     /// Learning rate of the decoder (5e-5 in the reference).
-    #[arg(long, value_name = "X", default_value_t = 5e-6, help_heading = "Optimizer")]
+    #[arg(long, value_name = "X", default_value_t = 5e-6, help_heading = "Optimizer",
+          hide_short_help = RARE)]
     pub lr_decoder: f64,
     /// Weight of the loss of the UNet's prediction (0.1 in the reference).
-    #[arg(long, value_name = "W", default_value_t = 1.0, help_heading = "Losses")]
+    #[arg(long, value_name = "W", default_value_t = 1.0, help_heading = "Losses",
+          hide_short_help = RARE)]
     pub diffusion_weight: f64,
     /// Weight of the distance of sampled motion from the phrase's (1 in the reference).
-    #[arg(long, value_name = "W", default_value_t = 3.0, help_heading = "Losses")]
+    #[arg(long, value_name = "W", default_value_t = 3.0, help_heading = "Losses",
+          hide_short_help = RARE)]
     pub decoder_weight: f64,
     /// Weight of the losses of coherence in time.
-    #[arg(long, value_name = "W", default_value_t = 10.0, help_heading = "Losses")]
+    #[arg(long, value_name = "W", default_value_t = 10.0, help_heading = "Losses",
+          hide_short_help = RARE)]
     pub temporal_weight: f64,
     #[command(flatten)]
     pub temporal: TemporalParams,
     /// Decay of weights.
     #[arg(long, value_name = "X", default_value_t = OptimizerConfig::default().weight_decay,
-          help_heading = "Optimizer")]
+          help_heading = "Optimizer", hide_short_help = RARE)]
     pub weight_decay: f64,
     /// Largest norm of the gradient; 0 for no limit.
-    #[arg(long, value_name = "X", default_value_t = 1.0, help_heading = "Optimizer")]
+    #[arg(long, value_name = "X", default_value_t = 1.0, help_heading = "Optimizer",
+          hide_short_help = RARE)]
     pub gradient_clip: f64,
     /// Steps of DDIM that gradients flow through.
-    #[arg(long, value_name = "N", default_value_t = 5, help_heading = "Losses")]
+    #[arg(long, value_name = "N", default_value_t = 5, help_heading = "Losses",
+          hide_short_help = RARE)]
     pub num_steps: usize,
     /// Share of the diffusion's steps that are undone: sampling begins with the phrase's motion made as
     /// noisy; 1 begins with noise alone, as in the reference, and ends in motion that stands still.
-    #[arg(long, value_name = "SHARE", default_value_t = 0.25, help_heading = "Losses")]
+    #[arg(long, value_name = "SHARE", default_value_t = 0.25, help_heading = "Losses",
+          hide_short_help = RARE)]
     pub start: f64,
     #[command(flatten)]
     pub machine: MachineParams,
@@ -120,43 +122,43 @@ pub struct Params {
 pub struct TemporalParams {
     /// Of velocity against the differences of position.
     #[arg(long, value_name = "W", default_value_t = TemporalConfig::default().velocity_weight,
-          help_heading = "Losses")]
+          help_heading = "Losses", hide_short_help = RARE)]
     pub velocity_weight: f64,
     /// Of acceleration against the differences of velocity.
     #[arg(long, value_name = "W", default_value_t = TemporalConfig::default().acceleration_weight,
-          help_heading = "Losses")]
+          help_heading = "Losses", hide_short_help = RARE)]
     pub acceleration_weight: f64,
     /// Of the differences of acceleration.
     #[arg(long, value_name = "W", default_value_t = TemporalConfig::default().jerk_weight,
-          help_heading = "Losses")]
+          help_heading = "Losses", hide_short_help = RARE)]
     pub jerk_weight: f64,
     /// Of large turns between frames.
     #[arg(long, value_name = "W", default_value_t = TemporalConfig::default().quaternion_delta_weight,
-          help_heading = "Losses")]
+          help_heading = "Losses", hide_short_help = RARE)]
     pub quat_delta_weight: f64,
     /// Of a phase that falls within a bar.
     #[arg(long, value_name = "W", default_value_t = TemporalConfig::default().phase_weight,
-          help_heading = "Losses")]
+          help_heading = "Losses", hide_short_help = RARE)]
     pub phase_monotonic_weight: f64,
     /// Of steps longer than half a metre between frames.
     #[arg(long, value_name = "W", default_value_t = TemporalConfig::default().smoothness_weight,
-          help_heading = "Losses")]
+          help_heading = "Losses", hide_short_help = RARE)]
     pub smoothness_weight: f64,
     /// By which errors of velocity are divided, m/s.
     #[arg(long, value_name = "X", default_value_t = TemporalConfig::default().target_velocity,
-          help_heading = "Losses")]
+          help_heading = "Losses", hide_short_help = RARE)]
     pub target_vel_coherence: f64,
     /// By which errors of acceleration are divided, m/s².
     #[arg(long, value_name = "X", default_value_t = TemporalConfig::default().target_acceleration,
-          help_heading = "Losses")]
+          help_heading = "Losses", hide_short_help = RARE)]
     pub target_accel_coherence: f64,
     /// By which jerk is divided, m/s³.
     #[arg(long, value_name = "X", default_value_t = TemporalConfig::default().target_jerk,
-          help_heading = "Losses")]
+          help_heading = "Losses", hide_short_help = RARE)]
     pub target_jerk: f64,
     /// |q · q'| above which a turn between frames costs nothing.
     #[arg(long, value_name = "X", default_value_t = TemporalConfig::default().target_quaternion_dot,
-          help_heading = "Losses")]
+          help_heading = "Losses", hide_short_help = RARE)]
     pub target_quat_delta: f64,
 }
 
@@ -245,9 +247,10 @@ impl Params {
             self.start
         );
         self.temporal.check()?;
-        for (flag, x) in
-            [("--minutes", self.minutes), ("--save-every-minutes", Some(self.save_every_minutes))]
-        {
+        for (flag, x) in [
+            ("--minutes", self.minutes),
+            ("--save-every-minutes", Some(self.saving.save_every_minutes)),
+        ] {
             let is_positive = x.is_none_or(|x| x > 0.0 && x.is_finite());
             ensure!(is_positive, "{flag} is not above 0; give a positive number");
         }
@@ -255,7 +258,6 @@ impl Params {
     }
 
     fn plan(&self, windows: &Windows) -> Plan {
-        let minutes = |m: f64| Duration::try_from_secs_f64(m * 60.0).unwrap_or(Duration::MAX);
         let is_bounded = self.steps.is_some() || self.minutes.is_some();
         Plan {
             n_steps: self.steps,
@@ -265,9 +267,9 @@ impl Params {
             batch_size: self.batch_size.get() as u64,
             validate_first: true,
             validate_every_epochs: self.validate_every,
-            save_every_epochs: self.save_every,
-            save_every_steps: self.save_every_steps,
-            save_every: minutes(self.save_every_minutes),
+            save_every_epochs: self.saving.save_every,
+            save_every_steps: self.saving.save_every_steps,
+            save_every: minutes(self.saving.save_every_minutes),
             patience: (self.patience > 0).then_some(self.patience),
             store_patience: self.machine.patience(),
         }

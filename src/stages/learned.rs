@@ -9,7 +9,8 @@ use super::trained::{FinetuneData, TrainedRun};
 use super::{Progress, Stage as _, finetune::Finetune, pretrained, train::Train};
 
 use crate::generation::{
-    CardError, GroupCard, LearnedFrom, MAX_CARD_BYTES, ModelCard, Purpose, family_of, file_names,
+    CardError, FamilyCard as _, GroupCard, LearnedFrom, MAX_CARD_BYTES, ModelCard, Purpose,
+    family_of, file_names,
 };
 use crate::model::Family;
 use crate::store::{Location, Patience, StoreError};

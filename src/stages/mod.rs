@@ -1,5 +1,6 @@
 //! Stages: what the user runs. Each has a contract, parameters, a run and a summary.
 
+mod batch;
 pub mod beats;
 pub mod compact;
 pub mod evaluate;
@@ -18,6 +19,7 @@ mod model_files;
 mod model_folder;
 mod motion_source;
 pub mod plot;
+mod pool;
 mod pretrained;
 #[cfg(feature = "query")]
 pub mod query;
@@ -128,6 +130,9 @@ pub trait Summary {
     }
 }
 
+/// Marks a flag that `--help` leaves out and `--help-all` shows: `#[arg(…, hide_short_help = RARE)]`.
+pub(in crate::stages) const RARE: bool = true;
+
 /// Returns how many threads this machine runs side by side, the default of every stage that has workers.
 pub(in crate::stages) fn all_threads() -> NonZeroUsize {
     std::thread::available_parallelism().unwrap_or(NonZeroUsize::MIN)
@@ -137,7 +142,7 @@ pub(in crate::stages) fn all_threads() -> NonZeroUsize {
 #[derive(Clone, Copy, Debug, Default, clap::Args)]
 pub struct LinkParams {
     /// Follow symbolic links that lead out of the source, whose files are failures otherwise.
-    #[arg(long)]
+    #[arg(long, hide_short_help = RARE)]
     pub follow_links: bool,
 }
 
@@ -146,15 +151,15 @@ pub struct LinkParams {
 pub struct ClientParams {
     /// Requests to remote storage under way at once.
     #[arg(long, value_name = "N", default_value_t = ClientOptions::default().n_requests,
-          help_heading = "Remote storage")]
+          help_heading = "Remote storage", hide_short_help = RARE)]
     pub requests: usize,
     /// Seconds that one request to remote storage may take.
     #[arg(long, value_name = "S", default_value_t = ClientOptions::default().request_timeout_s,
-          help_heading = "Remote storage")]
+          help_heading = "Remote storage", hide_short_help = RARE)]
     pub request_timeout_s: f64,
     /// Times that a throttled, failed or broken request is tried again, with jittered backoff.
     #[arg(long, value_name = "N", default_value_t = ClientOptions::default().max_retries,
-          help_heading = "Remote storage")]
+          help_heading = "Remote storage", hide_short_help = RARE)]
     pub max_retries: usize,
 }
 

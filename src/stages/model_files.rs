@@ -5,13 +5,14 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 
-use super::all_threads;
 pub use super::model_folder::{
-    ModelFolder, POINTER, current_folder, folder_of, is_model_name, pointer_to, sha256,
+    ModelFolder, POINTER, current_folder, folder_of, is_model_name, pointer_to, sha256, sha256_of,
 };
+use super::{RARE, all_threads};
 use crate::autodiff::Parameters;
 use crate::generation::{
-    EagerEngine, Engine, ModelCard, ModelFileName, OnnxEngine, SessionPlan, file_names,
+    EagerEngine, Engine, FamilyCard as _, ModelCard, ModelFileName, OnnxEngine, SessionPlan,
+    file_names,
 };
 use crate::model::{MotionDecoder, ParameterList, UNet1D};
 use crate::onnx::{Device, Model, OnnxError, PINNED_VERSION, Runtime, Session, check, values_of};
@@ -33,16 +34,18 @@ pub enum EngineChoice {
 #[derive(Clone, Debug, clap::Args)]
 pub struct EngineParams {
     /// What runs the model; MOTIONGEN_DEVICE chooses onnxruntime's device (auto, cpu, cuda, …).
-    #[arg(long, value_enum, default_value_t = EngineChoice::Auto, help_heading = "Engine")]
+    #[arg(long, value_enum, default_value_t = EngineChoice::Auto, help_heading = "Engine",
+          hide_short_help = RARE)]
     pub engine: EngineChoice,
     /// Library of onnxruntime [default: ORT_DYLIB_PATH, else beside the program, in .runtime, of the system]
-    #[arg(long, value_name = "FILE", help_heading = "Engine")]
+    #[arg(long, value_name = "FILE", help_heading = "Engine", hide_short_help = RARE)]
     pub ort_lib: Option<PathBuf>,
     /// Threads in all.
-    #[arg(long, value_name = "N", default_value_t = all_threads(), help_heading = "Engine")]
+    #[arg(long, value_name = "N", default_value_t = all_threads(), help_heading = "Engine",
+          hide_short_help = RARE)]
     pub threads: NonZeroUsize,
     /// Folder for models as this machine's processor likes them [default: ~/.cache/motiongen]
-    #[arg(long, value_name = "DIR", help_heading = "Engine")]
+    #[arg(long, value_name = "DIR", help_heading = "Engine", hide_short_help = RARE)]
     pub model_cache: Option<PathBuf>,
 }
 

@@ -10,8 +10,8 @@ use sha2::{Digest as _, Sha256};
 use super::pretrained;
 pub use crate::generation::is_name as is_model_name;
 use crate::generation::{
-    CardError, FileEntry, GroupCard, MAX_CARD_BYTES, ModelCard, ModelFileName, family_of,
-    file_names,
+    CardError, FamilyCard as _, FileEntry, GroupCard, MAX_CARD_BYTES, ModelCard, ModelFileName,
+    family_of, file_names,
 };
 use crate::model::Family;
 use crate::store::{Location, StoreError, prepared};
@@ -298,7 +298,14 @@ fn verify(file: &FileEntry, found: &str, folder: &str) -> Result<(), CardError> 
 
 /// Returns the SHA-256 of bytes as hexadecimal digits.
 pub fn sha256(bytes: &[u8]) -> String {
-    Sha256::digest(bytes).iter().fold(String::with_capacity(64), |mut text, byte| {
+    sha256_of([bytes])
+}
+
+/// Returns the SHA-256 of pieces of bytes, one behind the other, as hexadecimal digits.
+pub fn sha256_of(pieces: impl IntoIterator<Item = impl AsRef<[u8]>>) -> String {
+    let mut hash = Sha256::new();
+    pieces.into_iter().for_each(|piece| hash.update(piece));
+    hash.finalize().iter().fold(String::with_capacity(64), |mut text, byte| {
         // Writing to a string cannot fail.
         let _ = write!(text, "{byte:02x}");
         text

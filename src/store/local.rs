@@ -7,7 +7,7 @@ use super::location::{ListedObject, PutOutcome};
 
 /// Start of the names of files being written. The dot keeps an abandoned one out of `*.parquet` globs
 /// and of listings.
-const PARTIAL: &str = ".partial-";
+pub const PARTIAL: &str = ".partial-";
 /// Start of the names that libraries give to files that they write beside the one they were asked for;
 /// below `runs` alone, where weights are written so.
 const LIBRARY_PARTIAL: &str = ".tmp";

@@ -12,7 +12,7 @@ use std::time::SystemTime;
 use bytes::Bytes;
 use futures::{StreamExt as _, TryStreamExt as _};
 use object_store::path::Path as ObjectPath;
-use object_store::{ObjectStore, ObjectStoreExt as _};
+use object_store::{ObjectMeta, ObjectStore, ObjectStoreExt as _};
 use url::Url;
 
 use super::StoreError;
@@ -156,21 +156,29 @@ impl Location {
     pub fn list(&self, folder: &str) -> Result<Vec<ListedObject>, StoreError> {
         let mut found = match &self.kind {
             LocationKind::Local(root) => local::list(root, folder)?,
-            LocationKind::Remote { store, prefix } => {
-                let below = remote::join(prefix, folder);
-                let metas: Vec<_> = block_on(store.list(Some(&below)).try_collect())
-                    .map_err(|e| StoreError::remote("list", &self.url_of(folder), e))?;
-                metas
-                    .into_iter()
-                    .filter_map(|meta| {
-                        let path = remote::relative(prefix, &meta.location)?;
-                        Some(ListedObject { path, size_bytes: meta.size })
-                    })
-                    .collect()
-            }
+            LocationKind::Remote { store, prefix } => self
+                .metas(store, prefix, folder)?
+                .into_iter()
+                .filter_map(|meta| {
+                    let path = remote::relative(prefix, &meta.location)?;
+                    Some(ListedObject { path, size_bytes: meta.size })
+                })
+                .collect(),
         };
         found.sort_by(|a, b| a.path.cmp(&b.path));
         Ok(found)
+    }
+
+    /// Lists the objects of remote storage below `folder`.
+    fn metas(
+        &self,
+        store: &dyn ObjectStore,
+        prefix: &ObjectPath,
+        folder: &str,
+    ) -> Result<Vec<ObjectMeta>, StoreError> {
+        let below = remote::join(prefix, folder);
+        block_on(store.list(Some(&below)).try_collect())
+            .map_err(|e| StoreError::remote("list", &self.url_of(folder), e))
     }
 
     /// Lists every object below `folder` as [`Location::list`] does, with the times at which they were written.
@@ -193,19 +201,15 @@ impl Location {
                     .filter_map(|listed| time_of(&listed).ok().map(|time| (listed, time)))
                     .collect()
             }
-            LocationKind::Remote { store, prefix } => {
-                let below = remote::join(prefix, folder);
-                let metas: Vec<_> = block_on(store.list(Some(&below)).try_collect())
-                    .map_err(|e| StoreError::remote("list", &self.url_of(folder), e))?;
-                metas
-                    .into_iter()
-                    .filter_map(|meta| {
-                        let path = remote::relative(prefix, &meta.location)?;
-                        let listed = ListedObject { path, size_bytes: meta.size };
-                        Some((listed, meta.last_modified.into()))
-                    })
-                    .collect()
-            }
+            LocationKind::Remote { store, prefix } => self
+                .metas(store, prefix, folder)?
+                .into_iter()
+                .filter_map(|meta| {
+                    let path = remote::relative(prefix, &meta.location)?;
+                    let listed = ListedObject { path, size_bytes: meta.size };
+                    Some((listed, meta.last_modified.into()))
+                })
+                .collect(),
         };
         found.sort_by(|a, b| a.0.path.cmp(&b.0.path));
         Ok(found)

@@ -72,6 +72,7 @@ pub use schema::{Cell, Column, ColumnType, Row, TableSchema, TimestampUs};
 pub use shard::{Shard, batch_of, split_of};
 pub use source::{
     Content, Listing, OrderedContents, Source, SourceFile, SourceProblem, SourceProblemKind,
+    content_of,
 };
 pub use store_snapshot::{LivePart, StoreSnapshot, checkpoint, live_parts, origin_of};
 pub use vacuum::{VacuumRemovals, vacuum};

@@ -4,10 +4,10 @@ use std::path::{Path as FsPath, PathBuf};
 use std::time::SystemTime;
 
 use super::StoreError;
+use super::local::PARTIAL;
 
 /// Folders that are kept; the least recently used beyond are removed.
 const N_KEPT: usize = 12;
-const PARTIAL: &str = ".partial-";
 
 /// Returns the folder `key` below `root`, which `make` fills if it is not there yet.
 ///

@@ -288,11 +288,18 @@ impl Fetcher {
 
 /// Opens or reads a local file, whichever its size asks for.
 pub(super) fn read_local(path: &FsPath, size_bytes: u64) -> Result<Content, StoreError> {
-    let io = |e| StoreError::io("read", &path.display().to_string(), e);
+    content_of(path, size_bytes).map_err(|e| StoreError::io("read", &path.display().to_string(), e))
+}
+
+/// Opens or reads a file of this machine, whichever its size asks for.
+///
+/// # Errors
+/// What the disk says.
+pub fn content_of(path: &FsPath, size_bytes: u64) -> std::io::Result<Content> {
     if size_bytes <= IN_MEMORY_BYTES {
-        std::fs::read(path).map(|bytes| Content::Bytes(bytes.into())).map_err(io)
+        std::fs::read(path).map(|bytes| Content::Bytes(bytes.into()))
     } else {
-        File::open(path).map(Content::File).map_err(io)
+        File::open(path).map(Content::File)
     }
 }
 

@@ -309,7 +309,7 @@ fn the_documented_python_samples_what_motiongen_samples() {
 /// Samples by this program: the session of a file, the sampler of the room `diffusion`.
 fn sampled_by_motiongen(folder: &Path, noise: &[f32], [audio, clock]: [&[f32]; 2]) -> Vec<f32> {
     use motiongen::diffusion::{DiffusionError, SamplerConfig, Schedule, Spacing, sample};
-    use motiongen::generation::ModelCard;
+    use motiongen::generation::{FamilyCard as _, ModelCard};
     use motiongen::onnx::{DecoderNames, Session, UNetNames};
     use ndarray::{Array3, ArrayView3};
 

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
-use motiongen::generation::{LearnedFrom, ModelCard};
+use motiongen::generation::{FamilyCard as _, LearnedFrom, ModelCard};
 use motiongen::stages::learned::of_model;
 use motiongen::store::tables::{GenerationRow, PhraseRow};
 use motiongen::store::{Location, split_of};

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use arrow_array::RecordBatch;
-use motiongen::generation::{ModelCard, MusicSplit};
+use motiongen::generation::{FamilyCard as _, ModelCard, MusicSplit};
 use motiongen::stages::learned::of_model;
 use motiongen::store::tables::PhraseRow;
 use motiongen::store::{ItemTables, Location, PartWriter, Row, Snapshot, TableSchema};

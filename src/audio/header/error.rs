@@ -5,6 +5,7 @@ use std::io;
 use symphonia::core::errors::Error;
 
 use crate::audio::container::media::Survey;
+use crate::excerpt::preview;
 
 /// Why a file's audio header could not be read.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -207,16 +208,4 @@ pub(in crate::audio) fn unknown(bytes: &[u8], extension: &str) -> AudioHeaderErr
         "WAV, AIFF, FLAC, MP3, Ogg, MP4, AAC, CAF and AU are read, was another format saved{name}?"
     );
     AudioHeaderError::NotAudio { found: preview(bytes), way_out }
-}
-
-/// Quotes the text that the bytes start with, up to the first line's end, or lists the first bytes
-/// in hexadecimal when that text is shorter than a format's marker.
-fn preview(bytes: &[u8]) -> String {
-    let start = &bytes[..bytes.len().min(24)];
-    let n_text = start.iter().take_while(|byte| matches!(byte, b' '..=b'~' | b'\t')).count();
-    if n_text >= 4 || n_text == bytes.len() {
-        return format!("{:?}", String::from_utf8_lossy(&start[..n_text]));
-    }
-    let hex: Vec<String> = start.iter().take(8).map(|byte| format!("{byte:02x}")).collect();
-    format!("bytes {}", hex.join(" "))
 }

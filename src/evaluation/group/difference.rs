@@ -6,10 +6,11 @@ use super::correlation::pieces;
 use super::realism::compressed;
 use super::unison::own_velocities;
 use super::{mean, n_frames, pairs};
-use crate::evaluation::body::{minus, norm, part};
+use crate::evaluation::body::part;
 use crate::evaluation::diversity::mean_distance;
 use crate::evaluation::kinetic::{Formula, marker_features};
 use crate::motion::Poses;
+use crate::motion::vector::{minus, norm};
 
 /// How different dancers are.
 #[derive(Clone, Copy, Debug, PartialEq)]

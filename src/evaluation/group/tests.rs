@@ -7,7 +7,7 @@ use super::contact::contacts;
 use super::formation::coverage;
 use super::unison::unison;
 use super::*;
-use crate::evaluation::draws::Draws;
+use crate::chance::Draws;
 use crate::evaluation::frechet::{Gaussian, frechet_distance};
 use crate::evaluation::geometric::{GEOMETRIC_NAMES, GeometricThresholds, geometric_features};
 use crate::motion::npy::read_f32;

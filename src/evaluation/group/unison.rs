@@ -1,9 +1,9 @@
 //! Unison: how far dancers make the same steps, at once or one behind the other.
 
 use super::{mean, n_frames, pairs};
-use crate::evaluation::body::Vector;
 use crate::motion::kinematics::forward_differences;
 use crate::motion::quaternion::{from_axis_angle, rotate};
+use crate::motion::vector::Vector;
 use crate::motion::{Placement, Poses};
 
 /// Below this share of their mean square, velocities are taken for constant.

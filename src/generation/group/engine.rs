@@ -151,9 +151,7 @@ impl GroupEngine {
                 return Err(EngineError::Shape { what, found, expected });
             }
         }
-        let mut audio = inputs.audio.as_standard_layout().into_owned();
-        let rows = audio.view_mut().into_shape_with_order((groups * frames, dim));
-        self.scale.apply(rows.expect("in order"));
+        let audio = self.scaled(inputs.audio);
         let x = inputs.x.as_standard_layout();
         self.workers.with(|GroupWorker { threads, arena }| {
             threads.run(|| {
@@ -190,15 +188,21 @@ impl GroupEngine {
         })
     }
 
+    /// Returns music as the networks hear it, in units of its spread, \[groups, T, condition_dim\].
+    fn scaled(&self, audio: ArrayView3<f32>) -> Array3<f32> {
+        let (groups, frames, dim) = audio.dim();
+        let mut audio = audio.as_standard_layout().into_owned();
+        let rows = audio.view_mut().into_shape_with_order((groups * frames, dim));
+        self.scale.apply(rows.expect("in order"));
+        audio
+    }
+
     /// Returns log f of each group of clean motion at a step, for motion of one number of dancers.
     ///
     /// # Errors
     /// Shapes that do not fit.
     pub fn score(&self, inputs: &GroupEngineInputs) -> Result<Vec<f32>, EngineError> {
-        let (groups, frames, dim) = inputs.audio.dim();
-        let mut audio = inputs.audio.as_standard_layout().into_owned();
-        let rows = audio.view_mut().into_shape_with_order((groups * frames, dim));
-        self.scale.apply(rows.expect("in order"));
+        let audio = self.scaled(inputs.audio);
         let x = inputs.x.as_standard_layout();
         self.workers.with(|GroupWorker { threads, arena }| {
             threads.run(|| {

@@ -4,6 +4,7 @@ use std::f64::consts::FRAC_PI_2;
 use std::fmt;
 
 use super::super::quaternion::{IDENTITY, Quaternion, from_axis_angle, normalize, rotate};
+use super::super::vector::{inner, minus};
 use super::CaptureError;
 use super::skeleton::{Body, Landmarks, Positions, STANDING_RATIO, at, sampled};
 
@@ -83,13 +84,13 @@ impl Axis {
 
     /// The axis along which the mean of unit vectors is at least so long; none where they point everywhere.
     pub fn along(mean: [f64; 3], least: f64) -> Option<Self> {
-        Self::ALL.into_iter().find(|axis| dot(axis.direction(), mean) >= least)
+        Self::ALL.into_iter().find(|axis| inner(axis.direction(), mean) >= least)
     }
 
     /// The axis next to a direction; none where two are about as near.
     fn next_to(v: [f64; 3], least: f64) -> Option<Self> {
         let length = v.iter().map(|c| c * c).sum::<f64>().sqrt();
-        let along = |axis: &Self| dot(axis.direction(), v);
+        let along = |axis: &Self| inner(axis.direction(), v);
         Self::ALL.into_iter().find(|axis| length > 0.0 && along(axis) >= least * length)
     }
 }
@@ -192,9 +193,9 @@ fn rest_up(body: &Body) -> Option<Axis> {
         (minus(body.rest[*head], body.rest[*pelvis]), minus(body.rest[*pelvis], foot));
     let whole: [f64; 3] = std::array::from_fn(|c| trunk[c] + legs[c]);
     let axis = Axis::next_to(whole, DECIDED)?;
-    let height = dot(axis.direction(), whole);
+    let height = inner(axis.direction(), whole);
     // Where every bone lies along one axis, head and feet are on one side.
-    let both = [trunk, legs].iter().all(|v| dot(axis.direction(), *v) >= PART_SHARE * height);
+    let both = [trunk, legs].iter().all(|v| inner(axis.direction(), *v) >= PART_SHARE * height);
     both.then_some(axis)
 }
 
@@ -229,7 +230,7 @@ fn floor_motion(body: &Body, world: &Positions, up: Axis) -> f64 {
     let lowest: Vec<f64> = sampled(world.first().map_or(0, Vec::len))
         .into_iter()
         .map(|t| {
-            let heights = body.nodes.iter().map(|&i| dot(direction, at(world, i, t)));
+            let heights = body.nodes.iter().map(|&i| inner(direction, at(world, i, t)));
             heights.fold(f64::INFINITY, f64::min)
         })
         .collect();
@@ -248,14 +249,6 @@ pub fn tilt(q: Quaternion) -> Quaternion {
     // The turn about +Y, inverted, times the whole.
     let back = [w, 0.0, -y, 0.0];
     normalize(super::super::quaternion::mul(back, q))
-}
-
-fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
-    (0..3).map(|c| a[c] * b[c]).sum()
-}
-
-fn minus(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
-    std::array::from_fn(|c| a[c] - b[c])
 }
 
 fn mean(vectors: impl Iterator<Item = [f64; 3]>) -> [f64; 3] {

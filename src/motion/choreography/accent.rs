@@ -1,6 +1,7 @@
 //! Kinematic accents: the moments at which a body all but stops before it goes on.
 
 use super::super::quantile::percentile;
+use super::super::vector::norm;
 use crate::units::FPS;
 
 /// Lever arm that turns a rate of turning into a speed, m: about half the width of the hips and
@@ -15,14 +16,18 @@ const SURROUNDINGS_FRAMES: usize = 75;
 
 /// Returns the effort of every frame, m/s: `|v| + ρ |ω|` with `ρ` = 0.3 m.
 pub fn effort(velocity_m_s: &[[f64; 3]], angular_velocity_rad_s: &[[f64; 3]]) -> Vec<f64> {
-    let turning = angular_velocity_rad_s.iter().map(|w| LEVER_ARM_M * norm(w));
-    velocity_m_s.iter().zip(turning).map(|(v, turning)| norm(v) + turning).collect()
+    let turning = angular_velocity_rad_s.iter().map(|w| LEVER_ARM_M * norm(*w));
+    velocity_m_s.iter().zip(turning).map(|(v, turning)| norm(*v) + turning).collect()
 }
 
 /// Returns the energy of every frame, J per kg: `(|v|² + ρ² |ω|²) / 2` with `ρ` = 0.3 m.
 pub fn energy(velocity_m_s: &[[f64; 3]], angular_velocity_rad_s: &[[f64; 3]]) -> Vec<f64> {
-    let turning = angular_velocity_rad_s.iter().map(|w| (LEVER_ARM_M * norm(w)).powi(2));
-    velocity_m_s.iter().zip(turning).map(|(v, turning)| (norm(v).powi(2) + turning) / 2.0).collect()
+    let turning = angular_velocity_rad_s.iter().map(|w| (LEVER_ARM_M * norm(*w)).powi(2));
+    velocity_m_s
+        .iter()
+        .zip(turning)
+        .map(|(v, turning)| (norm(*v).powi(2) + turning) / 2.0)
+        .collect()
 }
 
 /// Returns the frames of the accents of an effort signal, ascending: its prominent minima.
@@ -69,10 +74,6 @@ pub fn held_differences<const N: usize>(x: &[[f64; N]]) -> Vec<[f64; N]> {
     let mut d: Vec<[f64; N]> = x.windows(2).map(difference).collect();
     d.extend(x.first().map(|_| d.last().copied().unwrap_or([0.0; N])));
     d
-}
-
-pub fn norm(v: &[f64; 3]) -> f64 {
-    v.iter().map(|c| c * c).sum::<f64>().sqrt()
 }
 
 #[cfg(test)]

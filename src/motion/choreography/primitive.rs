@@ -13,7 +13,8 @@ use super::super::quaternion::{
 };
 use super::super::spline::{CubicSpline, SplineError};
 use super::super::trajectory::Trajectory;
-use super::accent::{cuts, effort, energy, held_differences, norm};
+use super::super::vector::norm;
+use super::accent::{cuts, effort, energy, held_differences};
 use super::activity::mid_rank;
 use crate::units::{FPS, frames_to_s};
 
@@ -224,7 +225,7 @@ fn primitives(poses: &Poses, capture: usize) -> Vec<Primitive> {
     let headings = headings(&poses.orientation);
     let cuts = cuts(&effort(&velocity, &omega), MAX_PRIMITIVE_FRAMES);
     let is_upright = |t: usize| rotate(poses.orientation[t], UP)[1] >= MIN_UPRIGHT;
-    let top = |x: &[[f64; 3]]| x.iter().map(norm).fold(0.0, f64::max);
+    let top = |x: &[[f64; 3]]| x.iter().copied().map(norm).fold(0.0, f64::max);
     let mut found = Vec::new();
     for (i, &start) in cuts.iter().enumerate().filter(|&(_, &start)| is_upright(start)) {
         let ends = cuts[i + 1..].iter().take_while(|&&end| end - start <= MAX_PRIMITIVE_FRAMES);

@@ -1,13 +1,16 @@
 //! What the dance owes to the music, measured on songs whose beats and loudness are known.
 
-use super::accent::{LEVER_ARM_M, norm};
+use super::accent::LEVER_ARM_M;
 use super::floor::HALF_FLOOR_M;
 use super::selection::RATES;
 use super::*;
 use crate::motion::locking::bar_locking;
 use crate::motion::phase::bar_phase_at_tempo;
-use crate::motion::quaternion::{from_axis_angle, make_sign_continuous, mul, normalize};
+use crate::motion::quaternion::{
+    angular_velocity, from_axis_angle, make_sign_continuous, mul, normalize,
+};
 use crate::motion::trajectory::{ChannelLimits, Trajectory};
+use crate::motion::vector::norm;
 use crate::units::FPS;
 use std::f64::consts::TAU;
 
@@ -180,7 +183,7 @@ fn accents_fall_on_beats() {
     let effort: Vec<f64> = vectors(&dance.frames, Channel::Velocity)
         .iter()
         .zip(vectors(&dance.frames, Channel::AngularVelocity))
-        .map(|(v, w)| v[0].hypot(v[2]) + LEVER_ARM_M * norm(&w))
+        .map(|(v, w)| v[0].hypot(v[2]) + LEVER_ARM_M * norm(w))
         .collect();
     let mean = effort.iter().sum::<f64>() / effort.len() as f64;
     let ends: Vec<f64> = dance
@@ -200,33 +203,39 @@ fn every_frame_obeys_the_identities_and_moves_as_people_do() {
     for (tempo_bpm, beats_per_bar) in SONGS {
         let music = Music::new(tempo_bpm, beats_per_bar, 40.0);
         let dance = choreograph(&music.song(), &repertoire, 9).frames;
-        let trajectory = Trajectory::new(dance.clone()).unwrap();
-        trajectory.check(&ChannelLimits::Wide).unwrap();
-        let x = dance.mapv(f64::from);
-        for t in 0..x.nrows() - 1 {
-            for i in 0..6 {
-                let derived = (x[[t + 1, i]] - x[[t, i]]) * FPS;
-                let size = (x[[t, i]].abs() + x[[t + 1, i]].abs()) * FPS + derived.abs();
-                // Three roundings to f32, two of them times 30.
-                let tolerance = f64::from(f32::EPSILON) * size + 1e-9;
-                assert!((x[[t, i + 3]] - derived).abs() <= tolerance, "{i} at {t}");
-            }
-            let q = |t: usize| normalize(std::array::from_fn(|c| x[[t, 9 + c]]));
-            let omega = crate::motion::quaternion::angular_velocity(q(t), q(t + 1), FPS);
-            for axis in 0..3 {
-                // Rounding of quaternions (3e-8 each) times 2 · 30.
-                assert!((x[[t, 13 + axis]] - omega[axis]).abs() < 2e-5, "{axis} at {t}");
-            }
-            assert!(x[[t, 0]].abs() < HALF_FLOOR_M && x[[t, 2]].abs() < HALF_FLOOR_M, "{t}");
-        }
+        check_identities(&dance, &music);
+        let is_on_floor =
+            |i: usize| dance.column(i).iter().all(|x| f64::from(x.abs()) < HALF_FLOOR_M);
+        assert!(is_on_floor(0) && is_on_floor(2), "{tempo_bpm}");
         let acceleration = vectors(&dance, Channel::Acceleration);
         let jerk = forward_differences(&acceleration);
-        let mean = jerk.iter().map(norm).sum::<f64>() / jerk.len() as f64;
+        let mean = jerk.iter().copied().map(norm).sum::<f64>() / jerk.len() as f64;
         // The range of 64 real captures.
         assert!((5.0..=404.0).contains(&mean), "{tempo_bpm}: {mean}");
-        let phase = bar_phase(&music.times_s, &music.beats);
-        assert!(phase.iter().zip(dance.column(16)).all(|(p, &x)| *p as f32 == x));
     }
+}
+
+/// Asserts that a dance keeps to the limits, that its derivatives are those of its poses, and its phase the music's.
+pub(super) fn check_identities(dance: &Array2<f32>, music: &Music) {
+    Trajectory::new(dance.clone()).unwrap().check(&ChannelLimits::Wide).unwrap();
+    let x = dance.mapv(f64::from);
+    for t in 0..x.nrows() - 1 {
+        for i in 0..6 {
+            let derived = (x[[t + 1, i]] - x[[t, i]]) * FPS;
+            let size = (x[[t, i]].abs() + x[[t + 1, i]].abs()) * FPS + derived.abs();
+            // Three roundings to f32, two of them times 30.
+            let tolerance = f64::from(f32::EPSILON) * size + 1e-9;
+            assert!((x[[t, i + 3]] - derived).abs() <= tolerance, "{i} at {t}");
+        }
+        let q = |t: usize| normalize(std::array::from_fn(|c| x[[t, 9 + c]]));
+        let omega = angular_velocity(q(t), q(t + 1), FPS);
+        for axis in 0..3 {
+            // Rounding of quaternions (3e-8 each) times 2 · 30.
+            assert!((x[[t, 13 + axis]] - omega[axis]).abs() < 2e-5, "{axis} at {t}");
+        }
+    }
+    let phase = bar_phase(&music.times_s, &music.beats);
+    assert!(phase.iter().zip(dance.column(16)).all(|(p, &x)| *p as f32 == x));
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! Lists of keys in messages.
 
-use super::super::npy::clip;
+use crate::excerpt::clip;
 
 /// Most keys that a message lists.
 const MAX_LISTED: usize = 12;

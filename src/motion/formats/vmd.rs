@@ -16,7 +16,7 @@ mod tests;
 use thiserror::Error;
 
 use super::super::capture::RigidTrack;
-use super::super::npy::preview;
+use crate::excerpt::preview;
 
 /// Frames per second of every file.
 pub const RATE_HZ: f64 = 30.0;

@@ -2,8 +2,7 @@
 
 use std::io;
 
-/// Longest piece of foreign text repeated in a message, in characters.
-const MAX_QUOTED_CHARS: usize = 40;
+use crate::excerpt::preview;
 
 /// Why bytes could not be read as a numeric NumPy array.
 #[derive(Debug, thiserror::Error)]
@@ -98,25 +97,5 @@ impl NpyError {
             "save the array with numpy.save"
         };
         Self::NotNpy { found: preview(start), way_out }
-    }
-}
-
-/// Quotes the text that the bytes start with, up to the first line's end, or lists the first bytes
-/// in hexadecimal when that text is shorter than a format's marker.
-pub(crate) fn preview(bytes: &[u8]) -> String {
-    let start = &bytes[..bytes.len().min(24)];
-    let n_text = start.iter().take_while(|byte| matches!(byte, b' '..=b'~' | b'\t')).count();
-    if n_text >= 4 || n_text == bytes.len() {
-        return format!("{:?}", String::from_utf8_lossy(&start[..n_text]));
-    }
-    let hex: Vec<String> = start.iter().take(8).map(|byte| format!("{byte:02x}")).collect();
-    format!("bytes {}", hex.join(" "))
-}
-
-/// Shortens foreign text so that a hostile header cannot flood a message.
-pub(crate) fn clip(text: &str) -> String {
-    match text.char_indices().nth(MAX_QUOTED_CHARS) {
-        Some((end, _)) => format!("{}…", &text[..end]),
-        None => text.to_owned(),
     }
 }

@@ -3,7 +3,8 @@
 //! Source: NumPy enhancement proposal 1, "Format Specification: Version 1.0", and
 //! `numpy.lib.format` for versions 2.0 and 3.0.
 
-use super::error::{NpyError, clip};
+use super::error::NpyError;
+use crate::excerpt::clip;
 
 /// NumPy's own limit on the number of axes (`NPY_MAXDIMS` of NumPy 2).
 const MAX_AXES: usize = 64;

@@ -4,6 +4,7 @@ use ndarray::Array2;
 
 use super::fusion::{Displacement, FusionMeasurements, HeldPoses};
 use super::variances::{AxisVariances, FusionVariances};
+use crate::chance::Draws;
 use crate::motion::channels::MOTION_DIM;
 use crate::motion::kinematics::Poses;
 use crate::motion::quaternion::{
@@ -22,20 +23,16 @@ pub const VARIANCES: FusionVariances = FusionVariances {
     angular_velocity_rad2_s2: AxisVariances { horizontal: 0.08, vertical: 0.03 },
 };
 
-/// Normal numbers, the same for the same seed (splitmix64; Box and Muller).
-pub struct Noise(pub u64);
+/// Normal numbers, the same for the same seed (Box and Muller).
+pub struct Noise(Draws);
 
 impl Noise {
-    fn uniform(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1_u64 << 53) as f64
+    pub fn new(seed: u64) -> Self {
+        Self(Draws::new(seed))
     }
 
     pub fn normal(&mut self) -> f64 {
-        let (u, v) = (1.0 - self.uniform(), self.uniform());
+        let (u, v) = (1.0 - self.0.uniform(), self.0.uniform());
         (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos()
     }
 
@@ -76,7 +73,7 @@ pub fn exact(poses: &Poses) -> FusionMeasurements {
 
 /// Adds errors of some variances to every channel, and flips a sign now and then.
 pub fn noisy(poses: &Poses, variances: &FusionVariances, seed: u64) -> FusionMeasurements {
-    let mut noise = Noise(seed);
+    let mut noise = Noise::new(seed);
     let mut measured = exact(poses);
     let groups = [
         (&mut measured.position, &variances.position_m2),
@@ -92,7 +89,7 @@ pub fn noisy(poses: &Poses, variances: &FusionVariances, seed: u64) -> FusionMea
     }
     for q in &mut measured.orientation {
         let error = from_rotation_vector(noise.vector(&variances.orientation_rad2));
-        let sign = if noise.uniform() < 0.3 { -1.0 } else { 1.0 };
+        let sign = if noise.0.uniform() < 0.3 { -1.0 } else { 1.0 };
         *q = mul(error, *q).map(|c| sign * c);
     }
     measured

@@ -17,14 +17,15 @@ use ndarray::{Array2, Axis, concatenate};
 use crate::audio::FEATURE_DIM;
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
 use crate::generation::{
-    EagerEngine, EngineError, Generator, ModelCard, OVERLAP_FRAMES, Sampling, Track,
+    EagerEngine, EngineError, FamilyCard as _, Generator, ModelCard, OVERLAP_FRAMES, Sampling,
+    Track,
 };
 use crate::model::condition;
 use crate::motion::postprocess::process;
 use crate::stages::Progress;
-use crate::stages::extract::pool::{self, lock};
 use crate::stages::generate::{MotionSettings, PostProcessParams, seed_of};
 use crate::stages::model_files::OpenModel;
+use crate::stages::pool::{self, lock};
 use crate::store::Location;
 use crate::store::tables::GenerationRow;
 

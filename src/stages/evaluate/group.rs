@@ -1,7 +1,9 @@
 //! Runs of groups: how dancers move together, keep apart and follow the music, beside real groups and made-up ones.
 
+mod made_up;
+mod summary;
+
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::{self, Write};
 use std::time::Instant;
 
 use anyhow::bail;
@@ -23,6 +25,8 @@ use crate::stages::{Progress, Stage as _, Summary, lease};
 use crate::store::tables::{self, GenerationRow, MetricRow, PhraseRow};
 use crate::store::{self, Location, Row as _, StoreError, StoreSnapshot, TimestampUs, digest};
 use crate::units::{FPS, frames_to_s};
+use made_up::{copied, independent};
+use summary::GroupEvaluationSummary;
 
 /// Raised when this evaluation writes something else for the same motions.
 const OUTPUT_VERSION: u32 = 1;
@@ -413,44 +417,6 @@ fn measured(
     found
 }
 
-/// Mean place of a dancer on the floor, m.
-fn mean_place(dancer: ndarray::ArrayView2<f32>) -> [f32; 2] {
-    let first = Channel::Position.range().start;
-    [first, first + 2].map(|i| dancer.column(i).mean().unwrap_or_default())
-}
-
-/// Moves a dancer so that its mean place is `to`.
-fn moved(dancer: ndarray::ArrayView2<f32>, to: [f32; 2]) -> Array2<f32> {
-    let from = mean_place(dancer);
-    let mut dancer = dancer.to_owned();
-    let first = Channel::Position.range().start;
-    for (i, (from, to)) in [first, first + 2].into_iter().zip(from.into_iter().zip(to)) {
-        dancer.column_mut(i).mapv_inplace(|x| x + to - from);
-    }
-    dancer
-}
-
-/// The first dancer in the place of every dancer.
-fn copied(group: ArrayView3<f32>) -> Array3<f32> {
-    let mut copies = group.to_owned();
-    let first = group.index_axis(Axis(0), 0);
-    for (mut copy, dancer) in copies.outer_iter_mut().zip(group.outer_iter()) {
-        copy.assign(&moved(first, mean_place(dancer)));
-    }
-    copies
-}
-
-/// Dancer k of group k in the place of dancer k.
-fn independent(group: ArrayView3<f32>, others: &[Array3<f32>]) -> Array3<f32> {
-    let mut mixed = group.to_owned();
-    for (k, (mut dancer, other)) in mixed.outer_iter_mut().zip(others).enumerate() {
-        let place = mean_place(group.index_axis(Axis(0), k));
-        let from = other.index_axis(Axis(0), k.min(other.dim().0 - 1));
-        dancer.assign(&moved(from, place));
-    }
-    mixed
-}
-
 fn metric_rows(run: &str, model: &str, window: usize, found: &Found) -> Vec<MetricRow> {
     let time = TimestampUs::now();
     let protocol =
@@ -488,88 +454,4 @@ fn metric_rows(run: &str, model: &str, window: usize, found: &Found) -> Vec<Metr
         row("gmr", "", "", Estimate::plain(gmr, n));
     }
     rows
-}
-
-/// The summary of an evaluation of groups.
-struct GroupEvaluationSummary {
-    store: String,
-    run: String,
-    n_motions: usize,
-    length_s: f64,
-    is_up_to_date: bool,
-    dry_run: bool,
-    metrics: Vec<MetricRow>,
-    took_s: f64,
-}
-
-impl Summary for GroupEvaluationSummary {
-    fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        let Self { store, run, n_motions, length_s, took_s, .. } = self;
-        writeln!(out, "evaluate {run} → {store}")?;
-        if self.dry_run {
-            let what = if self.is_up_to_date { "nothing to do for" } else { "would evaluate" };
-            return writeln!(out, "  {what} {n_motions} groups ({length_s:.1} s)");
-        }
-        let done = match self.is_up_to_date {
-            true => ", evaluated before".to_owned(),
-            false => format!(" evaluated; {took_s:.1} s"),
-        };
-        writeln!(out, "  {n_motions} groups ({length_s:.1} s){done}")?;
-        let columns: BTreeSet<(&str, &str)> =
-            self.metrics.iter().map(|row| (row.split.as_str(), row.subject.as_str())).collect();
-        let names: BTreeSet<(&str, &str)> =
-            self.metrics.iter().map(|row| (row.metric.as_str(), row.variant.as_str())).collect();
-        write!(out, "\n  {:<38}", "")?;
-        for (split, subject) in &columns {
-            write!(out, " {:>16}", format!("{split}/").chars().take(16).collect::<String>())?;
-            let _ = subject;
-        }
-        write!(out, "\n  {:<38}", "")?;
-        for (_, subject) in &columns {
-            write!(out, " {subject:>16}")?;
-        }
-        writeln!(out)?;
-        for (metric, variant) in names {
-            let name = if variant.is_empty() {
-                metric.to_owned()
-            } else {
-                format!("{metric} ({variant})")
-            };
-            write!(out, "  {name:<38}")?;
-            for (split, subject) in &columns {
-                let is = |row: &&MetricRow| {
-                    row.metric == metric
-                        && row.variant == variant
-                        && row.split == *split
-                        && row.subject == *subject
-                };
-                let value = self.metrics.iter().find(is).and_then(|row| row.value);
-                let text = value.map_or_else(|| "-".to_owned(), |x| format!("{x:.3}"));
-                write!(out, " {text:>16}")?;
-            }
-            writeln!(out)?;
-        }
-        writeln!(
-            out,
-            "\n  motiongen query --store {store} \"select subject, split, metric, variant, value, ci_low, ci_high \
-             from metrics where run = '{run}'\""
-        )
-    }
-
-    fn n_failed(&self) -> u64 {
-        0
-    }
-
-    fn figures(&mut self) -> serde_json::Value {
-        serde_json::json!({
-            "store": self.store,
-            "run": self.run,
-            "n_motions": self.n_motions,
-            "length_s": self.length_s,
-            "is_up_to_date": self.is_up_to_date,
-            "dry_run": self.dry_run,
-            "n_metrics": self.metrics.len(),
-            "took_s": self.took_s,
-        })
-    }
 }

@@ -11,7 +11,7 @@ use crate::evaluation::window::{window, window_starts};
 use crate::evaluation::window_range::RANGE_CHECKS;
 use crate::evaluation::{Check, WindowMeasures, checks};
 use crate::motion::{ChannelLimits, MOTION_DIM};
-use crate::stages::extract::pool::lock;
+use crate::stages::pool::lock;
 
 /// Frames that are kept of all motions together, to compare the values of channels.
 pub const MAX_KEPT_FRAMES: usize = 60_000;

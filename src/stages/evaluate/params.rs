@@ -7,7 +7,7 @@ use anyhow::ensure;
 
 use crate::evaluation::verdict::Quality;
 use crate::motion::ChannelLimits;
-use crate::stages::{ClientParams, all_threads};
+use crate::stages::{ClientParams, RARE, all_threads};
 use crate::store::digest;
 
 /// Raised when evaluate writes something else for the same motions and settings.
@@ -56,7 +56,7 @@ pub struct Params {
     #[arg(long, value_name = "DIR")]
     pub motions: Option<PathBuf>,
     /// With --motions: the name under which tables keep what was found [default: the folder's]
-    #[arg(long, value_name = "NAME", requires = "motions")]
+    #[arg(long, value_name = "NAME", requires = "motions", hide_short_help = RARE)]
     pub name: Option<String>,
     /// Sanity checks only: no real motion is read, and no numbers and verdicts are written.
     #[arg(long)]
@@ -65,10 +65,10 @@ pub struct Params {
     #[arg(long, value_name = "N")]
     pub num_samples: Option<NonZeroUsize>,
     /// Frames of each motion that are looked at, from its first [default: all]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", hide_short_help = RARE)]
     pub num_frames: Option<NonZeroUsize>,
     /// How far each channel may go.
-    #[arg(long, value_enum, default_value_t = ChannelLimits::Wide)]
+    #[arg(long, value_enum, default_value_t = ChannelLimits::Wide, hide_short_help = RARE)]
     pub limits: ChannelLimits,
     /// Threads that measure motions [default: all cores]
     #[arg(long, value_name = "N", default_value_t = all_threads())]
@@ -80,7 +80,8 @@ pub struct Params {
     #[arg(long, value_name = "RUN", help_heading = "Report")]
     pub against: Option<String>,
     /// Motions that fail the most, which the report shows.
-    #[arg(long, value_name = "N", default_value_t = 3, help_heading = "Report")]
+    #[arg(long, value_name = "N", default_value_t = 3, help_heading = "Report",
+          hide_short_help = RARE)]
     pub worst: usize,
     /// Exit code 1 unless these verdicts are won, on music that the model did not meet, where there is any.
     #[arg(long, value_enum, value_name = "VERDICT", num_args = 1.., value_delimiter = ',',
@@ -88,13 +89,13 @@ pub struct Params {
     pub require: Vec<RequiredVerdict>,
     /// Windows of music for which the untrained network, and the trained one without its music, are sampled as
     /// baselines; 0 leaves both out, and the verdict on following the music open.
-    #[arg(long, value_name = "N", default_value_t = 256)]
+    #[arg(long, value_name = "N", default_value_t = 256, hide_short_help = RARE)]
     pub baseline_windows: usize,
     /// Exit code 1 when fewer than this share of the motions pass the reference's checks, 0 to 1.
-    #[arg(long, value_name = "X", help_heading = "Exit code")]
+    #[arg(long, value_name = "X", help_heading = "Exit code", hide_short_help = RARE)]
     pub min_pass_rate: Option<f64>,
     /// Exit code 1 when fewer than this share of the motions pass the strict checks, 0 to 1.
-    #[arg(long, value_name = "X", help_heading = "Exit code")]
+    #[arg(long, value_name = "X", help_heading = "Exit code", hide_short_help = RARE)]
     pub min_strict_pass_rate: Option<f64>,
     #[command(flatten)]
     pub client: ClientParams,

@@ -3,28 +3,102 @@
 use std::collections::BTreeMap;
 
 use bytes::Bytes;
-use sha2::{Digest as _, Sha256};
+use serde::Serialize;
 
 use super::Params;
 use crate::autodiff::Parameters;
-use crate::diffusion::Schedule;
+use crate::diffusion::{DiffusionConfig, Schedule};
 use crate::generation::{
-    FileEntry, LearnedFrom, MODEL_FORMAT, ModelCard, ModelFileName, Networks, Provenance,
-    SamplingDefaults, own_channels, own_features,
+    FamilyCard as _, FileEntry, LearnedFrom, MODEL_FORMAT, ModelCard, ModelFileName, Networks,
+    Provenance, SamplingDefaults, SharedFields, own_channels, own_features,
 };
 use crate::model::{Family, ParameterId};
 use crate::motion::rates::MotionRange;
-use crate::onnx::{EncodedModel, Form, Model, ModelFile, OnnxError, check, decoder, unet};
-use crate::stages::model_files::sha256;
+use crate::onnx::{EncodedModel, Form, Graph, Model, ModelFile, OnnxError, check, decoder, unet};
+use crate::stages::model_files::{sha256, sha256_of};
 use crate::stages::trained::TrainedRun;
 use crate::units::FPS;
 
 /// A model that is not yet anywhere.
-pub struct ExportedFiles {
-    pub card: ModelCard,
+pub struct ExportedFiles<C = ModelCard> {
+    pub card: C,
     pub card_text: Bytes,
     /// Name and content, in the order in which they are written.
     pub bytes: Vec<(ModelFileName, Bytes)>,
+}
+
+/// A network that becomes a file.
+pub struct NetworkFile<'a> {
+    pub graph: Graph,
+    pub name: ModelFileName,
+    /// SHA-256 of the weights as f32, that of all networks or of this one.
+    pub weights_sha256: &'a str,
+    /// Where weights of more than so many bytes lie; none for within the file, however many there are.
+    pub weights_beside: Option<(ModelFileName, usize)>,
+}
+
+/// Writes networks as files, and checks them against the rules of the format; `own` is what the files themselves tell
+/// of the model beside what cards of all families say.
+///
+/// # Errors
+/// A network that breaks a rule.
+pub fn encode(
+    networks: Vec<NetworkFile>,
+    card: SharedFields<'_>,
+    own: &[(&str, String)],
+) -> anyhow::Result<Vec<(ModelFileName, Bytes)>> {
+    let mut files = Vec::new();
+    for NetworkFile { graph, name, weights_sha256, weights_beside } in networks {
+        let mut metadata = metadata(&card, own)?;
+        metadata.insert("motiongen.weights_sha256".to_owned(), weights_sha256.to_owned());
+        let description = format!("{} of {}, by {}", graph.name, card.name, card.program);
+        let file = ModelFile { graph, metadata, description };
+        let (weights_name, embedded) =
+            weights_beside.map_or(("", usize::MAX), |(name, embedded)| (name.name(), embedded));
+        let EncodedModel { model, weights } = file.encode(weights_name, embedded);
+        let read = Model::read(model.clone(), weights.as_ref(), name.name())?;
+        check(&read, name.name())
+            .map_err(|e: OnnxError| anyhow::anyhow!("{e}; please report this"))?;
+        files.push((name, model));
+        files.extend(weights_beside.zip(weights).map(|((name, _), weights)| (name, weights)));
+    }
+    Ok(files)
+}
+
+/// Returns what a card lists of files.
+pub fn entries(files: &[(ModelFileName, Bytes)]) -> Vec<FileEntry> {
+    let entry = |(name, bytes): &(ModelFileName, Bytes)| FileEntry {
+        name: *name,
+        n_bytes: bytes.len() as u64,
+        sha256: sha256(bytes),
+    };
+    files.iter().map(entry).collect()
+}
+
+/// Returns ᾱ of each step of a diffusion.
+///
+/// # Errors
+/// A configuration of which no schedule can be made.
+pub fn alphas_cumprod(diffusion: &DiffusionConfig) -> anyhow::Result<Vec<f64>> {
+    let schedule = Schedule::new(diffusion)?;
+    Ok((0..schedule.len()).map(|t| schedule.alpha_bar(t)).collect())
+}
+
+/// Returns the program that writes a model, as cards name it.
+pub fn program() -> String {
+    format!("{} {}", env!("CARGO_PKG_NAME"), env!("CARGO_PKG_VERSION"))
+}
+
+impl<C: Serialize> ExportedFiles<C> {
+    /// Joins files with the card that lists them.
+    ///
+    /// # Errors
+    /// A number that JSON does not have.
+    pub fn new(card: C, bytes: Vec<(ModelFileName, Bytes)>) -> anyhow::Result<Self> {
+        let mut text = serde_json::to_vec_pretty(&card)?;
+        text.push(b'\n');
+        Ok(Self { card, card_text: text.into(), bytes })
+    }
 }
 
 impl ExportedFiles {
@@ -41,22 +115,17 @@ impl ExportedFiles {
         let config = &trained.state.config.network;
         let scales = &trained.state.scales;
         let storage = params.precision;
-        let schedule = Schedule::new(&config.diffusion)?;
         let unet_weights = |id: ParameterId| trained.unet.parameters.unpacked(id);
         let decoder_weights = |id: ParameterId| trained.decoder.parameters.unpacked(id);
         let weights_sha256 = Networks {
             unet: weights_sha256(&trained.unet.parameters),
             decoder: weights_sha256(&trained.decoder.parameters),
         };
-        let graphs = [
-            unet(&config.unet, &unet_weights, &scales.features, Form::default(), storage)?,
-            decoder(&config.decoder, &decoder_weights, storage)?,
-        ];
         let mut card = ModelCard {
             format: MODEL_FORMAT,
             family: Family::Unet,
             name: params.model.clone(),
-            program: format!("{} {}", env!("CARGO_PKG_NAME"), env!("CARGO_PKG_VERSION")),
+            program: program(),
             provenance: Provenance {
                 run: params.run.clone(),
                 stage: trained.stage.to_owned(),
@@ -70,7 +139,7 @@ impl ExportedFiles {
             unet: config.unet.clone(),
             decoder: config.decoder.clone(),
             diffusion: config.diffusion.clone(),
-            alphas_cumprod: (0..schedule.len()).map(|t| schedule.alpha_bar(t)).collect(),
+            alphas_cumprod: alphas_cumprod(&config.diffusion)?,
             n_parameters: Networks {
                 unet: trained.unet.parameters.list().n_elements(),
                 decoder: trained.decoder.parameters.list().n_elements(),
@@ -87,36 +156,35 @@ impl ExportedFiles {
             licence: params.licence.clone(),
             files: Vec::new(),
         };
-        let metadata = metadata(&card)?;
-        let names = [
-            (ModelFileName::Unet, ModelFileName::UnetWeights, &card.weights_sha256.unet),
-            (ModelFileName::Decoder, ModelFileName::DecoderWeights, &card.weights_sha256.decoder),
+        let weights_beside = |name| Some((name, params.embed_mb.saturating_mul(1_000_000)));
+        let own = [
+            ("stage", card.provenance.stage.clone()),
+            ("unet", serde_json::to_string(&card.unet)?),
+            ("decoder", serde_json::to_string(&card.decoder)?),
         ];
-        let mut bytes = Vec::new();
-        for (graph, (name, weights_name, weights_sha256)) in graphs.into_iter().zip(names) {
-            let mut metadata = metadata.clone();
-            metadata.insert("motiongen.weights_sha256".to_owned(), weights_sha256.clone());
-            let description = format!("{} of {}, by {}", graph.name, card.name, card.program);
-            let file = ModelFile { graph, metadata, description };
-            let embedded = params.embed_mb.saturating_mul(1_000_000);
-            let EncodedModel { model, weights } = file.encode(weights_name.name(), embedded);
-            let read = Model::read(model.clone(), weights.as_ref(), name.name())?;
-            check(&read, name.name())
-                .map_err(|e: OnnxError| anyhow::anyhow!("{e}; please report this"))?;
-            bytes.push((name, model));
-            bytes.extend(weights.map(|weights| (weights_name, weights)));
-        }
-        card.files = bytes
-            .iter()
-            .map(|(name, bytes)| FileEntry {
-                name: *name,
-                n_bytes: bytes.len() as u64,
-                sha256: sha256(bytes),
-            })
-            .collect();
-        let mut text = serde_json::to_vec_pretty(&card)?;
-        text.push(b'\n');
-        Ok(Self { card, card_text: text.into(), bytes })
+        let networks = vec![
+            NetworkFile {
+                graph: unet(
+                    &config.unet,
+                    &unet_weights,
+                    &scales.features,
+                    Form::default(),
+                    storage,
+                )?,
+                name: ModelFileName::Unet,
+                weights_sha256: &card.weights_sha256.unet,
+                weights_beside: weights_beside(ModelFileName::UnetWeights),
+            },
+            NetworkFile {
+                graph: decoder(&config.decoder, &decoder_weights, storage)?,
+                name: ModelFileName::Decoder,
+                weights_sha256: &card.weights_sha256.decoder,
+                weights_beside: weights_beside(ModelFileName::DecoderWeights),
+            },
+        ];
+        let bytes = encode(networks, card.shared(), &own)?;
+        card.files = entries(&bytes);
+        Self::new(card, bytes)
     }
 
     /// Returns the content of a file.
@@ -127,31 +195,29 @@ impl ExportedFiles {
 
 /// Returns the SHA-256 of a network's weights: f32, little-endian, in the order of its layers.
 pub(super) fn weights_sha256(parameters: &Parameters<f32>) -> String {
-    let mut hash = Sha256::new();
-    for (id, _) in parameters.list().iter() {
-        let bytes: Vec<u8> = parameters.unpacked(id).iter().flat_map(|x| x.to_le_bytes()).collect();
-        hash.update(&bytes);
-    }
-    hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+    let bytes =
+        |id| -> Vec<u8> { parameters.unpacked(id).iter().flat_map(|x| x.to_le_bytes()).collect() };
+    sha256_of(parameters.list().iter().map(|(id, _)| bytes(id)))
 }
 
 /// Returns what the files themselves tell of the model, so that one without its card can be used.
-fn metadata(card: &ModelCard) -> anyhow::Result<BTreeMap<String, String>> {
+fn metadata(
+    card: &SharedFields<'_>,
+    own: &[(&str, String)],
+) -> anyhow::Result<BTreeMap<String, String>> {
     let entries = [
-        ("model", card.name.clone()),
-        ("run", card.provenance.run.clone()),
-        ("stage", card.provenance.stage.clone()),
-        ("data", card.provenance.data.clone()),
-        ("licence", card.licence.clone()),
+        ("model", card.name.to_owned()),
+        ("run", card.run.to_owned()),
+        ("data", card.data.to_owned()),
+        ("licence", card.licence.to_owned()),
         ("precision", card.precision.name().to_owned()),
         ("fps", card.fps.to_string()),
         ("window_frames", card.window_frames.to_string()),
         ("channels", card.channels.join(",")),
         ("features", card.features.join(",")),
-        ("diffusion", serde_json::to_string(&card.diffusion)?),
-        ("normalizer", serde_json::to_string(&card.normalizer)?),
-        ("unet", serde_json::to_string(&card.unet)?),
-        ("decoder", serde_json::to_string(&card.decoder)?),
+        ("diffusion", serde_json::to_string(card.diffusion)?),
+        ("normalizer", serde_json::to_string(card.normalizer)?),
     ];
-    Ok(entries.into_iter().map(|(key, value)| (format!("motiongen.{key}"), value)).collect())
+    let all = entries.into_iter().chain(own.iter().cloned());
+    Ok(all.map(|(key, value)| (format!("motiongen.{key}"), value)).collect())
 }

@@ -18,7 +18,7 @@ use super::learned;
 use super::model_files::{POINTER, current_folder, folder_of, is_model_name, pointer_to, sha256};
 use super::train::session::{MachineParams, ProgressWatch, check_run_name, read_phrases};
 use super::trained::{TrainedRun, WeightsChoice};
-use super::{ClientParams, Contract, Progress, Stage, Summary, lease};
+use super::{ClientParams, Contract, Progress, RARE, Stage, Summary, lease};
 use crate::generation::{ModelFileName, file_names};
 use crate::model::Family;
 use crate::motion::rates::MotionRange;
@@ -59,10 +59,10 @@ pub struct Params {
     pub licence: String,
     /// Leave out the decoder's last layer, which fuses poses with velocities: decoded channels then contradict each
     /// other, and agree only after post-processing.
-    #[arg(long)]
+    #[arg(long, hide_short_help = RARE)]
     pub no_fusion: bool,
     /// Largest weights that lie within the .onnx file itself, in MB; larger ones lie beside it.
-    #[arg(long, value_name = "MB", default_value_t = 1000)]
+    #[arg(long, value_name = "MB", default_value_t = 1000, hide_short_help = RARE)]
     pub embed_mb: usize,
     /// Replace a model of the same name.
     #[arg(long)]
@@ -71,7 +71,7 @@ pub struct Params {
     #[arg(long)]
     pub dry_run: bool,
     /// Library of onnxruntime [default: ORT_DYLIB_PATH, else beside the program, in .runtime, of the system]
-    #[arg(long, value_name = "FILE", help_heading = "Machine")]
+    #[arg(long, value_name = "FILE", help_heading = "Machine", hide_short_help = RARE)]
     pub ort_lib: Option<PathBuf>,
     #[command(flatten)]
     pub machine: MachineParams,
@@ -132,37 +132,56 @@ impl Stage for Export {
         if params.dry_run {
             return Ok(Box::new(ExportDryRun::new(&params, &files, &store)));
         }
-        let (folder, what) = (folder_of(&params.model), format!("model {}", params.model));
-        let (lease, _) = lease::take(&store, &folder, &what, &|text| progress.note(text))?;
-        match store.read_if_there(&card_path(&store, &params.model)?)? {
-            Some(there) if there == files.card_text => {
-                return Ok(Box::new(ExportSummary::up_to_date(&params, &store, &files)));
-            }
-            Some(_) if !params.force => bail!(
-                "store {store} has a model \"{}\" of other weights or settings; give another --model name, \
-                 or replace it with --force",
-                params.model
-            ),
-            _ => {}
-        }
-        // Before anything is computed: without the library there is nothing to check with.
-        let runtime = Runtime::load(params.ort_lib.as_deref())?;
         let checking = ExportChecks {
             dataset: &phrases.dataset,
             params: &params,
             trained: &trained,
             files: &files,
         };
-        let results = checking.run(&runtime, progress)?;
-        // From here on a signal is left until the model is whole.
-        progress.is_interrupted();
-        record(&store, &params, &files.card_text, &results)?;
-        checkpoint(&store, &[Self::NAME]);
-        results.require(&params.model)?;
-        lease.check()?;
-        publish(&store, &params.model, (&files.bytes, &files.card_text))?;
-        Ok(Box::new(ExportSummary::written(&params, &store, &files, results)))
+        let model = (&files.bytes[..], &files.card_text);
+        let results = put_in_place(&params, &store, model, progress, |runtime| {
+            checking.run(runtime, progress)
+        })?;
+        Ok(Box::new(match results {
+            Some(results) => ExportSummary::written(&params, &store, &files, results),
+            None => ExportSummary::up_to_date(&params, &store, &files),
+        }))
     }
+}
+
+/// Checks a model, whose checks it keeps, and puts it in place; returns the checks, or none where it was there already.
+///
+/// # Errors
+/// A model of the same name that may not be replaced, no onnxruntime, and a check that failed.
+fn put_in_place(
+    params: &Params,
+    store: &Location,
+    (files, card_text): (&[(ModelFileName, Bytes)], &Bytes),
+    progress: &dyn Progress,
+    check: impl FnOnce(&Runtime) -> anyhow::Result<CheckResults>,
+) -> anyhow::Result<Option<CheckResults>> {
+    let (folder, what) = (folder_of(&params.model), format!("model {}", params.model));
+    let (lease, _) = lease::take(store, &folder, &what, &|text| progress.note(text))?;
+    match store.read_if_there(&card_path(store, &params.model)?)? {
+        Some(there) if there == *card_text => return Ok(None),
+        Some(_) if !params.force => bail!(
+            "store {store} has a model \"{}\" of other weights or settings; give another --model name, \
+             or replace it with --force",
+            params.model
+        ),
+        _ => {}
+    }
+    // Before anything is computed: without the library there is nothing to check with.
+    let runtime = Runtime::load(params.ort_lib.as_deref())?;
+    let results = check(&runtime)?;
+    // From here on a signal is left until the model is whole.
+    progress.is_interrupted();
+    record(store, params, card_text, &results)?;
+    checkpoint(store, &[Export::NAME]);
+    results.require(&params.model)?;
+    lease.check()?;
+    publish(store, &params.model, (files, card_text))?;
+    Ok(Some(results))
 }
 
 /// Returns how fast the motion is that was trained on; none where it never moves.
@@ -249,7 +268,7 @@ fn record(
 #[cfg(all(test, feature = "pretrained"))]
 mod tests {
     use super::*;
-    use crate::generation::ModelCard;
+    use crate::generation::{FamilyCard as _, ModelCard};
     use crate::stages::pretrained;
     use crate::store::ClientOptions;
 

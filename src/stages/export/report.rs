@@ -7,7 +7,7 @@ use serde_json::json;
 use super::Params;
 use super::checks::{CheckResults, ROUNDING};
 use super::files::ExportedFiles;
-use crate::generation::ModelCard;
+use crate::generation::{FileEntry, ModelCard};
 use crate::stages::Summary;
 use crate::stages::model_files::folder_of;
 use crate::store::Location;
@@ -70,6 +70,27 @@ pub(super) fn write_checks(out: &mut dyn Write, checks: &[OnnxCheckRow]) -> io::
     Ok(())
 }
 
+/// Writes a line for each file of a model.
+pub(super) fn write_files(out: &mut dyn Write, files: &[FileEntry]) -> io::Result<()> {
+    for file in files {
+        let mb = file.n_bytes as f64 / 1e6;
+        writeln!(out, "  {:<20} {mb:>8.1} MB  {}", file.name, &file.sha256[..16])?;
+    }
+    Ok(())
+}
+
+/// Returns the names and sizes of files, for a sentence.
+pub(super) fn sizes(files: &[FileEntry]) -> String {
+    let size = |file: &FileEntry| format!("{} ({:.1} MB)", file.name, file.n_bytes as f64 / 1e6);
+    files.iter().map(size).collect::<Vec<_>>().join(" and ")
+}
+
+/// Returns the files of a model as programs see them.
+pub(super) fn file_figures(files: &[FileEntry]) -> Vec<serde_json::Value> {
+    let figures = |file: &FileEntry| json!({ "name": file.name, "n_bytes": file.n_bytes, "sha256": file.sha256 });
+    files.iter().map(figures).collect()
+}
+
 impl Summary for ExportSummary {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
         let Self { card, place, checks, is_up_to_date } = self;
@@ -80,10 +101,7 @@ impl Summary for ExportSummary {
             card.name,
             if *is_up_to_date { ", up to date" } else { "" }
         )?;
-        for file in &card.files {
-            let mb = file.n_bytes as f64 / 1e6;
-            writeln!(out, "  {:<20} {mb:>8.1} MB  {}", file.name, &file.sha256[..16])?;
-        }
+        write_files(out, &card.files)?;
         writeln!(
             out,
             "  {} and {} parameters, {}, of run {} ({}, step {})",
@@ -110,16 +128,12 @@ impl Summary for ExportSummary {
 
 /// Returns what is told of a model in either case.
 fn of_card(card: &ModelCard, place: &str) -> serde_json::Value {
-    let files = card
-        .files
-        .iter()
-        .map(|file| json!({ "name": file.name, "n_bytes": file.n_bytes, "sha256": file.sha256 }));
     json!({
         "model": card.name,
         "to": place,
         "run": card.provenance.run,
         "precision": card.precision.name(),
-        "files": files.collect::<Vec<_>>(),
+        "files": file_figures(&card.files),
     })
 }
 
@@ -137,17 +151,11 @@ impl ExportDryRun {
 
 impl Summary for ExportDryRun {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        let sizes: Vec<String> = self
-            .card
-            .files
-            .iter()
-            .map(|file| format!("{} ({:.1} MB)", file.name, file.n_bytes as f64 / 1e6))
-            .collect();
         let provenance = &self.card.provenance;
         writeln!(
             out,
             "would check and write {} of run {} ({}, step {}) to {}",
-            sizes.join(" and "),
+            sizes(&self.card.files),
             provenance.run,
             provenance.stage,
             provenance.unet_step,

@@ -7,21 +7,18 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
 use super::one::{ExtractedFeatures, Origin, extract, needed_bytes};
-use super::pool::{self, Budget, lock};
 use super::{ExtractJob, ExtractTally};
 use crate::audio::FEATURE_DIM;
 use crate::audio::header::read_header_from;
 use crate::motion::npz::NpzWriter;
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::feature_file::write_blocks;
+use crate::stages::pool::{self, Budget, lock};
 use crate::store::{
-    Content, PartWriter, SourceFile, StoreError, is_standard_output, replace_file, tables,
+    PartWriter, SourceFile, StoreError, content_of, is_standard_output, replace_file, tables,
     temporary_beside,
 };
 use anyhow::{Context as _, bail};
-
-/// Files up to this size are read at once.
-const IN_MEMORY_BYTES: u64 = 16 << 20;
 
 /// Where features go.
 #[derive(Debug)]
@@ -169,11 +166,7 @@ fn extract_file(task: &FileTask, job: &ExtractJob<'_>) -> Result<ExtractedFeatur
         let message = format!("{path}: is a folder; name the files in it");
         return Err(Failure::new(FailureKind::NotAFile, &path, message));
     }
-    let content = if task.size_bytes <= IN_MEMORY_BYTES {
-        std::fs::read(&task.path).map(|bytes| Content::Bytes(bytes.into())).map_err(io)
-    } else {
-        File::open(&task.path).map(Content::File).map_err(io)
-    };
+    let content = content_of(&task.path, task.size_bytes).map_err(io);
     let (size_bytes, fingerprint) = (task.size_bytes, String::new());
     let file = SourceFile { path: path.clone(), size_bytes, fingerprint };
     extract(Origin::Audio, &file, content, |_| true, &job.rules)

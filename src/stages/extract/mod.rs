@@ -3,7 +3,6 @@
 mod files;
 mod one;
 mod phrases;
-pub(in crate::stages) mod pool;
 
 use std::io::{self, Write};
 use std::num::NonZeroUsize;
@@ -11,7 +10,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use super::failure::{Failure, N_SHOWN, failures_json, write_failures};
-use super::{ClientParams, Contract, Progress, Stage, Summary, all_threads};
+use super::{ClientParams, Contract, Progress, RARE, Stage, Summary, all_threads};
 use crate::audio::Tuning;
 use crate::store::{Location, Shard, digest};
 
@@ -39,7 +38,7 @@ pub struct Params {
     #[arg(long, value_name = "FILE|DIR", requires = "audio")]
     pub output: Option<PathBuf>,
     /// Deviation from A440 in bins of 1/36 octave, from -0.5 to below 0.5, instead of the estimate.
-    #[arg(long, value_name = "BINS", allow_hyphen_values = true)]
+    #[arg(long, value_name = "BINS", allow_hyphen_values = true, hide_short_help = RARE)]
     pub tuning: Option<Tuning>,
     /// Part of the job that this process does: i/n, or auto inside an array job.
     #[arg(long, value_name = "I/N", default_value_t = Shard::WHOLE.to_string())]
@@ -52,10 +51,10 @@ pub struct Params {
     #[arg(long, value_name = "GB", default_value_t = 2.0)]
     pub memory: f64,
     /// Longest time for one file, in seconds; then it counts as failed.
-    #[arg(long, value_name = "S", default_value_t = 900.0)]
+    #[arg(long, value_name = "S", default_value_t = 900.0, hide_short_help = RARE)]
     pub timeout: f64,
     /// Longest audio of one file, in seconds; a longer one counts as failed.
-    #[arg(long, value_name = "S", default_value_t = 24.0 * 3600.0)]
+    #[arg(long, value_name = "S", default_value_t = 24.0 * 3600.0, hide_short_help = RARE)]
     pub max_duration: f64,
     #[command(flatten)]
     pub client: ClientParams,

@@ -9,16 +9,17 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Mutex;
 
 use super::one::{ExtractedFeatures, Origin, extract, needed_bytes};
-use super::pool::{self, Budget, lock};
 use super::{Extract, ExtractJob, ExtractTally};
 use crate::stages::Stage as _;
+use crate::stages::batch::{BatchCommit, BatchJob, n_batches};
 use crate::stages::beats::{self, BeatSource};
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::ingest::content_hash_of_audio;
-use crate::store::tables::{self, BeatRow, ExtractionRow, FailureRow, PhraseRow};
+use crate::stages::pool::{self, Budget, lock};
+use crate::store::tables::{self, BeatRow, ExtractionRow, PhraseRow};
 use crate::store::{
-    ClientOptions, Commit, Content, Item, Ledger, Location, OrderedContents, Row as _, Shard,
-    Source, SourceFile, StoreError, StoreSnapshot, TimestampUs, batch_of, checkpoint,
+    ClientOptions, Content, Item, Location, OrderedContents, Row as _, Shard, Source, SourceFile,
+    StoreError, StoreSnapshot, batch_of, checkpoint,
 };
 use crate::units::frames_to_s;
 
@@ -94,7 +95,14 @@ pub fn run(job: &ExtractJob<'_>, target: &StoreTarget<'_>) -> anyhow::Result<Ext
         ExtractTally { n_without: n_phrases - tasks.len() as u64, ..ExtractTally::default() };
     tasks.retain(|task| target.shard.takes(&task.row.phrase_id));
     let n_mine = tasks.len();
-    tasks.retain(|task| target.force || !is_settled(task, &ledger, target.params_hash));
+    let batches = BatchJob {
+        store: target.store,
+        stage: Extract::NAME,
+        params_hash: target.params_hash,
+        origin: ITEMS_FROM,
+        ledger: &ledger,
+    };
+    tasks.retain(|task| target.force || !is_settled(task, &batches));
     done.n_unchanged = (n_mine - tasks.len()) as u64;
     done.n_todo = tasks.len() as u64;
     // An empty sum of f64 is -0.
@@ -105,11 +113,15 @@ pub fn run(job: &ExtractJob<'_>, target: &StoreTarget<'_>) -> anyhow::Result<Ext
     target.store.sweep();
     snapshot.checkpoint();
     job.progress.start_audio("extract", done.todo_s.ceil() as u64);
-    let writer = BatchWriter { target, ledger: &ledger };
+    let writer = BatchWriter { job: batches, force: target.force };
     let done = Mutex::new(done);
     work_off(job, target, tasks, &writer, &done)?;
     if !lock(&done).is_stopped {
-        writer.forget_failures(&names)?;
+        let suffix = beside("");
+        batches.forget_failures(|id| {
+            let phrase = id.strip_suffix(&suffix).unwrap_or(id);
+            !names.contains(phrase) && target.shard.takes(phrase)
+        })?;
     }
     job.progress.finish();
     checkpoint(target.store, &[Extract::NAME]);
@@ -150,9 +162,8 @@ fn plan(rows: Vec<PhraseRow>, listed: &BTreeSet<String>) -> Vec<PhraseTask> {
     let mut tasks: Vec<PhraseTask> = rows.into_iter().filter_map(with_input).collect();
     let total_s: f64 = tasks.iter().map(|task| task.row.duration_s).sum();
     let by_length = (total_s / MAX_BATCH_S).ceil() as u64;
-    let by_count = tasks.len().div_ceil(MAX_BATCH_PHRASES) as u64;
-    // A power of two, so that shards in powers of two hold whole batches.
-    let n_batches = by_length.max(by_count).max(1).next_power_of_two();
+    let by_count = tasks.len().div_ceil(MAX_BATCH_PHRASES);
+    let n_batches = n_batches(by_count, by_length);
     for task in &mut tasks {
         task.batch = batch_of(&task.row.phrase_id, n_batches) as usize;
     }
@@ -168,13 +179,11 @@ fn plan(rows: Vec<PhraseRow>, listed: &BTreeSet<String>) -> Vec<PhraseTask> {
 }
 
 /// Returns whether the store has the phrase's features for this content and these parameters.
-fn is_settled(task: &PhraseTask, ledger: &Ledger, params_hash: &str) -> bool {
+fn is_settled(task: &PhraseTask, batches: &BatchJob) -> bool {
     let id = &task.row.phrase_id;
-    let is_refused = ledger.get(&beside(id)).is_some_and(|known| known.item.failure.is_some());
-    !is_refused
-        && ledger.get(id).is_some_and(|known| {
-            known.params_hash == params_hash
-                && known.item.succeeded()
+    !batches.has_failed(&beside(id))
+        && batches.known(id).is_some_and(|known| {
+            known.item.succeeded()
                 && known.item.input_hash == task.row.content_hash
                 && known.item.fingerprint == task.fingerprint()
         })
@@ -332,30 +341,25 @@ impl PhraseInputs {
 
 /// Writes finished batches.
 struct BatchWriter<'a> {
-    target: &'a StoreTarget<'a>,
-    ledger: &'a Ledger,
+    job: BatchJob<'a>,
+    force: bool,
 }
 
 impl BatchWriter<'_> {
-    fn start(&self) -> Commit<'_> {
-        Commit::new(self.target.store, Extract::NAME, self.target.params_hash, ITEMS_FROM)
-    }
-
     fn commit(&self, batch: PhraseBatch) -> Result<(), StoreError> {
-        let mut commit = self.start();
-        let (mut extractions, mut beats, mut failures) = (Vec::new(), Vec::new(), Vec::new());
+        let mut commit = self.job.start();
+        let (mut extractions, mut beats) = (Vec::new(), Vec::new());
         for (id, (task, outcome)) in batch.outcomes {
             let id = self.name_for(id, &outcome, &mut commit);
             let failure = outcome.as_ref().err().map(Failure::digest);
             let input_hash = task.row.content_hash.clone();
             let fingerprint = task.fingerprint();
-            let unchanged = self.ledger.get(&id).is_some_and(|known| {
-                known.params_hash == self.target.params_hash
-                    && known.item.input_hash == input_hash
+            let unchanged = self.job.known(&id).is_some_and(|known| {
+                known.item.input_hash == input_hash
                     && known.item.fingerprint == fingerprint
                     && known.item.failure == failure
             });
-            if unchanged && !(self.target.force && failure.is_none()) {
+            if unchanged && !(self.force && failure.is_none()) {
                 continue;
             }
             match outcome {
@@ -367,58 +371,33 @@ impl BatchWriter<'_> {
                         beats.extend(beat_rows(&id, &extracted));
                     }
                 }
-                Err(failure) => failures.push(FailureRow {
-                    stage: Extract::NAME.to_owned(),
-                    phrase_id: id.clone(),
-                    source: task.url,
-                    kind: failure.kind.name().to_owned(),
-                    message: failure.message,
-                    time: TimestampUs::now(),
-                }),
+                Err(failure) => commit.list_failure(&id, &task.url, &failure),
             }
-            commit.settle(Item { id, fingerprint, input_hash, failure }, self.ledger);
+            commit.settle(Item { id, fingerprint, input_hash, failure });
         }
-        if !extractions.is_empty() {
-            let schema = ExtractionRow::schema;
-            commit.part(schema().name, schema)?.write_rows(&extractions)?;
-        }
-        if !beats.is_empty() {
-            commit.part(BeatRow::schema().name, BeatRow::schema)?.write_rows(&beats)?;
-        }
-        if !failures.is_empty() {
-            failures.sort_by(|a, b| a.phrase_id.cmp(&b.phrase_id));
-            commit.part(FailureRow::schema().name, FailureRow::schema)?.write_rows(&failures)?;
-        }
-        if commit.is_empty() { Ok(()) } else { commit.publish().map(|_| ()) }
+        commit.rows(&extractions)?;
+        commit.rows::<BeatRow>(&beats)?;
+        commit.publish()
     }
 
     /// Returns the name to settle: the phrase's own, or one beside it when a file that cannot be
     /// read just now says nothing against the rows that are there.
-    fn name_for(&self, id: String, outcome: &PhraseOutcome, commit: &mut Commit<'_>) -> String {
+    fn name_for(
+        &self,
+        id: String,
+        outcome: &PhraseOutcome,
+        commit: &mut BatchCommit<'_>,
+    ) -> String {
         let beside = beside(&id);
-        let has_rows = self.ledger.get(&id).is_some_and(|known| known.item.succeeded());
         let is_out_of_reach =
             outcome.as_ref().is_err_and(|failure| failure.kind == FailureKind::Unreadable);
-        if is_out_of_reach && has_rows {
+        if is_out_of_reach && self.job.has_rows(&id) {
             return beside;
         }
-        if self.ledger.get(&beside).is_some_and(|known| known.item.failure.is_some()) {
-            commit.settle(Item::forgotten(&beside), self.ledger);
+        if self.job.has_failed(&beside) {
+            commit.forget(&beside);
         }
         id
-    }
-
-    /// Removes the failures of phrases that the table of phrases no longer has.
-    fn forget_failures(&self, names: &BTreeSet<String>) -> Result<(), StoreError> {
-        let mut commit = self.start();
-        let suffix = beside("");
-        for id in self.ledger.failed(ITEMS_FROM) {
-            let phrase = id.strip_suffix(&suffix).unwrap_or(id);
-            if !names.contains(phrase) && self.target.shard.takes(phrase) {
-                commit.settle(Item::forgotten(id), self.ledger);
-            }
-        }
-        if commit.is_empty() { Ok(()) } else { commit.publish().map(|_| ()) }
     }
 }
 

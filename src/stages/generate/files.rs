@@ -9,7 +9,8 @@ use anyhow::{Context as _, bail};
 use ndarray::ArrayView2;
 
 use super::GenerateTally;
-use super::maker::{GeneratedMotion, MotionMaker, PhraseMusic};
+use super::maker::{GeneratedMotion, MotionMaker};
+use super::music::PhraseMusic;
 use super::outputs::{self, MotionFormat, MotionOutput};
 use super::receipt::{Receipt, digest_of_song};
 use crate::motion::exchange::{csv_header, write_csv_rows};
@@ -17,10 +18,8 @@ use crate::motion::{Beats, BeatsError};
 use crate::stages::Progress;
 use crate::stages::extract::{ExtractRules, ExtractedFeatures, Origin, extract};
 use crate::stages::failure::{Failure, FailureKind};
-use crate::store::{Content, SourceFile, StoreError};
+use crate::store::{SourceFile, StoreError, content_of};
 
-/// Larger files are read as they are decoded.
-const IN_MEMORY_BYTES: u64 = 64 << 20;
 /// Longest audio.
 const MAX_DURATION_S: f64 = 24.0 * 3600.0;
 
@@ -187,11 +186,7 @@ pub(in crate::stages) fn listen(path: &Path) -> FeaturesAndBeats {
         return Err(Failure::new(FailureKind::NotAFile, &name, message));
     }
     let size_bytes = std::fs::metadata(path).map_or(0, |meta| meta.len());
-    let content = if size_bytes <= IN_MEMORY_BYTES {
-        std::fs::read(path).map(|bytes| Content::Bytes(bytes.into())).map_err(io)
-    } else {
-        File::open(path).map(Content::File).map_err(io)
-    };
+    let content = content_of(path, size_bytes).map_err(io);
     let rules =
         ExtractRules { tuning: None, max_duration_s: MAX_DURATION_S, timeout: Duration::MAX };
     let file = SourceFile { path: name.clone(), size_bytes, fingerprint: String::new() };

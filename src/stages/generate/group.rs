@@ -7,21 +7,23 @@ use anyhow::{Context as _, bail, ensure};
 use ndarray::{Array2, Array3, ArrayView2, Axis, concatenate};
 use serde::{Deserialize, Serialize};
 
-use super::maker::{GeneratedMotion, MotionMaker, PhraseMusic, generation_id, seed_of};
-use super::params::{Params, SamplerName};
+use super::maker::{GeneratedMotion, MotionMaker, generation_id, seed_of};
+use super::music::PhraseMusic;
+use super::params::{Params, SamplingSettings};
 use super::report::GenerateSummary;
 use super::settings::OUTPUT_VERSION;
 use super::{make_all, name_of_model};
 use crate::autodiff::Parameters;
-use crate::diffusion::{Sampler, SamplerConfig, Schedule};
+use crate::diffusion::{SamplerConfig, Schedule};
 use crate::evaluation::{derivative_error, score};
 use crate::generation::{
-    ConsistencyForm, EngineError, GroupCard, GroupEngine, GroupGenerator, GroupTrack, ModelFileName,
+    ConsistencyForm, EngineError, FamilyCard as _, GroupCard, GroupEngine, GroupGenerator,
+    GroupTrack, ModelFileName,
 };
-use crate::model::{GroupNetworks, Parameter, condition};
+use crate::model::{GroupNetworks, Parameter};
+use crate::motion::Channel;
 use crate::motion::group::{MAX_DANCERS, RADIUS_M, separate};
 use crate::motion::postprocess::{PostProcessConfig, process};
-use crate::motion::{Channel, bar_phase, clock};
 use crate::onnx::{Model, values_of};
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::model_folder::ModelFolder;
@@ -100,27 +102,7 @@ impl GroupSettings {
             "--consistency {consistency} is not from -1 to 1; give -1 for dancers who go each a way of their own, 1 \
              for unison"
         );
-        let schedule = Schedule::new(&card.diffusion)?;
-        let sampler = match params.sampler {
-            SamplerName::Ddpm => Sampler::Ddpm,
-            SamplerName::Ddim => Sampler::Ddim { eta: params.eta },
-            SamplerName::DpmSolver => Sampler::DpmSolver,
-        };
-        let n_steps = params.steps.unwrap_or_else(|| sampler.usual_steps(schedule.len()));
-        let sampler = SamplerConfig { sampler, n_steps, spacing: params.spacing, clip: true };
-        sampler.check(schedule.len())?;
-        let guidance = params.guidance.unwrap_or_else(|| card.guidance());
-        ensure!(
-            guidance >= 0.0 && guidance.is_finite(),
-            "--guidance {guidance} is below 0; give 1 to follow the music, more to exaggerate it"
-        );
-        ensure!(
-            params.overlap < card.window_frames,
-            "--overlap {} is not below the {} frames of a window of model {}; give a smaller number",
-            params.overlap,
-            card.window_frames,
-            card.name
-        );
+        let SamplingSettings { sampler, guidance, overlap_frames } = params.sampling(card)?;
         Ok(Self {
             output_version: OUTPUT_VERSION,
             n_dancers,
@@ -128,7 +110,7 @@ impl GroupSettings {
             consistency_form: params.consistency_form.into(),
             sampler,
             guidance,
-            overlap_frames: params.overlap,
+            overlap_frames,
             postprocess: params.postprocess.config((card.motion_range, card.fusion_variances()))?,
             separation: !params.no_separation && !params.postprocess.raw,
             no_clock: params.no_clock,
@@ -273,21 +255,12 @@ impl MotionMaker for GroupMaker<'_> {
 impl GroupMaker<'_> {
     fn sample(&self, music: &PhraseMusic, sample: usize) -> Result<GeneratedMotion, Failure> {
         let started = Instant::now();
-        let n_frames = music.features.nrows();
-        let phase = music.beats.as_ref().map(|beats| {
-            let times_s: Vec<f64> = (0..n_frames).map(frames_to_s).collect();
-            bar_phase(&times_s, beats)
-        });
-        let bars = phase.as_deref().filter(|_| music.has_downbeats);
-        let known = bars.filter(|_| !self.settings.no_clock).zip(music.beats.as_ref());
-        let clock = known.map(|(bars, beats)| clock(bars, beats.beats_per_bar()));
-        let clock = clock.as_ref().map(|clock| clock.view());
-        let hears = self.card.group.condition();
-        let heard = condition(hears, music.features, clock);
+        let heard = music.heard_by(self.card.group.condition(), self.settings.no_clock);
+        let bars = heard.bars();
         let seed = seed_of(self.seed, music.phrase_id, sample, 0);
         let track = GroupTrack {
-            condition: heard.view(),
-            phase: bars.filter(|_| hears.clock && clock.is_some()),
+            condition: heard.condition.view(),
+            phase: heard.clock_phase(),
             seed,
             n_dancers: self.settings.n_dancers,
         };
@@ -353,10 +326,7 @@ impl GroupMaker<'_> {
             sampler: settings.sampler.sampler.name().to_owned(),
             n_steps: settings.sampler.n_steps as i32,
             guidance: settings.guidance,
-            eta: match settings.sampler.sampler {
-                Sampler::Ddim { eta } => Some(eta),
-                Sampler::Ddpm | Sampler::DpmSolver => None,
-            },
+            eta: settings.sampler.sampler.eta(),
             primed_by: None,
             n_frames: n_frames as i64,
             n_windows: self.generator.windows(n_frames).len() as i32,

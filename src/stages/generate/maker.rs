@@ -4,33 +4,19 @@ use std::time::Instant;
 
 use ndarray::{Array2, Array3, ArrayView2, Axis, concatenate};
 
+use super::music::{HeardMusic, PhraseMusic};
 use super::params::Settings;
 use crate::evaluation::{Score, derivative_error, score};
 use crate::generation::{
     Constraints, EngineError, Generator, ModelCard, PrimingMotion, Track, WeightedConstraints,
 };
-use crate::model::condition;
 use crate::motion::postprocess::{Displacement, process, process_holding};
-use crate::motion::{Beats, Channel, MOTION_DIM, bar_phase, clock};
+use crate::motion::{Channel, MOTION_DIM};
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::retrieval::{Primer, Priming};
 use crate::store::tables::GenerationRow;
 use crate::store::{TimestampUs, digest};
 use crate::units::frames_to_s;
-
-/// The music of a phrase or file, to which motion is generated.
-pub struct PhraseMusic<'a> {
-    pub phrase_id: &'a str,
-    /// Digest of what the phrase's files hold, as `generations` has it.
-    pub content_hash: &'a str,
-    /// The name in messages and failures.
-    pub source: &'a str,
-    /// \[T, 163\]
-    pub features: ArrayView2<'a, f32>,
-    pub beats: Option<Beats>,
-    /// Whether the downbeats are known: counted by somebody, or taken to begin with the first beat of a song.
-    pub has_downbeats: bool,
-}
 
 /// A motion that was kept, and what is known of all its candidates.
 #[derive(Debug)]
@@ -110,14 +96,6 @@ pub fn seed_of(seed: u64, phrase_id: &str, sample: usize, candidate: usize) -> u
         .expect("a digest has hexadecimal digits")
 }
 
-/// The conditions of a network for a track, and the bar phase that its motion is sampled with.
-#[derive(Clone, Copy)]
-struct TrackConditions<'a> {
-    /// \[T, condition_dim\]
-    condition: ArrayView2<'a, f32>,
-    phase: Option<&'a [f64]>,
-}
-
 impl MotionMaker for SoloistMaker<'_> {
     fn model(&self) -> &str {
         self.model
@@ -164,19 +142,8 @@ impl SoloistMaker<'_> {
         let started = Instant::now();
         let n_frames = music.features.nrows();
         let constraints = self.constraints(music)?;
-        let phase = music.beats.as_ref().map(|beats| {
-            let times_s: Vec<f64> = (0..n_frames).map(frames_to_s).collect();
-            bar_phase(&times_s, beats)
-        });
-        let bars = phase.as_deref().filter(|_| music.has_downbeats);
-        let known = bars.filter(|_| !self.settings.no_clock).zip(music.beats.as_ref());
-        let clock = known.map(|(bars, beats)| clock(bars, beats.beats_per_bar()));
-        let clock = clock.as_ref().map(|clock| clock.view());
-        let heard = condition(&self.card.unet, music.features, clock);
-        let heard = TrackConditions {
-            condition: heard.view(),
-            phase: bars.filter(|_| self.card.unet.clock && clock.is_some()),
-        };
+        let heard = music.heard_by(&self.card.unet, self.settings.no_clock);
+        let bars = heard.bars();
         let priming = self.priming(music)?;
         let kept = constraints.as_ref().filter(|_| !self.settings.soft);
         let held = kept.map(|constraints| constraints.held(n_frames)).unwrap_or_default();
@@ -189,7 +156,7 @@ impl SoloistMaker<'_> {
             let watcher: &mut dyn FnMut(ArrayView2<f32>) -> std::io::Result<()> =
                 if candidate == 0 { &mut *watch } else { &mut unseen };
             let decoded =
-                self.sample(music, heard, seed, constraints.as_ref(), priming.as_ref(), watcher)?;
+                self.sample(music, &heard, seed, constraints.as_ref(), priming.as_ref(), watcher)?;
             let velocity_error =
                 derivative_error(decoded.view(), Channel::Position, Channel::Velocity);
             let mut frames = decoded.clone();
@@ -203,7 +170,7 @@ impl SoloistMaker<'_> {
             let score = score(
                 frames.view(),
                 self.settings.postprocess.limits,
-                phase.as_deref(),
+                heard.phase.as_deref(),
                 velocity_error,
             );
             let misses = constraints.as_ref().map(|c| c.errors(frames.view())).unwrap_or_default();
@@ -265,7 +232,7 @@ impl SoloistMaker<'_> {
     fn sample(
         &self,
         music: &PhraseMusic,
-        heard: TrackConditions,
+        heard: &HeardMusic,
         seed: u64,
         constraints: Option<&Constraints>,
         priming: Option<&Priming>,
@@ -273,8 +240,8 @@ impl SoloistMaker<'_> {
     ) -> Result<Array2<f32>, Failure> {
         let strength = self.settings.constraint_strength;
         let track = Track {
-            condition: heard.condition,
-            phase: heard.phase,
+            condition: heard.condition.view(),
+            phase: heard.clock_phase(),
             seed,
             style: self.settings.style,
             constraints: constraints
@@ -329,7 +296,7 @@ impl SoloistMaker<'_> {
             sampler: settings.sampler.sampler.name().to_owned(),
             n_steps: settings.sampler.n_steps as i32,
             guidance: settings.guidance,
-            eta: settings.eta(),
+            eta: settings.sampler.sampler.eta(),
             primed_by: found.primed_by.clone(),
             n_frames: n_frames as i64,
             n_windows: n_windows as i32,

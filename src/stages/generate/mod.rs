@@ -4,6 +4,7 @@ mod constraints_file;
 mod files;
 mod group;
 mod maker;
+mod music;
 mod outputs;
 mod params;
 mod receipt;

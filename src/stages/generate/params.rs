@@ -11,17 +11,16 @@ use super::constraints_file::ConstraintsRequest;
 use super::outputs::MotionFormat;
 use super::settings::{MotionSettings, OUTPUT_VERSION};
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
-use crate::generation::ConsistencyForm;
-use crate::generation::{ModelCard, OVERLAP_FRAMES};
+use crate::generation::{ConsistencyForm, FamilyCard, ModelCard, OVERLAP_FRAMES};
 use crate::motion::postprocess::{
     Coherence, FusionVariances, Hemisphere, PostProcessConfig, SavitzkyGolay,
 };
 use crate::motion::rates::MotionRange;
 use crate::motion::style::STYLE_DIM;
 use crate::motion::{Channel, ChannelLimits};
-use crate::stages::ClientParams;
 use crate::stages::model_files::EngineParams;
 use crate::stages::motion_source::read_motion;
+use crate::stages::{ClientParams, RARE};
 use crate::store::{Shard, digest};
 
 /// The samplers by the names of the flag.
@@ -88,57 +87,65 @@ pub struct Params {
     pub format: Vec<MotionFormat>,
     /// With --audio: writes the frames of the first motion as CSV, as soon as they are final and before
     /// post-processing; - is the standard output.
-    #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-", requires = "audio")]
+    #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-", requires = "audio",
+          hide_short_help = RARE)]
     pub stream: Option<String>,
     /// Name under which tables keep the motions [default: the model's]
     #[arg(long, value_name = "NAME")]
     pub run: Option<String>,
     /// Which phrases of the store.
-    #[arg(long, value_enum, default_value_t = Tracks::Songs, help_heading = "Phrases")]
+    #[arg(long, value_enum, default_value_t = Tracks::Songs, help_heading = "Phrases",
+          hide_short_help = RARE)]
     pub tracks: Tracks,
     /// Only phrases of this split: train, validation or test.
-    #[arg(long, value_name = "SPLIT", help_heading = "Phrases")]
+    #[arg(long, value_name = "SPLIT", help_heading = "Phrases", hide_short_help = RARE)]
     pub split: Option<String>,
     /// Only these phrases.
-    #[arg(long, value_name = "ID", num_args = 1.., help_heading = "Phrases")]
+    #[arg(long, value_name = "ID", num_args = 1.., help_heading = "Phrases",
+          hide_short_help = RARE)]
     pub phrase: Vec<String>,
     /// Part of the job that this process does: i/n, or auto inside an array job.
-    #[arg(long, value_name = "I/N", default_value_t = Shard::WHOLE.to_string(), help_heading = "Phrases")]
+    #[arg(long, value_name = "I/N", default_value_t = Shard::WHOLE.to_string(),
+          help_heading = "Phrases", hide_short_help = RARE)]
     pub shard: String,
     /// Motions for each phrase.
     #[arg(long, value_name = "N", default_value_t = NonZeroUsize::MIN, help_heading = "Sampling")]
     pub samples: NonZeroUsize,
     /// Candidates for each motion, of which the one with the best score is kept.
-    #[arg(long, value_name = "N", default_value_t = NonZeroUsize::MIN, help_heading = "Sampling")]
+    #[arg(long, value_name = "N", default_value_t = NonZeroUsize::MIN, help_heading = "Sampling",
+          hide_short_help = RARE)]
     pub best_of: NonZeroUsize,
     /// How noise becomes motion.
-    #[arg(long, value_enum, default_value_t = SamplerName::DpmSolver, help_heading = "Sampling")]
+    #[arg(long, value_enum, default_value_t = SamplerName::DpmSolver, help_heading = "Sampling",
+          hide_short_help = RARE)]
     pub sampler: SamplerName,
     /// Steps of the sampler [default: 20; all of ddpm]
-    #[arg(long, value_name = "N", help_heading = "Sampling")]
+    #[arg(long, value_name = "N", help_heading = "Sampling", hide_short_help = RARE)]
     pub steps: Option<usize>,
     /// Which steps of the diffusion are visited.
-    #[arg(long, value_enum, default_value_t = Spacing::Trailing, help_heading = "Sampling")]
+    #[arg(long, value_enum, default_value_t = Spacing::Trailing, help_heading = "Sampling",
+          hide_short_help = RARE)]
     pub spacing: Spacing,
     /// 1 follows the music, more exaggerates it, 0 ignores it [default: the model's]
     #[arg(long, value_name = "X", help_heading = "Sampling")]
     pub guidance: Option<f64>,
     /// Withhold the clock from a model that hears it, so that it dances to the features alone.
-    #[arg(long, help_heading = "Sampling")]
+    #[arg(long, help_heading = "Sampling", hide_short_help = RARE)]
     pub no_clock: bool,
     /// Share of the noise that ddim renews at every step, 0 to 1.
-    #[arg(long, value_name = "X", default_value_t = 0.0, help_heading = "Sampling")]
+    #[arg(long, value_name = "X", default_value_t = 0.0, help_heading = "Sampling",
+          hide_short_help = RARE)]
     pub eta: f64,
     /// Seed of all noise.
     #[arg(long, value_name = "N", default_value_t = 0, help_heading = "Sampling")]
     pub seed: u64,
     /// Eight style values from -1 to 1, for a model that takes a style.
     #[arg(long, value_name = "S0,…,S7", value_delimiter = ',', num_args = 1.., allow_hyphen_values = true,
-          help_heading = "Sampling")]
+          help_heading = "Sampling", hide_short_help = RARE)]
     pub style: Vec<f32>,
     /// Begin from the motion of the library's phrases whose music is nearest, made noisy, instead of from noise
     /// alone: the share of it that is kept, 0 to 1; needs --store with a library.
-    #[arg(long, value_name = "X", help_heading = "Sampling")]
+    #[arg(long, value_name = "X", help_heading = "Sampling", hide_short_help = RARE)]
     pub prime: Option<f64>,
     /// Dancers, for a model of the family group [default: 3]
     #[arg(long, value_name = "N", help_heading = "Groups")]
@@ -146,26 +153,30 @@ pub struct Params {
     /// Guidance by the score of a model of the family group, from -1 (away from one group, meant for dancers who go
     /// each a way of their own) to 1 (towards one group, meant for unison); docs/groups.md has what it was seen to
     /// do; other than 0 it takes three times as long [default: 0]
-    #[arg(long, value_name = "GAMMA", allow_hyphen_values = true, help_heading = "Groups")]
+    #[arg(long, value_name = "GAMMA", allow_hyphen_values = true, help_heading = "Groups",
+          hide_short_help = RARE)]
     pub consistency: Option<f64>,
     /// What --consistency moves at every step: the estimate, by its own gradient; or, three times as slow, the noise
     /// that is predicted (Dhariwal and Nichol) or the mean of the step (the paper), by the gradient through the network.
-    #[arg(long, value_name = "FORM", value_enum, default_value_t, help_heading = "Groups")]
+    #[arg(long, value_name = "FORM", value_enum, default_value_t, help_heading = "Groups",
+          hide_short_help = RARE)]
     pub consistency_form: ConsistencyFormName,
     /// Let bodies touch where they were sampled so, instead of moving them apart.
-    #[arg(long, help_heading = "Groups")]
+    #[arg(long, help_heading = "Groups", hide_short_help = RARE)]
     pub no_separation: bool,
     /// Frames that neighbouring windows of a long track share.
-    #[arg(long, value_name = "N", default_value_t = OVERLAP_FRAMES, help_heading = "Sampling")]
+    #[arg(long, value_name = "N", default_value_t = OVERLAP_FRAMES, help_heading = "Sampling",
+          hide_short_help = RARE)]
     pub overlap: usize,
     /// TOML or JSON file of poses and values that the motion must have (docs/generate.md).
-    #[arg(long, value_name = "FILE", help_heading = "Control")]
+    #[arg(long, value_name = "FILE", help_heading = "Control", hide_short_help = RARE)]
     pub constraints: Option<PathBuf>,
     /// Share of the way to a constraint that every step of the sampling goes, 0 to 1.
-    #[arg(long, value_name = "X", default_value_t = 1.0, help_heading = "Control")]
+    #[arg(long, value_name = "X", default_value_t = 1.0, help_heading = "Control",
+          hide_short_help = RARE)]
     pub constraint_strength: f64,
     /// Leave the rest of the way, instead of bending the finished motion to every constraint.
-    #[arg(long, help_heading = "Control")]
+    #[arg(long, help_heading = "Control", hide_short_help = RARE)]
     pub soft: bool,
     #[command(flatten)]
     pub postprocess: PostProcessParams,
@@ -185,38 +196,40 @@ pub struct Params {
 #[derive(Clone, Debug, clap::Args)]
 pub struct PostProcessParams {
     /// Leave decoded motion as it is.
-    #[arg(long, help_heading = "Post-processing")]
+    #[arg(long, help_heading = "Post-processing", hide_short_help = RARE)]
     pub raw: bool,
     /// How far each channel may go.
-    #[arg(long, value_enum, default_value_t = ChannelLimits::Wide, help_heading = "Post-processing")]
+    #[arg(long, value_enum, default_value_t = ChannelLimits::Wide, help_heading = "Post-processing",
+          hide_short_help = RARE)]
     pub limits: ChannelLimits,
     /// Let motion be faster than nearly all that the model was trained on (99.9 % of its frames).
-    #[arg(long, help_heading = "Post-processing")]
+    #[arg(long, help_heading = "Post-processing", hide_short_help = RARE)]
     pub any_speed: bool,
     /// Signs of quaternions: continuous in time, or w ≥ 0 in every frame as in the reference.
-    #[arg(long, value_enum, default_value_t = Hemisphere::Sequential, help_heading = "Post-processing")]
+    #[arg(long, value_enum, default_value_t = Hemisphere::Sequential,
+          help_heading = "Post-processing", hide_short_help = RARE)]
     pub hemisphere: Hemisphere,
     /// Frames of a weighted mean of the orientations; an odd number [default: none]
-    #[arg(long, value_name = "N", help_heading = "Post-processing")]
+    #[arg(long, value_name = "N", help_heading = "Post-processing", hide_short_help = RARE)]
     pub smooth_quaternions: Option<usize>,
     /// Never let the phase fall within a bar.
-    #[arg(long, help_heading = "Post-processing")]
+    #[arg(long, help_heading = "Post-processing", hide_short_help = RARE)]
     pub monotonic_phase: bool,
     /// Leave the phase as it was decoded, instead of the phase of the music's bars.
-    #[arg(long, help_heading = "Post-processing")]
+    #[arg(long, help_heading = "Post-processing", hide_short_help = RARE)]
     pub decoded_phase: bool,
     /// Velocities, accelerations and angular velocities: as decoded, half of each as in the reference, derived
     /// from positions and orientations, or fused with them by least squares and then
     /// derived [default: fuse, by the errors that the model's card has; derive for one of release 0.1]
-    #[arg(long, value_enum, help_heading = "Post-processing")]
+    #[arg(long, value_enum, help_heading = "Post-processing", hide_short_help = RARE)]
     pub coherence: Option<Coherence>,
     /// Frames of the reference's moving average; an odd number [default: none]
-    #[arg(long, value_name = "N", help_heading = "Post-processing")]
+    #[arg(long, value_name = "N", help_heading = "Post-processing", hide_short_help = RARE)]
     pub moving_average: Option<usize>,
     /// Smooths by polynomials of an order over a window of frames; 0 for none; with --coherence derive or
     /// fuse [default: 11,3 with derive]
     #[arg(long, value_name = "WINDOW,ORDER", value_delimiter = ',', num_args = 1..,
-          help_heading = "Post-processing")]
+          help_heading = "Post-processing", hide_short_help = RARE)]
     pub savitzky_golay: Vec<usize>,
 }
 
@@ -271,6 +284,47 @@ impl PostProcessParams {
     }
 }
 
+/// How windows are sampled, by a model of any family.
+pub struct SamplingSettings {
+    pub sampler: SamplerConfig,
+    /// 1 follows the music, more exaggerates it, 0 ignores it.
+    pub guidance: f64,
+    /// Frames that neighbouring windows share.
+    pub overlap_frames: usize,
+}
+
+impl Params {
+    /// Returns how windows of a model are sampled.
+    ///
+    /// # Errors
+    /// One sentence for what this model or any sampler cannot do.
+    pub fn sampling(&self, card: &impl FamilyCard) -> anyhow::Result<SamplingSettings> {
+        let model = card.shared();
+        let n_train = Schedule::new(model.diffusion)?.len();
+        let sampler = match self.sampler {
+            SamplerName::Ddpm => Sampler::Ddpm,
+            SamplerName::Ddim => Sampler::Ddim { eta: self.eta },
+            SamplerName::DpmSolver => Sampler::DpmSolver,
+        };
+        let n_steps = self.steps.unwrap_or_else(|| sampler.usual_steps(n_train));
+        let sampler = SamplerConfig { sampler, n_steps, spacing: self.spacing, clip: true };
+        sampler.check(n_train)?;
+        let guidance = self.guidance.unwrap_or_else(|| card.guidance());
+        ensure!(
+            guidance >= 0.0 && guidance.is_finite(),
+            "--guidance {guidance} is below 0; give 1 to follow the music, more to exaggerate it"
+        );
+        let overlap_frames = self.overlap;
+        ensure!(
+            overlap_frames < model.window_frames,
+            "--overlap {overlap_frames} is not below the {} frames of a window of model {}; give a smaller number",
+            model.window_frames,
+            model.name
+        );
+        Ok(SamplingSettings { sampler, guidance, overlap_frames })
+    }
+}
+
 /// How sampling begins from the library's motion.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Prime {
@@ -305,27 +359,7 @@ impl Settings {
     /// # Errors
     /// One sentence for what this model or any sampler cannot do.
     pub fn new(params: &Params, card: &ModelCard) -> anyhow::Result<Self> {
-        let schedule = Schedule::new(&card.diffusion)?;
-        let sampler = match params.sampler {
-            SamplerName::Ddpm => Sampler::Ddpm,
-            SamplerName::Ddim => Sampler::Ddim { eta: params.eta },
-            SamplerName::DpmSolver => Sampler::DpmSolver,
-        };
-        let n_steps = params.steps.unwrap_or_else(|| sampler.usual_steps(schedule.len()));
-        let sampler = SamplerConfig { sampler, n_steps, spacing: params.spacing, clip: true };
-        sampler.check(schedule.len())?;
-        let guidance = params.guidance.unwrap_or_else(|| card.guidance());
-        ensure!(
-            guidance >= 0.0 && guidance.is_finite(),
-            "--guidance {guidance} is below 0; give 1 to follow the music, more to exaggerate it"
-        );
-        ensure!(
-            params.overlap < card.window_frames,
-            "--overlap {} is not below the {} frames of a window of model {}; give a smaller number",
-            params.overlap,
-            card.window_frames,
-            card.name
-        );
+        let SamplingSettings { sampler, guidance, overlap_frames } = params.sampling(card)?;
         let strength = params.constraint_strength;
         ensure!(
             (0.0..=1.0).contains(&strength),
@@ -343,7 +377,7 @@ impl Settings {
             seed: params.seed,
             best_of: params.best_of.get(),
             style: style(&params.style, card)?,
-            overlap_frames: params.overlap,
+            overlap_frames,
             prime: None,
             postprocess: params.postprocess.config((card.motion_range, card.fusion_variances()))?,
             constraints,
@@ -381,14 +415,6 @@ impl Settings {
         );
         self.prime = Some(Prime { n_left, library: library.to_owned() });
         Ok(())
-    }
-
-    /// Returns η, for a sampler that has one.
-    pub fn eta(&self) -> Option<f64> {
-        match self.sampler.sampler {
-            Sampler::Ddim { eta } => Some(eta),
-            Sampler::Ddpm | Sampler::DpmSolver => None,
-        }
     }
 
     /// Returns the settings as `generations` keeps them: without seed and weights, and of constraints the

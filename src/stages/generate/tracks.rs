@@ -11,17 +11,19 @@ use std::sync::Mutex;
 use anyhow::{bail, ensure};
 use ndarray::Array2;
 
-use super::maker::{GeneratedMotion, MotionMaker, PhraseMusic, generation_id};
+use super::maker::{GeneratedMotion, MotionMaker, generation_id};
+use super::music::PhraseMusic;
 use super::params::Tracks;
 use super::{Generate, GenerateTally};
+use crate::stages::batch::{BatchJob, n_batches};
 use crate::stages::beats::{self, BeatSource, PhraseBeats};
-use crate::stages::extract::pool::{self, lock};
 use crate::stages::failure::{Failure, FailureKind};
+use crate::stages::pool::{self, lock};
 use crate::stages::{Progress, Stage as _, lease};
-use crate::store::tables::{self, ExtractionRow, FailureRow, GenerationRow, PhraseRow};
+use crate::store::tables::{self, ExtractionRow, GenerationRow, PhraseRow};
 use crate::store::{
-    Commit, Item, Label, Ledger, Location, Row as _, Shard, Snapshot, StoreError, StoreSnapshot,
-    TimestampUs, batch_of, checkpoint, digest, outdated_features,
+    Item, Label, Ledger, Location, Row as _, Shard, Snapshot, StoreError, StoreSnapshot, batch_of,
+    checkpoint, digest, outdated_features,
 };
 use crate::units::frames_to_s;
 
@@ -47,6 +49,18 @@ pub struct TrackTarget<'a> {
     pub phrases: &'a [String],
     pub n_samples: usize,
     pub n_workers: NonZeroUsize,
+}
+
+impl<'a> TrackTarget<'a> {
+    fn batches(&self, ledger: &'a Ledger) -> BatchJob<'a> {
+        BatchJob {
+            store: self.store,
+            stage: Generate::NAME,
+            params_hash: self.params_hash,
+            origin: ITEMS_FROM,
+            ledger,
+        }
+    }
 }
 
 /// A phrase to generate motion for.
@@ -114,7 +128,7 @@ pub fn run(
         let outcomes = make_batch(maker, target, tasks, &ahead, progress)?;
         done.add(&outcomes);
         lease.check()?;
-        commit(maker, target, &ledger, tasks, outcomes)?;
+        commit(maker, target.batches(&ledger), tasks, outcomes)?;
         ahead.forget(tasks);
         if progress.is_interrupted() && i + 1 < batches.len() {
             done.is_interrupted = true;
@@ -139,7 +153,7 @@ impl TrackPlan {
         let snapshot = StoreSnapshot::take(target.store)?;
         let ledger = snapshot.ledger(Generate::NAME)?;
         let mut done = GenerateTally::default();
-        let tasks = plan(maker, target, &snapshot, &ledger, &mut done)?;
+        let tasks = plan(maker, target, &snapshot, target.batches(&ledger), &mut done)?;
         done.n_todo = tasks.iter().map(|task| task.samples.len() as u64).sum();
         done.todo_s =
             tasks.iter().map(|task| frames_to_s(task.n_frames) * task.samples.len() as f64).sum();
@@ -200,7 +214,7 @@ fn plan(
     maker: &dyn MotionMaker,
     target: &TrackTarget,
     snapshot: &StoreSnapshot,
-    ledger: &Ledger,
+    batches: BatchJob,
     done: &mut GenerateTally,
 ) -> anyhow::Result<Vec<TrackTask>> {
     let store = target.store;
@@ -244,9 +258,8 @@ fn plan(
     let total_s: f64 =
         tasks.iter().map(|task| frames_to_s(task.n_frames) * target.n_samples as f64).sum();
     let by_length = (total_s / MAX_BATCH_S).ceil() as u64;
-    let by_count = tasks.len().div_ceil(MAX_BATCH_PHRASES) as u64;
-    // A power of two, so that shards in powers of two hold whole batches.
-    let n_batches = by_length.max(by_count).max(1).next_power_of_two();
+    let by_count = tasks.len().div_ceil(MAX_BATCH_PHRASES);
+    let n_batches = n_batches(by_count, by_length);
     tasks.retain(|task| target.shard.takes(&task.row.phrase_id));
     let ids: BTreeSet<&str> = tasks.iter().map(|task| task.row.phrase_id.as_str()).collect();
     let mut beats = beats::of_phrases(snapshot, |id| ids.contains(id))?;
@@ -256,9 +269,8 @@ fn plan(
         task.batch = batch_of(id, n_batches);
         let is_missing = |sample: &usize| {
             target.force
-                || !ledger.get(&generation_id(maker.run(), id, *sample)).is_some_and(|known| {
-                    known.params_hash == target.params_hash
-                        && known.item.succeeded()
+                || !batches.known(&generation_id(maker.run(), id, *sample)).is_some_and(|known| {
+                    known.item.succeeded()
                         && known.item.input_hash == task.row.content_hash
                         && known.item.fingerprint == fingerprint
                 })
@@ -351,11 +363,10 @@ fn with_old_features(row: &PhraseRow, store: &Location) -> Failure {
 /// Writes a batch: its motions, what is known of them, and what failed.
 fn commit(
     maker: &dyn MotionMaker,
-    target: &TrackTarget,
-    ledger: &Ledger,
+    batches: BatchJob,
     tasks: &[TrackTask],
     outcomes: BTreeMap<String, TrackOutcome>,
-) -> anyhow::Result<()> {
+) -> Result<(), StoreError> {
     let tasks: HashMap<String, (&TrackTask, usize)> = tasks
         .iter()
         .flat_map(|task| task.samples.iter().map(move |&sample| (task, sample)))
@@ -363,18 +374,16 @@ fn commit(
             (generation_id(maker.run(), &task.row.phrase_id, sample), (task, sample))
         })
         .collect();
-    let mut commit = Commit::new(target.store, Generate::NAME, target.params_hash, ITEMS_FROM);
-    let (mut generations, mut failures) = (Vec::new(), Vec::new());
+    let mut commit = batches.start();
+    let mut generations = Vec::new();
     for (id, outcome) in outcomes {
         let (task, sample) = tasks[&id];
         let row = &task.row;
         let failure = outcome.as_ref().err().map(Failure::digest);
         let (fingerprint, input_hash) = (task.fingerprint(), row.content_hash.clone());
         let is_known_failure = failure.is_some()
-            && ledger.get(&id).is_some_and(|known| {
-                known.params_hash == target.params_hash
-                    && known.item.input_hash == input_hash
-                    && known.item.failure == failure
+            && batches.known(&id).is_some_and(|known| {
+                known.item.input_hash == input_hash && known.item.failure == failure
             });
         if is_known_failure {
             continue;
@@ -392,27 +401,10 @@ fn commit(
                 part.write_labelled_group(&id, &labels, made.decoded.view())?;
                 generations.extend(made.rows);
             }
-            Err(failure) => failures.push(FailureRow {
-                stage: Generate::NAME.to_owned(),
-                phrase_id: id.clone(),
-                source: url_of(row).to_owned(),
-                kind: failure.kind.name().to_owned(),
-                message: failure.message,
-                time: TimestampUs::now(),
-            }),
+            Err(failure) => commit.list_failure(&id, url_of(row), &failure),
         }
-        commit.settle(Item { id, fingerprint, input_hash, failure }, ledger);
+        commit.settle(Item { id, fingerprint, input_hash, failure });
     }
-    if !generations.is_empty() {
-        commit
-            .part(GenerationRow::schema().name, GenerationRow::schema)?
-            .write_rows(&generations)?;
-    }
-    if !failures.is_empty() {
-        commit.part(FailureRow::schema().name, FailureRow::schema)?.write_rows(&failures)?;
-    }
-    if !commit.is_empty() {
-        commit.publish()?;
-    }
-    Ok(())
+    commit.rows::<GenerationRow>(&generations)?;
+    commit.publish()
 }

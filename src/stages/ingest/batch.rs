@@ -4,20 +4,21 @@
 //! every process, at any time and after any number of kills, writes the same bytes under the same name.
 
 use std::collections::BTreeSet;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::num::NonZeroUsize;
 use std::sync::{Mutex, PoisonError};
 
 use super::layout::{PlannedPhrase, Role};
 use super::phrase::{CheckedPhrase, IngestRules, PhraseFiles};
-use super::{BEATS_VERSION, CAPTURE_VERSION, FailedPhrase, Ingest, IngestTally, notes_of};
+use super::{BEATS_VERSION, CAPTURE_VERSION, FailedPhrase, IngestTally, notes_of};
+use crate::stages::Progress;
+use crate::stages::batch::{BatchCommit, BatchJob, n_batches};
 use crate::stages::beats::{self, BeatSource};
 use crate::stages::failure::{Failure, FailureKind, guarded};
+use crate::stages::pool::{self, lock};
 use crate::stages::seen::SeenContent;
-use crate::stages::{Progress, Stage as _};
-use crate::store::tables::{self, BeatRow, FailureRow, PhraseRow};
+use crate::store::tables::{self, BeatRow, PhraseRow};
 use crate::store::{
-    Commit, Content, Item, Ledger, Location, Row as _, Shard, Source, SourceFile, StoreError,
-    TimestampUs, batch_of, digest, split_of,
+    Commit, Content, Item, Shard, Source, SourceFile, StoreError, batch_of, digest, split_of,
 };
 
 /// Bytes of source files that one batch holds at most, so that a kill costs little of a slow source.
@@ -26,11 +27,9 @@ const MAX_BATCH_BYTES: u64 = 256 << 20;
 /// Everything that the batches of a run share.
 pub struct IngestJob<'a> {
     pub source: &'a Source,
-    pub store: &'a Location,
-    pub ledger: &'a Ledger,
+    pub batches: BatchJob<'a>,
     pub seen: &'a SeenContent,
     pub rules: &'a IngestRules,
-    pub params_hash: &'a str,
     pub progress: &'a dyn Progress,
     /// Phrases of the store that lack the identity of their music, and have it now.
     pub unidentified: &'a BTreeSet<String>,
@@ -47,10 +46,8 @@ pub fn batches<'p>(
     batch_phrases: usize,
 ) -> Vec<Vec<&'p PlannedPhrase>> {
     let n_bytes: u64 = all.iter().flat_map(|p| &p.files).map(|(_, file)| file.size_bytes).sum();
-    let by_count = all.len().div_ceil(batch_phrases.max(1)) as u64;
-    let by_bytes = n_bytes.div_ceil(MAX_BATCH_BYTES);
-    // A power of two, so that shards in powers of two hold whole batches.
-    let n_batches = by_count.max(by_bytes).max(1).next_power_of_two();
+    let by_count = all.len().div_ceil(batch_phrases.max(1));
+    let n_batches = n_batches(by_count, n_bytes.div_ceil(MAX_BATCH_BYTES));
     let mut batches: Vec<Vec<&PlannedPhrase>> = vec![Vec::new(); n_batches as usize];
     for phrase in todo {
         batches[batch_of(&phrase.id, n_batches) as usize].push(phrase);
@@ -67,65 +64,43 @@ impl IngestJob<'_> {
     pub fn run(
         &self,
         batches: &[Vec<&PlannedPhrase>],
-        n_workers: usize,
+        n_workers: NonZeroUsize,
     ) -> Result<IngestTally, StoreError> {
-        let next = AtomicUsize::new(0);
-        let stop = AtomicBool::new(false);
-        let total: Mutex<Result<IngestTally, StoreError>> = Mutex::new(Ok(IngestTally::default()));
-        std::thread::scope(|scope| {
-            for _ in 0..n_workers.clamp(1, batches.len().max(1)) {
-                scope.spawn(|| {
-                    while !stop.load(Ordering::Relaxed) {
-                        let Some(batch) = batches.get(next.fetch_add(1, Ordering::Relaxed)) else {
-                            return;
-                        };
-                        if self.progress.is_interrupted() {
-                            let mut total = total.lock().unwrap_or_else(PoisonError::into_inner);
-                            total.iter_mut().for_each(|sum| sum.is_stopped = true);
-                            return;
-                        }
-                        let done = self.batch(batch);
-                        let mut total = total.lock().unwrap_or_else(PoisonError::into_inner);
-                        match (done, total.as_mut()) {
-                            (Ok(tally), Ok(sum)) => sum.add(tally),
-                            (Err(e), Ok(_)) => {
-                                stop.store(true, Ordering::Relaxed);
-                                *total = Err(e);
-                            }
-                            (_, Err(_)) => {}
-                        }
-                    }
-                });
-            }
-        });
-        total.into_inner().unwrap_or_else(PoisonError::into_inner)
+        let total = Mutex::new(IngestTally::default());
+        let mut queue = batches.iter();
+        let n_batches = NonZeroUsize::new(batches.len()).unwrap_or(NonZeroUsize::MIN);
+        pool::run(
+            n_workers.min(n_batches),
+            || {
+                let batch = queue.next()?;
+                if self.progress.is_interrupted() {
+                    lock(&total).is_stopped = true;
+                    return None;
+                }
+                Some(batch)
+            },
+            |batch| self.batch(batch).map(|tally| lock(&total).add(tally)),
+        )?;
+        Ok(total.into_inner().unwrap_or_else(PoisonError::into_inner))
     }
 
     /// Removes the failures of phrases that the source no longer has.
     ///
-    /// Rows of phrases that succeeded stay: a store loses no record because a file went away.
-    ///
     /// # Errors
     /// [`StoreError`] of the store.
     pub fn forget_failures(&self, all: &[PlannedPhrase], shard: Shard) -> Result<(), StoreError> {
-        let origin = self.source.location().url();
         let there: BTreeSet<&str> = all.iter().map(|p| p.id.as_str()).collect();
         let suffix = self.contested("");
-        let mut commit = Commit::new(self.store, Ingest::NAME, self.params_hash, origin);
-        for id in self.ledger.failed(origin) {
+        self.batches.forget_failures(|id| {
             let phrase = id.strip_suffix(&suffix).unwrap_or(id);
-            if !there.contains(phrase) && shard.takes(phrase) {
-                commit.settle(Item::forgotten(id), self.ledger);
-            }
-        }
-        if commit.is_empty() { Ok(()) } else { commit.publish().map(|_| ()) }
+            !there.contains(phrase) && shard.takes(phrase)
+        })
     }
 
     fn batch(&self, batch: &[&PlannedPhrase]) -> Result<IngestTally, StoreError> {
         let mut tally = IngestTally::default();
-        let mut commit =
-            Commit::new(self.store, Ingest::NAME, self.params_hash, self.source.location().url());
-        let mut seen = self.seen.start(self.store, self.source.location().url());
+        let mut commit = self.batches.start();
+        let mut seen = self.seen.start(self.batches.store, self.batches.origin);
         let mut rows = BatchRows::default();
         let readable = batch.iter().filter(|p| p.problem.is_none());
         let files = readable.flat_map(|p| p.files.iter().map(|(_, f)| f.clone())).collect();
@@ -147,21 +122,9 @@ impl IngestJob<'_> {
             self.settle(planned, &content_hash, outcome, &mut commit, &mut tally, &mut rows)?;
             self.progress.advance(1);
         }
-        let BatchRows { phrases, beats, mut failures } = rows;
-        if !phrases.is_empty() {
-            commit.part(PhraseRow::schema().name, PhraseRow::schema)?.write_rows(&phrases)?;
-        }
-        if !beats.is_empty() {
-            commit.part(BeatRow::schema().name, BeatRow::schema)?.write_rows(&beats)?;
-        }
-        if !failures.is_empty() {
-            // A contested name sorts elsewhere than the name that it is made from.
-            failures.sort_by(|a, b| a.phrase_id.cmp(&b.phrase_id));
-            commit.part(FailureRow::schema().name, FailureRow::schema)?.write_rows(&failures)?;
-        }
-        if !commit.is_empty() {
-            commit.publish()?;
-        }
+        commit.rows(&rows.phrases)?;
+        commit.rows(&rows.beats)?;
+        commit.publish()?;
         if !seen.is_empty() {
             seen.publish()?;
         }
@@ -177,12 +140,11 @@ impl IngestJob<'_> {
         outcome: &Result<CheckedPhrase, Failure>,
         seen: &mut Commit<'_>,
     ) {
-        let Some(known) = self.ledger.get(&planned.id) else { return };
-        let origin = self.source.location().url();
+        let Some(known) = self.batches.known(&planned.id) else { return };
+        let origin = self.batches.origin;
         let fingerprint = fingerprint(planned);
-        let is_same = known.params_hash == self.params_hash
-            && known.item.succeeded()
-            && known.item.input_hash == input_hash(planned, content_hash);
+        let is_same =
+            known.item.succeeded() && known.item.input_hash == input_hash(planned, content_hash);
         let is_news = known.item.fingerprint != fingerprint || known.origin != origin;
         let stays = !self.force && !self.unidentified.contains(&planned.id);
         if outcome.is_ok() && is_same && is_news && stays {
@@ -217,7 +179,7 @@ impl IngestJob<'_> {
         planned: &PlannedPhrase,
         content_hash: &str,
         mut outcome: Result<CheckedPhrase, Failure>,
-        commit: &mut Commit<'_>,
+        commit: &mut BatchCommit<'_>,
         tally: &mut IngestTally,
         rows: &mut BatchRows,
     ) -> Result<(), StoreError> {
@@ -233,10 +195,8 @@ impl IngestJob<'_> {
         let failure = outcome.as_ref().err().map(Failure::digest);
         let unchanged = !self.force
             && !self.unidentified.contains(&id)
-            && self.ledger.get(&id).is_some_and(|known| {
-                known.params_hash == self.params_hash
-                    && known.item.input_hash == input_hash
-                    && known.item.failure == failure
+            && self.batches.known(&id).is_some_and(|known| {
+                known.item.input_hash == input_hash && known.item.failure == failure
             });
         match &outcome {
             Ok(_) if unchanged => tally.n_unchanged += 1,
@@ -257,10 +217,9 @@ impl IngestJob<'_> {
             }
         }
         let fingerprint = fingerprint(planned);
-        let refused = |id| self.ledger.get(id).is_some_and(|known| known.item.failure.is_some());
-        if id != contested && refused(&contested) {
+        if id != contested && self.batches.has_failed(&contested) {
             // What kept the phrase from its own name is gone, and with it the failure.
-            commit.settle(Item::forgotten(&contested), self.ledger);
+            commit.forget(&contested);
         }
         if unchanged {
             return Ok(());
@@ -277,9 +236,12 @@ impl IngestJob<'_> {
                 }
                 rows.phrases.push(self.phrase_row(planned, phrase));
             }
-            Err(failure) => rows.failures.push(self.failure_row(&id, failure)),
+            Err(failure) => {
+                let url = self.source.location().url_of(&failure.path);
+                commit.list_failure(&id, &url, &failure);
+            }
         }
-        commit.settle(Item { id, fingerprint, input_hash, failure }, self.ledger);
+        commit.settle(Item { id, fingerprint, input_hash, failure });
         Ok(())
     }
 
@@ -289,13 +251,13 @@ impl IngestJob<'_> {
     /// nothing about them: they stay, and the failure is listed beside them.
     fn is_out_of_reach(&self, id: &str, outcome: &Result<CheckedPhrase, Failure>) -> bool {
         matches!(outcome, Err(failure) if failure.kind == FailureKind::Unreadable)
-            && self.ledger.get(id).is_some_and(|known| known.item.succeeded())
+            && self.batches.has_rows(id)
     }
 
     /// Returns the name under which a phrase fails whose own name stands for rows that stay: those of
     /// another source, or those of a phrase that cannot be read just now.
     fn contested(&self, id: &str) -> String {
-        contested(id, self.source.location().url())
+        contested(id, self.batches.origin)
     }
 
     /// Refuses a phrase whose name the store has from elsewhere with other content.
@@ -304,10 +266,10 @@ impl IngestJob<'_> {
         planned: &PlannedPhrase,
         content_hash: &str,
     ) -> Option<Failure> {
-        let known = self.ledger.get(&planned.id)?;
+        let known = self.batches.ledger.get(&planned.id)?;
         // Release 0.1 kept the content hash of every phrase.
         let same = [content_hash, &input_hash(planned, content_hash)];
-        let here = self.source.location().url();
+        let here = self.batches.origin;
         if self.force
             || known.origin == here
             || !known.item.succeeded()
@@ -378,17 +340,6 @@ impl IngestJob<'_> {
             style_name: None,
         }
     }
-
-    fn failure_row(&self, id: &str, failure: Failure) -> FailureRow {
-        FailureRow {
-            stage: Ingest::NAME.to_owned(),
-            phrase_id: id.to_owned(),
-            source: self.source.location().url_of(&failure.path),
-            kind: failure.kind.name().to_owned(),
-            message: failure.message,
-            time: TimestampUs::now(),
-        }
-    }
 }
 
 /// Returns the name under which a phrase from `origin` fails while rows of its own name stay.
@@ -396,12 +347,11 @@ pub fn contested(id: &str, origin: &str) -> String {
     format!("{id} @ {origin}")
 }
 
-/// The rows of a batch but for motion.
+/// The rows of a batch but for motion and failures.
 #[derive(Default)]
 struct BatchRows {
     phrases: Vec<PhraseRow>,
     beats: Vec<BeatRow>,
-    failures: Vec<FailureRow>,
 }
 
 /// Returns what a phrase's rows are made from, as its item names it: its content, and the versions of what is

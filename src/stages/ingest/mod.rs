@@ -11,12 +11,13 @@ use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::time::Instant;
 
-use super::{ClientParams, Contract, LinkParams, Progress, Stage, Summary, all_threads};
+use super::{ClientParams, Contract, LinkParams, Progress, RARE, Stage, Summary, all_threads};
 use crate::store::tables::PhraseRow;
 use crate::store::{
-    Cache, Ledger, Location, Row as _, Shard, Source, StoreError, StoreSnapshot, checkpoint, digest,
+    Cache, Location, Row as _, Shard, Source, StoreError, StoreSnapshot, checkpoint, digest,
 };
 
+use super::batch::BatchJob;
 use super::failure::{Failure, failures_json, write_failures, write_notes};
 use super::seen::SeenContent;
 pub(in crate::stages) use crate::audio::formats::is_audio_extension as is_audio;
@@ -60,13 +61,15 @@ pub struct Params {
     #[arg(long, value_name = "N", default_value_t = all_threads())]
     pub workers: NonZeroUsize,
     /// Phrases committed together, about; also how many a kill can cost each worker.
-    #[arg(long, value_name = "N", default_value_t = NonZeroUsize::new(512).expect("512 is not 0"))]
+    #[arg(long, value_name = "N", default_value_t = NonZeroUsize::new(512).expect("512 is not 0"),
+          hide_short_help = RARE)]
     pub batch_phrases: NonZeroUsize,
     /// Keep copies of remote files in this folder and read them from there next time.
     #[arg(long, value_name = "DIR", help_heading = "Remote storage")]
     pub cache: Option<PathBuf>,
     /// Size of the cache in GB (10^9 bytes); the least recently used files leave first.
-    #[arg(long, value_name = "GB", default_value_t = 20.0, help_heading = "Remote storage")]
+    #[arg(long, value_name = "GB", default_value_t = 20.0, help_heading = "Remote storage",
+          hide_short_help = RARE)]
     pub cache_size_gb: f64,
     #[command(flatten)]
     pub links: LinkParams,
@@ -119,11 +122,18 @@ impl Stage for Ingest {
 
         let mine: Vec<_> = plan.phrases.iter().filter(|p| shard.takes(&p.id)).collect();
         let origin = source.location().url();
+        let batches = BatchJob {
+            store: &store,
+            stage: Self::NAME,
+            params_hash: &params_hash,
+            origin,
+            ledger: &ledger,
+        };
         let is_done = |p: &PlannedPhrase| {
             !params.force
                 && !params.verify
                 && !unidentified.contains(&p.id)
-                && is_settled(p, &ledger, &seen, &params_hash, origin)
+                && is_settled(p, &batches, &seen)
         };
         let (done, todo): (Vec<_>, Vec<_>) = mine.into_iter().partition(|p| is_done(p));
         tracing::info!(
@@ -154,24 +164,22 @@ impl Stage for Ingest {
         } else {
             snapshot.checkpoint();
             progress.start("ingest", "phrases", todo.len() as u64);
-            let batches = batch::batches(&plan.phrases, todo, params.batch_phrases.get());
+            let todo = batch::batches(&plan.phrases, todo, params.batch_phrases.get());
             let job = batch::IngestJob {
                 source: &source,
-                store: &store,
-                ledger: &ledger,
+                batches,
                 seen: &seen,
                 rules: &params.rules,
-                params_hash: &params_hash,
                 progress,
                 unidentified: &unidentified,
                 force: params.force,
             };
-            report.tally.add(job.run(&batches, params.workers.get())?);
+            report.tally.add(job.run(&todo, params.workers)?);
             if !report.tally.is_stopped {
                 job.forget_failures(&plan.phrases, shard)?;
             }
             // The plan and the catalogue of a million phrases are not needed at once.
-            drop(batches);
+            drop(todo);
             drop((plan.phrases, ledger, seen));
             checkpoint(&store, &[Self::NAME]);
             progress.finish();
@@ -198,22 +206,12 @@ fn params_hash(rules: &IngestRules) -> String {
 /// Returns whether the store has a phrase's rows for these files and rules.
 ///
 /// Size and time tell a file's versions apart, not the files of two sources.
-fn is_settled(
-    planned: &PlannedPhrase,
-    ledger: &Ledger,
-    seen: &SeenContent,
-    params_hash: &str,
-    origin: &str,
-) -> bool {
-    let fingerprint = batch::fingerprint(planned);
-    let refused = ledger.get(&batch::contested(&planned.id, origin));
-    let is_refused = refused.is_some_and(|known| known.item.failure.is_some());
-    !is_refused
-        && ledger.get(&planned.id).is_some_and(|known| {
+fn is_settled(planned: &PlannedPhrase, batches: &BatchJob, seen: &SeenContent) -> bool {
+    let (origin, fingerprint) = (batches.origin, batch::fingerprint(planned));
+    !batches.has_failed(&batch::contested(&planned.id, origin))
+        && batches.known(&planned.id).is_some_and(|known| {
             let is_same = known.origin == origin && known.item.fingerprint == fingerprint;
-            known.params_hash == params_hash
-                && known.item.succeeded()
-                && (is_same || seen.has(known, origin, &fingerprint))
+            known.item.succeeded() && (is_same || seen.has(known, origin, &fingerprint))
         })
 }
 

@@ -7,6 +7,7 @@ use super::motion::{ReadMotion, read_dancers, read_group, read_motion};
 use crate::audio::header::{AudioHeader, AudioHeaderError, read_header, read_header_from};
 use crate::motion::text::text_of;
 use crate::motion::{Axis, Beats, BeatsPerBarSource, CaptureAccount, ChannelLimits, Dancers};
+use crate::stages::RARE;
 use crate::stages::beats::{self, BeatSource};
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::feature_file::read_features;
@@ -21,10 +22,11 @@ const MAX_FILE_BYTES: u64 = 1 << 30;
 pub struct IngestRules {
     /// Which channel values a motion may have: `wide` allows ±20 rad/s of angular velocity, as real
     /// spins need; `reference` allows ±10 rad/s.
-    #[arg(long, value_enum, value_name = "LIMITS", default_value_t = ChannelLimits::Wide)]
+    #[arg(long, value_enum, value_name = "LIMITS", default_value_t = ChannelLimits::Wide,
+          hide_short_help = RARE)]
     pub limits: ChannelLimits,
     /// Frames by which the lengths of motion, features and audio may differ.
-    #[arg(long, value_name = "FRAMES", default_value_t = 1)]
+    #[arg(long, value_name = "FRAMES", default_value_t = 1, hide_short_help = RARE)]
     pub length_tolerance_frames: u32,
     /// The axis that is up in motion captures [default: found, by the skeleton and its poses].
     #[arg(long, value_enum, value_name = "AXIS", allow_hyphen_values = true)]

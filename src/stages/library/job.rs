@@ -13,12 +13,13 @@ use super::made::{self, Band, perform};
 use super::report::{LibrarySummary, LibraryTally};
 use super::songs::{Song, SongFiles, SongInput, Songs};
 use super::write::{Refusal, SongWriter, fingerprint, is_settled};
-use super::{Params, one, params_hash};
-use crate::stages::Progress;
+use super::{Library, Params, one, params_hash};
+use crate::stages::batch::BatchJob;
 use crate::stages::extract::needed_bytes;
-use crate::stages::extract::pool::{self, Budget, lock};
 use crate::stages::failure::{guarded, query_of_failures};
+use crate::stages::pool::{self, Budget, lock};
 use crate::stages::seen::SeenContent;
+use crate::stages::{Progress, Stage as _};
 use crate::store::{Ledger, Location};
 
 /// Memory that songs under way may take while their audio is decoded.
@@ -52,18 +53,19 @@ impl LibraryJob<'_> {
         let capture_names = captures.names();
         let (captures_origin, captures_print) =
             (captures.origin.clone(), captures.fingerprint.clone());
+        let batches = BatchJob {
+            store: self.store,
+            stage: Library::NAME,
+            params_hash: &params_hash,
+            origin: &songs.origin,
+            ledger: &self.ledger,
+        };
         let is_done = |song: &Song| {
             let print = fingerprint(song, &captures_print);
             !force
                 && output.is_none()
                 && (compose_audio.is_none() || !song.is_made())
-                && is_settled(
-                    song,
-                    (&self.ledger, &self.seen),
-                    (&songs.origin, &params_hash),
-                    rules,
-                    &print,
-                )
+                && is_settled(song, (&batches, &self.seen), rules, &print)
         };
         let (sound, problems): (Vec<Song>, Vec<Song>) =
             songs.songs.iter().cloned().partition(|song| song.problem.is_none());
@@ -77,14 +79,13 @@ impl LibraryJob<'_> {
             return Ok(());
         }
         self.store.sweep();
-        let failed_before =
-            |name: &String| self.ledger.get(name).is_some_and(|k| k.item.failure.is_some());
         // Captures are read where they are danced, or where one may have been mended.
-        let loaded = if todo.is_empty() && !capture_names.iter().any(failed_before) {
-            None
-        } else {
-            Some(captures.load()?)
-        };
+        let loaded =
+            if todo.is_empty() && !capture_names.iter().any(|name| batches.has_failed(name)) {
+                None
+            } else {
+                Some(captures.load()?)
+            };
         let folder = output
             .as_ref()
             .map(|path| {
@@ -94,10 +95,7 @@ impl LibraryJob<'_> {
         let empty = LoadedCaptures::default();
         let loaded = loaded.as_ref().unwrap_or(&empty);
         let writer = SongWriter {
-            store: self.store,
-            ledger: &self.ledger,
-            params_hash: &params_hash,
-            origin: &songs.origin,
+            batches,
             rules,
             repertoire: &loaded.repertoire,
             captures_hash: &loaded.content_hash,

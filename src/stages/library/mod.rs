@@ -20,7 +20,7 @@ use std::time::Instant;
 
 use super::failure::{Failure, FailureKind};
 use super::seen::SeenContent;
-use super::{ClientParams, Contract, LinkParams, Progress, Stage, Summary, all_threads};
+use super::{ClientParams, Contract, LinkParams, Progress, RARE, Stage, Summary, all_threads};
 use crate::motion::Axis;
 use crate::store::{Location, Source, StoreError, StoreSnapshot, checkpoint, digest};
 use captures::Captures;
@@ -56,7 +56,8 @@ pub struct Params {
     #[arg(long, value_name = "DIR")]
     pub captures: Option<String>,
     /// The axis that is up in motion captures of --captures [default: found, by skeletons and poses].
-    #[arg(long, value_enum, value_name = "AXIS", allow_hyphen_values = true)]
+    #[arg(long, value_enum, value_name = "AXIS", allow_hyphen_values = true,
+          hide_short_help = RARE)]
     pub up: Option<Axis>,
     /// Compose so many songs, play them, and dance to them, too: 22 styles of 70 to 180 bpm, in bars of
     /// three and four, whose beats are known. They are all for training. --seed chooses others.
@@ -69,10 +70,10 @@ pub struct Params {
     /// Play composed songs and tunes with the instruments of a General MIDI soundfont (SF2), instead of our own
     /// voices.
     #[cfg(feature = "soundfont")]
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", hide_short_help = RARE)]
     pub soundfont: Option<PathBuf>,
     /// Also write the songs that are composed or played in this run: NAME.wav and NAME.beats.txt.
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "DIR", hide_short_help = RARE)]
     pub compose_audio: Option<PathBuf>,
     /// Also write the phrases as files, in the layout that ingest reads.
     #[arg(long, value_name = "DIR")]
@@ -81,10 +82,12 @@ pub struct Params {
     pub rules: LibraryRules,
     /// Songs for validation: a number, or a fraction of all (at least one). Fewer than three songs all
     /// train.
-    #[arg(long, value_name = "N|FRACTION", default_value_t = SongShare::Fraction(0.1))]
+    #[arg(long, value_name = "N|FRACTION", default_value_t = SongShare::Fraction(0.1),
+          hide_short_help = RARE)]
     pub validation_songs: SongShare,
     /// Songs for the test: a number, or a fraction of all (at least one).
-    #[arg(long, value_name = "N|FRACTION", default_value_t = SongShare::Fraction(0.1))]
+    #[arg(long, value_name = "N|FRACTION", default_value_t = SongShare::Fraction(0.1),
+          hide_short_help = RARE)]
     pub test_songs: SongShare,
     /// Songs under way at once.
     #[arg(long, value_name = "N", default_value_t = all_threads())]
@@ -109,11 +112,11 @@ pub struct LibraryRules {
     pub takes: NonZeroU32,
     /// Length of a phrase, in frames at 30 fps.
     #[arg(long, value_name = "FRAMES",
-          default_value_t = NonZeroUsize::new(120).expect("120 is not 0"))]
+          default_value_t = NonZeroUsize::new(120).expect("120 is not 0"), hide_short_help = RARE)]
     pub phrase_frames: NonZeroUsize,
     /// From the begin of a phrase to that of the next, in frames.
     #[arg(long, value_name = "FRAMES",
-          default_value_t = NonZeroUsize::new(60).expect("60 is not 0"))]
+          default_value_t = NonZeroUsize::new(60).expect("60 is not 0"), hide_short_help = RARE)]
     pub hop_frames: NonZeroUsize,
     /// Dancers of a take, a number or a range that chance draws from for each take, such as 2..5: groups in
     /// formations, their steps the same, mirrored, in canon, as call and response, or free (docs/groups.md)

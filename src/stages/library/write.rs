@@ -2,28 +2,23 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
+use super::LibraryRules;
 use super::layout::PhraseFolder;
 use super::one::{self, SongMusic, dance};
 use super::report::PhraseCounts;
 use super::rows::{beat_rows, phrase_row};
 use super::songs::Song;
-use super::{Library, LibraryRules};
 use crate::motion::choreography::Repertoire;
-use crate::stages::Stage as _;
+use crate::stages::batch::{BatchCommit, BatchJob};
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::seen::SeenContent;
-use crate::store::tables::{self, BeatRow, FailureRow, PhraseRow};
-use crate::store::{
-    Commit, Item, Ledger, Location, Row as _, SettledItem, StoreError, TimestampUs, digest,
-};
+use crate::store::tables::{self, BeatRow, PhraseRow};
+use crate::store::{Item, SettledItem, StoreError, digest};
 
 /// Writes songs and failures.
 pub struct SongWriter<'a> {
-    pub store: &'a Location,
-    pub ledger: &'a Ledger,
-    pub params_hash: &'a str,
-    /// Where the songs come from, as commits name it.
-    pub origin: &'a str,
+    /// Of the songs; captures may come from elsewhere.
+    pub batches: BatchJob<'a>,
     pub rules: &'a LibraryRules,
     pub repertoire: &'a Repertoire,
     /// Digest of the captures' content.
@@ -77,26 +72,25 @@ pub fn fingerprint(song: &Song, captures_fingerprint: &str) -> String {
 /// A song is committed whole, so its first phrase stands for all.
 pub fn is_settled(
     song: &Song,
-    (ledger, seen): (&Ledger, &SeenContent),
-    (origin, params_hash): (&str, &str),
+    (batches, seen): (&BatchJob, &SeenContent),
     rules: &LibraryRules,
     fingerprint: &str,
 ) -> bool {
-    let is_refused = ledger.get(&song.id).is_some_and(|known| known.item.failure.is_some());
-    let first = ledger.get(&one::phrase_id(song, rules, 0, 0));
-    !is_refused
+    let origin = batches.origin;
+    let first = batches.known(&one::phrase_id(song, rules, 0, 0));
+    !batches.has_failed(&song.id)
         && !song.is_unidentified
         && first.is_some_and(|known| {
-            known.params_hash == params_hash
-                && known.origin == origin
+            known.origin == origin
                 && known.item.succeeded()
                 && (known.item.fingerprint == fingerprint || seen.has(known, origin, fingerprint))
         })
 }
 
 impl SongWriter<'_> {
-    fn start(&self, origin: &str) -> Commit<'_> {
-        Commit::new(self.store, Library::NAME, self.params_hash, origin)
+    /// Returns the job of items that come from elsewhere than songs may.
+    fn batches_of<'b>(&'b self, origin: &'b str) -> BatchJob<'b> {
+        BatchJob { origin, ..self.batches }
     }
 
     /// Makes and commits the phrases of a song.
@@ -105,24 +99,23 @@ impl SongWriter<'_> {
     /// [`Refusal`]; nothing of the song is in the store then that was not there before.
     pub fn song(&self, song: &Song, music: &SongMusic) -> Result<SongOutcome, Refusal> {
         let input_hash = self.input_hash(song, music);
-        let first = self.ledger.get(&one::phrase_id(song, self.rules, 0, 0));
+        let first = self.batches.known(&one::phrase_id(song, self.rules, 0, 0));
         let is_there = !self.force
             && !song.is_unidentified
             && first.is_some_and(|known| {
-                known.params_hash == self.params_hash
-                    && known.origin == self.origin
+                known.origin == self.batches.origin
                     && known.item.succeeded()
                     && known.item.input_hash == input_hash
             });
         if is_there {
             // A song that was out of reach for a while kept its phrases, and is not failed any more.
-            self.settle(self.start(self.origin), self.recovered(song).into_iter().collect())?;
+            settle(self.batches.start(), self.recovered(song).into_iter().collect())?;
             self.see(song, first)?;
             if self.output.is_none() {
                 return Ok(SongOutcome::Unchanged);
             }
         }
-        let mut commit = self.start(self.origin);
+        let mut commit = self.batches.start();
         let fingerprint = fingerprint(song, self.captures_fingerprint);
         let (mut phrases, mut beats) = (Vec::new(), Vec::new());
         let mut items: Vec<Item> = Vec::new();
@@ -154,12 +147,9 @@ impl SongWriter<'_> {
         let made: BTreeSet<&str> = items.iter().map(|item| item.id.as_str()).collect();
         let old = self.former(song, &made);
         items.extend(old.into_iter().chain(self.recovered(song)));
-        let schema = PhraseRow::schema;
-        commit.part(schema().name, schema)?.write_rows(&phrases)?;
-        if !beats.is_empty() {
-            commit.part(BeatRow::schema().name, BeatRow::schema)?.write_rows(&beats)?;
-        }
-        self.settle(commit, items)?;
+        commit.rows::<PhraseRow>(&phrases)?;
+        commit.rows::<BeatRow>(&beats)?;
+        settle(commit, items)?;
         Ok(SongOutcome::Phrases(counts))
     }
 
@@ -170,8 +160,9 @@ impl SongWriter<'_> {
         let Some(known) = first.filter(|known| known.item.fingerprint != fingerprint) else {
             return Ok(());
         };
-        let mut commit = self.seen.start(self.store, self.origin);
-        self.seen.settle(known, self.origin, &fingerprint, &mut commit);
+        let BatchJob { store, origin, .. } = self.batches;
+        let mut commit = self.seen.start(store, origin);
+        self.seen.settle(known, origin, &fingerprint, &mut commit);
         if commit.is_empty() { Ok(()) } else { commit.publish().map(|_| ()) }
     }
 
@@ -189,7 +180,7 @@ impl SongWriter<'_> {
                 | FailureKind::StaleFeatures
         );
         let old = if is_out_of_reach { Vec::new() } else { self.former(song, &BTreeSet::new()) };
-        self.failures(self.origin, &[(&song.id, &song.url, failure)], old)
+        self.failures(self.batches.origin, &[(&song.id, &song.url, failure)], old)
     }
 
     /// Records captures that failed, and takes back the failures of those that did not.
@@ -203,10 +194,10 @@ impl SongWriter<'_> {
         failed: &[(String, String, Failure)],
     ) -> Result<(), StoreError> {
         let refused: BTreeSet<&str> = failed.iter().map(|(name, ..)| name.as_str()).collect();
-        let recovered = names.iter().map(String::as_str).filter(|&name| {
-            !refused.contains(name)
-                && self.ledger.get(name).is_some_and(|known| known.item.failure.is_some())
-        });
+        let recovered = names
+            .iter()
+            .map(String::as_str)
+            .filter(|&name| !refused.contains(name) && self.batches.has_failed(name));
         let recovered: Vec<Item> = recovered.map(Item::forgotten).collect();
         let failed: Vec<_> = failed.iter().map(|(name, url, f)| (name, url, f)).collect();
         self.failures(origin, &failed, recovered)
@@ -219,32 +210,18 @@ impl SongWriter<'_> {
         failed: &[(&String, &String, &Failure)],
         mut items: Vec<Item>,
     ) -> Result<(), StoreError> {
-        let mut commit = self.start(origin);
-        let mut rows = Vec::new();
+        let mut commit = self.batches_of(origin).start();
         for (name, url, failure) in failed {
             let (found, input_hash) = (Some(failure.digest()), failure.digest());
-            let is_known = self.ledger.get(name).is_some_and(|known| {
-                known.params_hash == self.params_hash && known.item.failure == found
-            });
-            if is_known {
+            let known = self.batches.known(name);
+            if known.is_some_and(|known| known.item.failure == found) {
                 continue;
             }
-            rows.push(FailureRow {
-                stage: Library::NAME.to_owned(),
-                phrase_id: (*name).clone(),
-                source: (*url).clone(),
-                kind: failure.kind.name().to_owned(),
-                message: failure.message.clone(),
-                time: TimestampUs::now(),
-            });
+            commit.list_failure(name, url, failure);
             let (id, fingerprint) = ((*name).clone(), String::new());
             items.push(Item { id, fingerprint, input_hash, failure: found });
         }
-        if !rows.is_empty() {
-            rows.sort_by(|a, b| a.phrase_id.cmp(&b.phrase_id));
-            commit.part(FailureRow::schema().name, FailureRow::schema)?.write_rows(&rows)?;
-        }
-        self.settle(commit, items)
+        settle(commit, items)
     }
 
     /// Removes the phrases and failures of what is no longer among the songs and captures; returns how
@@ -258,7 +235,8 @@ impl SongWriter<'_> {
         names: &BTreeSet<String>,
         slugs: Option<&BTreeSet<&str>>,
     ) -> Result<usize, StoreError> {
-        let failed = self.ledger.failed(origin).into_iter().filter(|id| !names.contains(*id));
+        let failed =
+            self.batches.ledger.failed(origin).into_iter().filter(|id| !names.contains(*id));
         let mut items: Vec<Item> = failed.map(Item::forgotten).collect();
         let n_failures = items.len();
         if let Some(slugs) = slugs {
@@ -267,13 +245,13 @@ impl SongWriter<'_> {
             items.extend(ids.filter(|id| self.is_ours(id)).map(|id| Item::forgotten(id)));
         }
         let n_phrases = items.len() - n_failures;
-        self.settle(self.start(origin), items)?;
+        settle(self.batches_of(origin).start(), items)?;
         Ok(n_phrases)
     }
 
     /// Returns whether a phrase comes from where the songs of this run come from.
     fn is_ours(&self, id: &str) -> bool {
-        self.ledger.get(id).is_some_and(|known| known.origin == self.origin)
+        self.batches.ledger.get(id).is_some_and(|known| known.origin == self.batches.origin)
     }
 
     /// Returns the phrases that the store has of a song and that were not made again, as items to be
@@ -287,16 +265,7 @@ impl SongWriter<'_> {
 
     /// Returns the failure of a song, to be forgotten.
     fn recovered(&self, song: &Song) -> Option<Item> {
-        let known = self.ledger.get(&song.id)?;
-        known.item.failure.is_some().then(|| Item::forgotten(&song.id))
-    }
-
-    fn settle(&self, mut commit: Commit<'_>, mut items: Vec<Item>) -> Result<(), StoreError> {
-        items.sort_by(|a, b| a.id.cmp(&b.id));
-        for item in items {
-            commit.settle(item, self.ledger);
-        }
-        if commit.is_empty() { Ok(()) } else { commit.publish().map(|_| ()) }
+        self.batches.has_failed(&song.id).then(|| Item::forgotten(&song.id))
     }
 
     /// Returns the digest of everything but the parameters that determines a song's phrases.
@@ -311,8 +280,9 @@ impl SongWriter<'_> {
         let former = self.constructed.get(&song.slug).and_then(|phrases| phrases.get(id));
         let is_same = former.is_some_and(|url| *url == song.url);
         let other_origin = || {
-            let known = self.ledger.get(id).filter(|known| known.item.succeeded())?;
-            (known.origin != self.origin && !is_same && !self.force).then_some(&known.origin)
+            let known = self.batches.ledger.get(id).filter(|known| known.item.succeeded())?;
+            (known.origin != self.batches.origin && !is_same && !self.force)
+                .then_some(&known.origin)
         };
         let Some(from) = self.others.get(id).or_else(other_origin) else { return Ok(()) };
         let message = format!(
@@ -322,4 +292,11 @@ impl SongWriter<'_> {
         );
         Err(Failure::new(FailureKind::DuplicateId, &song.id, message))
     }
+}
+
+/// Settles items in the order of their names, and publishes.
+fn settle(mut commit: BatchCommit<'_>, mut items: Vec<Item>) -> Result<(), StoreError> {
+    items.sort_by(|a, b| a.id.cmp(&b.id));
+    items.into_iter().for_each(|item| commit.settle(item));
+    commit.publish()
 }

@@ -13,7 +13,7 @@ use crate::plot::{self, FeaturesPlot, Panel};
 use crate::stages::beats::{self, BeatSource};
 use crate::stages::extract::Extract;
 use crate::stages::failure::{Failure, guarded};
-use crate::stages::{ClientParams, Stage as _, Summary};
+use crate::stages::{ClientParams, RARE, Stage as _, Summary};
 use crate::store::tables::{self, ExtractionRow, FailureRow, PhraseRow};
 use crate::store::{ItemTables, Location, Row as _, Snapshot, StoreError};
 use crate::units::frames_to_s;
@@ -50,7 +50,7 @@ pub struct Params {
           value_parser = clap::value_parser!(u32).range(WIDTHS_PX))]
     pub width: u32,
     /// Deviation from A440 in bins of 1/36 octave, from -0.5 to below 0.5, instead of the estimate.
-    #[arg(long, value_name = "BINS", allow_hyphen_values = true)]
+    #[arg(long, value_name = "BINS", allow_hyphen_values = true, hide_short_help = RARE)]
     pub tuning: Option<Tuning>,
     #[command(flatten)]
     pub client: ClientParams,

@@ -5,7 +5,8 @@ use std::sync::Arc;
 
 use anyhow::{Context as _, ensure};
 
-use super::session::{ProgressWatch, claim, lease_of, read_phrases, scales};
+use super::budget::StageBudget;
+use super::session::{ProgressWatch, claim, lease_of, scales};
 use super::{Params, Run, TrainDryRun, TrainSummary, resume_command};
 use crate::model::{Family, GroupNetworks};
 use crate::motion::Normalizer;
@@ -85,17 +86,7 @@ impl Run<'_> {
         config: &GroupTrainConfig,
         progress: &dyn Progress,
     ) -> anyhow::Result<Box<dyn Summary>> {
-        let machine = &self.params.machine;
-        let dancers = Family::Group;
-        let phrases = read_phrases(
-            self.store,
-            Train::NAME,
-            (machine, dancers),
-            None,
-            progress,
-            self.watch,
-            true,
-        )?;
+        let phrases = self.phrases(Family::Group, progress)?;
         let windows = Windows::new(
             phrases.dataset,
             Normalizer::identity(),
@@ -122,16 +113,7 @@ impl Run<'_> {
     ) -> anyhow::Result<Box<dyn Summary>> {
         let params = self.params;
         let machine = &params.machine;
-        let dancers = Family::Group;
-        let phrases = read_phrases(
-            self.store,
-            Train::NAME,
-            (machine, dancers),
-            None,
-            progress,
-            self.watch,
-            false,
-        )?;
+        let phrases = self.phrases(Family::Group, progress)?;
         let threads = Arc::new(machine.start_threads()?);
         let n_frames = config.network.window_frames;
         let scales = scales(&phrases.dataset, n_frames, self.watch)?;
@@ -152,7 +134,7 @@ impl Run<'_> {
         }
         claim(self.store, &params.run, Train::NAME, config, machine.patience(), self.watch)?;
         let steps =
-            super::StageBudget { share: 1.0, ..self.steps_of_diffusion(config.group.batch_size) };
+            StageBudget { share: 1.0, ..params.budget.of_denoiser(config.group.batch_size) };
         let end = self.stage(config, steps, &mut learner, &windows, &mut account)?;
         if end == TrainingEnd::Interrupted {
             return Ok(Box::new(account.interrupted(&resume_command(params))));

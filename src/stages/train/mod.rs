@@ -1,5 +1,6 @@
 //! `train`: the UNet learns to remove noise from motion, then the decoder to make motion of latents.
 
+pub mod budget;
 mod group;
 mod judge;
 mod params;
@@ -7,14 +8,13 @@ pub mod session;
 mod summary;
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use anyhow::{bail, ensure};
 
 use super::failure::quoted;
 use super::learned::{learned_path, remember};
 use super::trained::best;
-use super::{ClientParams, Contract, Progress, Stage, Summary};
+use super::{ClientParams, Contract, Progress, RARE, Stage, Summary};
 use crate::autodiff::{Arena, Parameters};
 use crate::diffusion::Schedule;
 use crate::model::{Family, UNet1D};
@@ -22,17 +22,16 @@ use crate::motion::Normalizer;
 use crate::store::{Lease, Location};
 use crate::training::{
     Augmentation, CheckpointKind, Checkpoints, DecoderLearner, Denoiser, DiffusionLearner, Drive,
-    GroupLearner, Journal, Learner, Loader, Plan, State, TrainConfig, TrainingEnd, TrainingError,
+    GroupLearner, Journal, Learner, Loader, State, TrainConfig, TrainingEnd, TrainingError,
     Windows,
 };
+use budget::{BudgetParams, StageBudget};
 use judge::ValidationJudge;
 use session::{
-    MachineParams, ProgressWatch, check_run_name, claim, claim_path, lease_of, read_phrases, scales,
+    MachineParams, ProgressWatch, TrainingPhrases, check_run_name, claim, claim_path, lease_of,
+    read_phrases, scales,
 };
 pub use summary::{StageSummary, TrainDryRun, TrainSummary};
-
-/// Share of a time budget that the decoder gets.
-const DECODER_SHARE: f64 = 0.1;
 
 /// The stage.
 pub struct Train;
@@ -47,7 +46,7 @@ pub struct Params {
     #[arg(long, value_name = "NAME")]
     pub run: String,
     /// Refuse to start a run that does not exist.
-    #[arg(long)]
+    #[arg(long, hide_short_help = RARE)]
     pub resume: bool,
     #[command(flatten)]
     pub budget: BudgetParams,
@@ -66,39 +65,6 @@ pub struct Params {
     /// Start the run anew: its checkpoints and its log are removed.
     #[arg(long)]
     pub force: bool,
-}
-
-/// When training ends, and what happens on the way.
-#[derive(Clone, Debug, clap::Args)]
-pub struct BudgetParams {
-    /// Times that the UNet sees all phrases [default: 100, without --steps and --minutes]
-    #[arg(long, value_name = "N", help_heading = "Budget")]
-    pub epochs: Option<u64>,
-    /// Steps of the UNet.
-    #[arg(long, value_name = "N", help_heading = "Budget")]
-    pub steps: Option<u64>,
-    /// Minutes that training may take, over all its resumptions; a tenth is the decoder's.
-    #[arg(long, value_name = "M", help_heading = "Budget")]
-    pub minutes: Option<f64>,
-    /// Steps of the decoder.
-    #[arg(long, value_name = "N", default_value_t = 2000, help_heading = "Budget")]
-    pub decoder_steps: u64,
-    /// Epochs from one validation to the next.
-    #[arg(long, value_name = "N", default_value_t = 5, help_heading = "Budget")]
-    pub validate_every: u64,
-    /// Validations without improvement after which training ends; 0 for never.
-    #[arg(long, value_name = "N", default_value_t = 0, help_heading = "Budget")]
-    pub patience: u64,
-    /// Epochs from one checkpoint to the next.
-    #[arg(long, value_name = "N", default_value_t = 10, help_heading = "Budget")]
-    pub save_every: u64,
-    /// Steps from one checkpoint to the next, beside --save-every.
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..),
-          help_heading = "Budget")]
-    pub save_every_steps: Option<u64>,
-    /// Longest time between two checkpoints, in minutes.
-    #[arg(long, value_name = "M", default_value_t = 10.0, help_heading = "Budget")]
-    pub save_every_minutes: f64,
 }
 
 impl Stage for Train {
@@ -183,7 +149,7 @@ fn check_numbers(params: &Params, config: &TrainConfig) -> anyhow::Result<()> {
     };
     positive("--learning-rate", d.learning_rate.peak)?;
     positive("--decoder-learning-rate", config.decoder.learning_rate.peak)?;
-    positive("--save-every-minutes", params.budget.save_every_minutes)?;
+    positive("--save-every-minutes", params.budget.saving.save_every_minutes)?;
     params.budget.minutes.map_or(Ok(()), |minutes| positive("--minutes", minutes))?;
     ensure!(
         d.augmentation.condition_noise >= 0.0 && d.augmentation.yaw_deg >= 0.0,
@@ -213,6 +179,13 @@ impl<'a> Run<'a> {
         })
     }
 
+    /// Reads the phrases that networks of a family learn from.
+    fn phrases(&self, family: Family, progress: &dyn Progress) -> anyhow::Result<TrainingPhrases> {
+        let Params { machine, dry_run, .. } = self.params;
+        let (store, watch) = (self.store, self.watch);
+        read_phrases(store, Train::NAME, (machine, family), None, progress, watch, *dry_run)
+    }
+
     /// Removes what the run has left, so that it can begin anew.
     fn clear(&mut self) -> anyhow::Result<()> {
         for stage in
@@ -236,16 +209,7 @@ impl<'a> Run<'a> {
         config: &TrainConfig,
         progress: &dyn Progress,
     ) -> anyhow::Result<Box<dyn Summary>> {
-        let machine = &self.params.machine;
-        let phrases = read_phrases(
-            self.store,
-            Train::NAME,
-            (machine, Family::Unet),
-            None,
-            progress,
-            self.watch,
-            true,
-        )?;
+        let phrases = self.phrases(Family::Unet, progress)?;
         let n_frames = config.network.window_frames;
         let windows = Windows::new(
             phrases.dataset,
@@ -271,16 +235,7 @@ impl<'a> Run<'a> {
         progress: &dyn Progress,
     ) -> anyhow::Result<Box<dyn Summary>> {
         let params = self.params;
-        let machine = &params.machine;
-        let phrases = read_phrases(
-            self.store,
-            Train::NAME,
-            (machine, Family::Unet),
-            None,
-            progress,
-            self.watch,
-            false,
-        )?;
+        let phrases = self.phrases(Family::Unet, progress)?;
         let threads = Arc::new(params.machine.start_threads()?);
         let n_frames = config.network.window_frames;
         let scales = scales(&phrases.dataset, n_frames, self.watch)?;
@@ -308,7 +263,7 @@ impl<'a> Run<'a> {
         claim(self.store, &params.run, Train::NAME, config, patience, self.watch)?;
         let end = self.stage(
             config,
-            self.steps_of_diffusion(config.diffusion.batch_size),
+            params.budget.of_denoiser(config.diffusion.batch_size),
             &mut learner,
             &augmented,
             &mut account,
@@ -338,7 +293,7 @@ impl<'a> Run<'a> {
         .on(&threads);
         let end = self.stage(
             config,
-            self.steps_of_decoder(config),
+            params.budget.of_decoder(config.decoder.batch_size),
             &mut learner,
             &augmented,
             &mut account,
@@ -363,7 +318,8 @@ impl<'a> Run<'a> {
         C: Clone + serde::Serialize + serde::de::DeserializeOwned,
     {
         let checkpoints = self.checkpoints(L::STAGE);
-        let plan = self.plan(steps, windows);
+        let patience = self.params.machine.patience();
+        let plan = self.params.budget.plan(steps, windows.n_train(), patience);
         let state = State::new(
             L::STAGE,
             config.clone(),
@@ -371,7 +327,6 @@ impl<'a> Run<'a> {
             windows.scales().clone(),
         );
         let state = restore(learner, &checkpoints, state, &self.params.run, self.watch)?;
-        let patience = self.params.machine.patience();
         let (run, dataset) = (&self.params.run, windows.dataset());
         remember(self.store, run, Train::NAME, dataset, patience, self.watch)?;
         let started_at = state.progress.step;
@@ -390,52 +345,6 @@ impl<'a> Run<'a> {
         account.add(StageSummary::of(L::STAGE, &drive.state.progress, started_at, end));
         Ok(end)
     }
-
-    /// Returns how long a denoiser is trained, which has the budget but for the decoder's share.
-    fn steps_of_diffusion(&self, batch_size: usize) -> StageBudget {
-        let b = &self.params.budget;
-        let is_bounded = b.steps.is_some() || b.minutes.is_some();
-        let n_epochs = b.epochs.or_else(|| (!is_bounded).then_some(100));
-        StageBudget { n_steps: b.steps, n_epochs, share: 1.0 - DECODER_SHARE, batch_size }
-    }
-
-    fn steps_of_decoder(&self, config: &TrainConfig) -> StageBudget {
-        StageBudget {
-            n_steps: Some(self.params.budget.decoder_steps),
-            n_epochs: None,
-            share: DECODER_SHARE,
-            batch_size: config.decoder.batch_size,
-        }
-    }
-
-    fn plan(&self, steps: StageBudget, windows: &Windows) -> Plan {
-        let b = &self.params.budget;
-        let minutes = |m: f64| Duration::try_from_secs_f64(m * 60.0).unwrap_or(Duration::MAX);
-        let StageBudget { n_steps, n_epochs, share, batch_size } = steps;
-        Plan {
-            n_steps,
-            n_epochs,
-            time: b.minutes.map(|m| minutes(share * m)),
-            windows_per_epoch: windows.n_train() as u64,
-            batch_size: batch_size as u64,
-            validate_first: false,
-            validate_every_epochs: b.validate_every,
-            save_every_epochs: b.save_every,
-            save_every_steps: b.save_every_steps,
-            save_every: minutes(b.save_every_minutes),
-            patience: (b.patience > 0).then_some(b.patience),
-            store_patience: self.params.machine.patience(),
-        }
-    }
-}
-
-/// How long a network is trained: by steps, epochs, or its share of the time.
-#[derive(Clone, Copy, Debug)]
-struct StageBudget {
-    n_steps: Option<u64>,
-    n_epochs: Option<u64>,
-    share: f64,
-    batch_size: usize,
 }
 
 /// Takes up the newest checkpoint that can be read, if there is one.

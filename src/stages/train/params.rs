@@ -6,6 +6,7 @@ use crate::diffusion::{BetaSchedule, DiffusionConfig, LossType, Prediction};
 use crate::model::{DecoderConfig, Family, GroupConfig, Preset, UNetConfig};
 use crate::motion::ChannelLimits;
 use crate::motion::style::STYLE_DIM;
+use crate::stages::RARE;
 use crate::training::{
     Augmentation, ChannelWeights, DecoderTraining, DiffusionTraining, EmaConfig, EstimateLosses,
     GroupLosses, GroupNetworkConfig, GroupTrainConfig, GroupTraining, LearningRate,
@@ -23,63 +24,68 @@ pub struct NetworkParams {
     #[arg(long, value_enum, default_value_t = Preset::Small, help_heading = "Networks")]
     pub preset: Preset,
     /// Channels of each level, 256,512,… [default: the preset's]
-    #[arg(long, value_name = "N", value_delimiter = ',', help_heading = "Networks")]
+    #[arg(long, value_name = "N", value_delimiter = ',', help_heading = "Networks",
+          hide_short_help = RARE)]
     pub widths: Vec<usize>,
     /// Residual blocks of a level [default: 2]
-    #[arg(long, value_name = "N", help_heading = "Networks")]
+    #[arg(long, value_name = "N", help_heading = "Networks", hide_short_help = RARE)]
     pub num_res_blocks: Option<usize>,
     /// Levels that attend [default: all but the first]
-    #[arg(long, value_name = "LEVEL", value_delimiter = ',', help_heading = "Networks")]
+    #[arg(long, value_name = "LEVEL", value_delimiter = ',', help_heading = "Networks",
+          hide_short_help = RARE)]
     pub attention_levels: Option<Vec<usize>>,
     /// Heads of attention [default: the preset's]
-    #[arg(long, value_name = "N", help_heading = "Networks")]
+    #[arg(long, value_name = "N", help_heading = "Networks", hide_short_help = RARE)]
     pub num_heads: Option<usize>,
     /// Channels of a head, instead of --num-heads
-    #[arg(long, value_name = "N", help_heading = "Networks")]
+    #[arg(long, value_name = "N", help_heading = "Networks", hide_short_help = RARE)]
     pub num_head_channels: Option<usize>,
     /// Numbers of the time embedding [default: the preset's]
-    #[arg(long, value_name = "N", help_heading = "Networks")]
+    #[arg(long, value_name = "N", help_heading = "Networks", hide_short_help = RARE)]
     pub time_embed_dim: Option<usize>,
     /// Channels of the music as attention sees it [default: the preset's]
-    #[arg(long, value_name = "N", help_heading = "Networks")]
+    #[arg(long, value_name = "N", help_heading = "Networks", hide_short_help = RARE)]
     pub context_dim: Option<usize>,
     /// Share of the UNet's numbers that training drops [default: 0.1]
-    #[arg(long, value_name = "P", help_heading = "Networks")]
+    #[arg(long, value_name = "P", help_heading = "Networks", hide_short_help = RARE)]
     pub dropout: Option<f64>,
     /// Compute inner values of the UNet again for their gradient: less memory, a third more time.
-    #[arg(long, help_heading = "Networks")]
+    #[arg(long, help_heading = "Networks", hide_short_help = RARE)]
     pub use_checkpoint: bool,
     /// Let the music in by attention alone, as the reference draws it; such a network cannot tell when a
     /// beat falls.
-    #[arg(long, help_heading = "Networks")]
+    #[arg(long, help_heading = "Networks", hide_short_help = RARE)]
     pub attention_only: bool,
     /// Let the UNet hear the features alone, as the reference does, without the clock: where in its bar and how
     /// fast the music is.
-    #[arg(long, help_heading = "Networks")]
+    #[arg(long, help_heading = "Networks", hide_short_help = RARE)]
     pub no_clock: bool,
     /// Let the UNet take a style (the mean of the style channels) beside the music.
-    #[arg(long, help_heading = "Networks")]
+    #[arg(long, help_heading = "Networks", hide_short_help = RARE)]
     pub style: bool,
     /// Width of the decoder.
     #[arg(long, value_name = "N", default_value_t = DecoderConfig::default().hidden_dim,
-          help_heading = "Networks")]
+          help_heading = "Networks", hide_short_help = RARE)]
     pub decoder_hidden_dim: usize,
     /// Blocks of the decoder.
     #[arg(long, value_name = "N", default_value_t = DecoderConfig::default().n_blocks,
-          help_heading = "Networks")]
+          help_heading = "Networks", hide_short_help = RARE)]
     pub decoder_blocks: usize,
     /// Width of a decoder block's inner layer, in units of --decoder-hidden-dim.
     #[arg(long, value_name = "N", default_value_t = DecoderConfig::default().expansion,
-          help_heading = "Networks")]
+          help_heading = "Networks", hide_short_help = RARE)]
     pub decoder_expansion: usize,
     /// Share of the decoder's numbers that training drops.
-    #[arg(long, value_name = "P", default_value_t = 0.0, help_heading = "Networks")]
+    #[arg(long, value_name = "P", default_value_t = 0.0, help_heading = "Networks",
+          hide_short_help = RARE)]
     pub decoder_dropout: f64,
     /// Limits within which the decoder keeps velocities and accelerations.
-    #[arg(long, value_enum, default_value_t = ChannelLimits::Wide, help_heading = "Networks")]
+    #[arg(long, value_enum, default_value_t = ChannelLimits::Wide, help_heading = "Networks",
+          hide_short_help = RARE)]
     pub limits: ChannelLimits,
     /// Frames of a window, 30 a second.
-    #[arg(long, value_name = "N", default_value_t = 120, help_heading = "Networks")]
+    #[arg(long, value_name = "N", default_value_t = 120, help_heading = "Networks",
+          hide_short_help = RARE)]
     pub window_frames: usize,
 }
 
@@ -88,65 +94,72 @@ pub struct NetworkParams {
 pub struct DiffusionParams {
     /// Steps of the diffusion.
     #[arg(long, value_name = "N", default_value_t = DiffusionConfig::default().n_steps,
-          help_heading = "Diffusion")]
+          help_heading = "Diffusion", hide_short_help = RARE)]
     pub timesteps: usize,
     /// How noise grows from step to step.
     #[arg(long, value_enum, default_value_t = DiffusionConfig::default().beta_schedule,
-          help_heading = "Diffusion")]
+          help_heading = "Diffusion", hide_short_help = RARE)]
     pub beta_schedule: BetaSchedule,
     /// First noise of a linear or sqrt schedule.
     #[arg(long, value_name = "X", default_value_t = DiffusionConfig::default().beta_start,
-          help_heading = "Diffusion")]
+          help_heading = "Diffusion", hide_short_help = RARE)]
     pub beta_start: f64,
     /// Last noise of a linear or sqrt schedule.
     #[arg(long, value_name = "X", default_value_t = DiffusionConfig::default().beta_end,
-          help_heading = "Diffusion")]
+          help_heading = "Diffusion", hide_short_help = RARE)]
     pub beta_end: f64,
     /// What the UNet predicts. From a prediction of noise clean motion follows by a division by nearly 0
     /// at the noisiest steps, which samplers of few steps do not survive.
-    #[arg(long, value_enum, default_value_t = Prediction::Sample, help_heading = "Diffusion")]
+    #[arg(long, value_enum, default_value_t = Prediction::Sample, help_heading = "Diffusion",
+          hide_short_help = RARE)]
     pub prediction: Prediction,
     /// Estimates of clean motion are kept within so many standard deviations; 0 for no limit.
-    #[arg(long, value_name = "X", default_value_t = 5.0, help_heading = "Diffusion")]
+    #[arg(long, value_name = "X", default_value_t = 5.0, help_heading = "Diffusion",
+          hide_short_help = RARE)]
     pub clip_range: f64,
     /// What is made small.
-    #[arg(long, value_enum, default_value_t = LossType::Mse, help_heading = "Diffusion")]
+    #[arg(long, value_enum, default_value_t = LossType::Mse, help_heading = "Diffusion",
+          hide_short_help = RARE)]
     pub loss: LossType,
     /// Where Huber's loss turns from squared to linear.
     #[arg(long, value_name = "X", default_value_t = Objective::default().huber_delta,
-          help_heading = "Diffusion")]
+          help_heading = "Diffusion", hide_short_help = RARE)]
     pub huber_delta: f64,
     /// Weigh steps by min-SNR with this γ (5 is usual) [default: all steps alike]
-    #[arg(long, value_name = "GAMMA", help_heading = "Diffusion")]
+    #[arg(long, value_name = "GAMMA", help_heading = "Diffusion", hide_short_help = RARE)]
     pub min_snr_gamma: Option<f64>,
     /// Weight of each style channel; all others but the vertical ones have 1.
     #[arg(long, value_name = "X", default_value_t = ChannelWeights::default().style,
-          help_heading = "Diffusion")]
+          help_heading = "Diffusion", hide_short_help = RARE)]
     pub style_weight: f64,
     /// Weight of vertical position, velocity and acceleration.
     #[arg(long, value_name = "X", default_value_t = ChannelWeights::default().vertical,
-          help_heading = "Diffusion")]
+          help_heading = "Diffusion", hide_short_help = RARE)]
     pub vertical_weight: f64,
     /// Weight of velocities against differences of positions, of the estimate of clean motion.
     #[arg(long, value_name = "X", default_value_t = EstimateLosses::default().velocity,
-          help_heading = "Diffusion")]
+          help_heading = "Diffusion", hide_short_help = RARE)]
     pub velocity_loss: f64,
     /// Weight of accelerations against differences of velocities.
     #[arg(long, value_name = "X", default_value_t = EstimateLosses::default().acceleration,
-          help_heading = "Diffusion")]
+          help_heading = "Diffusion", hide_short_help = RARE)]
     pub acceleration_loss: f64,
     /// Weights of the first, second and third differences of poses against the truth's.
     #[arg(long, value_name = "X,X,X", value_delimiter = ',', num_args = 1..,
-          default_values_t = EstimateLosses::default().differences, help_heading = "Diffusion")]
+          default_values_t = EstimateLosses::default().differences, help_heading = "Diffusion",
+          hide_short_help = RARE)]
     pub difference_losses: Vec<f64>,
     /// Probability that a window goes without its music, for guidance.
-    #[arg(long, value_name = "P", default_value_t = 0.1, help_heading = "Diffusion")]
+    #[arg(long, value_name = "P", default_value_t = 0.1, help_heading = "Diffusion",
+          hide_short_help = RARE)]
     pub condition_dropout: f64,
     /// Probability that a window goes without its clock alone, so that the network hears as well.
-    #[arg(long, value_name = "P", default_value_t = 0.1, help_heading = "Diffusion")]
+    #[arg(long, value_name = "P", default_value_t = 0.1, help_heading = "Diffusion",
+          hide_short_help = RARE)]
     pub clock_dropout: f64,
     /// Probability that a window goes without its style, with --style.
-    #[arg(long, value_name = "P", default_value_t = 0.1, help_heading = "Diffusion")]
+    #[arg(long, value_name = "P", default_value_t = 0.1, help_heading = "Diffusion",
+          hide_short_help = RARE)]
     pub style_dropout: f64,
 }
 
@@ -155,15 +168,15 @@ pub struct DiffusionParams {
 pub struct GroupParams {
     /// Weight of points fixed to each body, in 1/m².
     #[arg(long, value_name = "X", default_value_t = GroupLosses::default().markers,
-          help_heading = "Groups")]
+          help_heading = "Groups", hide_short_help = RARE)]
     pub markers_loss: f64,
     /// Weight of telling a group from mixed ones, by which --consistency works.
     #[arg(long, value_name = "X", default_value_t = GroupLosses::default().contrast,
-          help_heading = "Groups")]
+          help_heading = "Groups", hide_short_help = RARE)]
     pub contrast_loss: f64,
     /// Mixed groups beside each group.
     #[arg(long, value_name = "N", default_value_t = GroupLosses::default().n_negatives,
-          help_heading = "Groups")]
+          help_heading = "Groups", hide_short_help = RARE)]
     pub negatives: usize,
 }
 
@@ -172,18 +185,18 @@ pub struct GroupParams {
 pub struct AugmentationParams {
     /// Standard deviation of the noise added to features.
     #[arg(long, value_name = "X", default_value_t = Augmentation::default().condition_noise,
-          help_heading = "Augmentation")]
+          help_heading = "Augmentation", hide_short_help = RARE)]
     pub condition_noise: f64,
     /// Do not mirror windows in x.
-    #[arg(long, help_heading = "Augmentation")]
+    #[arg(long, help_heading = "Augmentation", hide_short_help = RARE)]
     pub no_mirror: bool,
     /// Turn windows about the vertical by up to so many degrees.
     #[arg(long, value_name = "DEG", default_value_t = Augmentation::default().yaw_deg,
-          help_heading = "Augmentation")]
+          help_heading = "Augmentation", hide_short_help = RARE)]
     pub yaw_rotation: f64,
     /// Change the speed of windows, music and motion, by up to this share.
     #[arg(long, value_name = "X", default_value_t = Augmentation::default().stretch,
-          help_heading = "Augmentation")]
+          help_heading = "Augmentation", hide_short_help = RARE)]
     pub time_stretch: f64,
 }
 
@@ -195,43 +208,49 @@ pub struct OptimizerParams {
           help_heading = "Optimizer")]
     pub batch_size: NonZeroUsize,
     /// Parts of a batch done one after the other, to save memory.
-    #[arg(long, value_name = "N", default_value_t = NonZeroUsize::MIN, help_heading = "Optimizer")]
+    #[arg(long, value_name = "N", default_value_t = NonZeroUsize::MIN, help_heading = "Optimizer",
+          hide_short_help = RARE)]
     pub accumulate: NonZeroUsize,
     /// Parts of a batch done at once, each by its share of the threads: twice as fast for a small network,
     /// whose operations are too short to be shared out; one more gradient in memory each [default: 1; 2
     /// for tiny and small]
-    #[arg(long, value_name = "N", help_heading = "Optimizer")]
+    #[arg(long, value_name = "N", help_heading = "Optimizer", hide_short_help = RARE)]
     pub side_by_side: Option<NonZeroUsize>,
     /// Highest learning rate of the UNet [default: 1e-4; 5e-4 for tiny and small]
-    #[arg(long, value_name = "X", help_heading = "Optimizer")]
+    #[arg(long, value_name = "X", help_heading = "Optimizer", hide_short_help = RARE)]
     pub learning_rate: Option<f64>,
     /// Course of the learning rate after the warm-up.
-    #[arg(long, value_enum, default_value_t = LearningRateSchedule::Cosine, help_heading = "Optimizer")]
+    #[arg(long, value_enum, default_value_t = LearningRateSchedule::Cosine,
+          help_heading = "Optimizer", hide_short_help = RARE)]
     pub lr_schedule: LearningRateSchedule,
     /// Steps of the warm-up; in a short training a tenth of all.
-    #[arg(long, value_name = "N", default_value_t = 1000, help_heading = "Optimizer")]
+    #[arg(long, value_name = "N", default_value_t = 1000, help_heading = "Optimizer",
+          hide_short_help = RARE)]
     pub warmup_steps: u64,
     /// Decay of weights.
     #[arg(long, value_name = "X", default_value_t = OptimizerConfig::default().weight_decay,
-          help_heading = "Optimizer")]
+          help_heading = "Optimizer", hide_short_help = RARE)]
     pub weight_decay: f64,
     /// Largest norm of the gradient; 0 for no limit.
-    #[arg(long, value_name = "X", default_value_t = 1.0, help_heading = "Optimizer")]
+    #[arg(long, value_name = "X", default_value_t = 1.0, help_heading = "Optimizer",
+          hide_short_help = RARE)]
     pub gradient_clip: f64,
     /// Decay of the average of the weights.
     #[arg(long, value_name = "X", default_value_t = EmaConfig::default().decay,
-          help_heading = "Optimizer")]
+          help_heading = "Optimizer", hide_short_help = RARE)]
     pub ema_decay: f64,
     /// Steps between two updates of the average.
     #[arg(long, value_name = "N", default_value_t = EmaConfig::default().every,
-          value_parser = clap::value_parser!(u64).range(1..), help_heading = "Optimizer")]
+          value_parser = clap::value_parser!(u64).range(1..), help_heading = "Optimizer",
+          hide_short_help = RARE)]
     pub ema_update_every: u64,
     /// Windows of a step of the decoder.
     #[arg(long, value_name = "N", default_value_t = NonZeroUsize::new(8).expect("not 0"),
-          help_heading = "Optimizer")]
+          help_heading = "Optimizer", hide_short_help = RARE)]
     pub decoder_batch_size: NonZeroUsize,
     /// Highest learning rate of the decoder.
-    #[arg(long, value_name = "X", default_value_t = 1e-3, help_heading = "Optimizer")]
+    #[arg(long, value_name = "X", default_value_t = 1e-3, help_heading = "Optimizer",
+          hide_short_help = RARE)]
     pub decoder_learning_rate: f64,
 }
 
@@ -240,23 +259,28 @@ pub struct OptimizerParams {
 pub struct AdvancedParams {
     /// Decays of AdamW's averages of the gradient and its square.
     #[arg(long, value_name = "X", num_args = 2, value_delimiter = ',',
-          default_values_t = OptimizerConfig::default().betas, help_heading = "Optimizer")]
+          default_values_t = OptimizerConfig::default().betas, help_heading = "Optimizer",
+          hide_short_help = RARE)]
     pub betas: Vec<f64>,
     /// What AdamW adds to the root of the average square.
     #[arg(long, value_name = "X", default_value_t = OptimizerConfig::default().epsilon,
-          help_heading = "Optimizer")]
+          help_heading = "Optimizer", hide_short_help = RARE)]
     pub epsilon: f64,
     /// Latents for the decoder are made noisy up to this share of the diffusion's steps.
-    #[arg(long, value_name = "SHARE", default_value_t = 0.05, help_heading = "Decoder")]
+    #[arg(long, value_name = "SHARE", default_value_t = 0.05, help_heading = "Decoder",
+          hide_short_help = RARE)]
     pub decoder_noised_to: f64,
     /// Of so many batches one has latents that the UNet sampled; 0 for none.
-    #[arg(long, value_name = "N", default_value_t = 4, help_heading = "Decoder")]
+    #[arg(long, value_name = "N", default_value_t = 4, help_heading = "Decoder",
+          hide_short_help = RARE)]
     pub decoder_sampled_every: u64,
     /// They are sampled from up to this share of the diffusion's steps.
-    #[arg(long, value_name = "SHARE", default_value_t = 0.5, help_heading = "Decoder")]
+    #[arg(long, value_name = "SHARE", default_value_t = 0.5, help_heading = "Decoder",
+          hide_short_help = RARE)]
     pub decoder_sampled_from: f64,
     /// In so many steps of DDIM.
-    #[arg(long, value_name = "N", default_value_t = 5, help_heading = "Decoder")]
+    #[arg(long, value_name = "N", default_value_t = 5, help_heading = "Decoder",
+          hide_short_help = RARE)]
     pub decoder_sampler_steps: usize,
 }
 

@@ -12,7 +12,8 @@ use serde::de::DeserializeOwned;
 use crate::autodiff::Threads;
 use crate::model::Family;
 use crate::motion::group::MAX_DANCERS;
-use crate::stages::{Progress, all_threads, lease};
+use crate::stages::model_folder::is_model_name;
+use crate::stages::{Progress, RARE, all_threads, lease};
 use crate::store::tables::FailureRow;
 use crate::store::{
     Commit, Item, Lease, Ledger, Location, Patience, PutOutcome, Row as _, StoreError, TimestampUs,
@@ -22,9 +23,6 @@ use crate::training::{
     Dataset, DatasetOptions, Ensemble, ExcludedPhrase, Scales, TrainingError, Watch, differences,
     fit_scales,
 };
-
-/// Longest name of a run.
-const MAX_NAME: usize = 100;
 
 /// Where failures of phrases come from.
 const ITEMS_FROM: &str = "phrases";
@@ -36,16 +34,19 @@ pub struct MachineParams {
     #[arg(long, value_name = "N", default_value_t = all_threads(), help_heading = "Machine")]
     pub threads: NonZeroUsize,
     /// Threads that make batches ahead of time; the batches are the same for any number.
-    #[arg(long, value_name = "N", default_value_t = NonZeroUsize::MIN, help_heading = "Machine")]
+    #[arg(long, value_name = "N", default_value_t = NonZeroUsize::MIN, help_heading = "Machine",
+          hide_short_help = RARE)]
     pub loader_threads: NonZeroUsize,
     /// Keep all frames in memory rather than in a temporary file (see TMPDIR).
-    #[arg(long, help_heading = "Machine")]
+    #[arg(long, help_heading = "Machine", hide_short_help = RARE)]
     pub in_memory: bool,
     /// Seconds that a store which does not answer is waited for.
-    #[arg(long, value_name = "S", default_value_t = 600.0, help_heading = "Machine")]
+    #[arg(long, value_name = "S", default_value_t = 600.0, help_heading = "Machine",
+          hide_short_help = RARE)]
     pub store_patience: f64,
     /// Share of the phrases that may be unfit to learn from; training refuses to start beyond.
-    #[arg(long, value_name = "SHARE", default_value_t = 0.05, help_heading = "Machine")]
+    #[arg(long, value_name = "SHARE", default_value_t = 0.05, help_heading = "Machine",
+          hide_short_help = RARE)]
     pub max_failed: f64,
 }
 
@@ -67,13 +68,9 @@ impl MachineParams {
 
 /// Refuses a name that could not be a folder everywhere.
 pub fn check_run_name(run: &str) -> anyhow::Result<()> {
-    let is_plain = |c: char| c.is_ascii_alphanumeric() || ['-', '_', '.'].contains(&c);
     ensure!(
-        !run.is_empty()
-            && run.len() <= MAX_NAME
-            && run.chars().all(is_plain)
-            && !run.starts_with('.'),
-        "--run {run:?} is no name for a run; use 1 to {MAX_NAME} letters, digits, -, _ and ., and no . \
+        is_model_name(run),
+        "--run {run:?} is no name for a run; use 1 to 100 letters, digits, -, _ and ., and no . \
          at the beginning"
     );
     Ok(())

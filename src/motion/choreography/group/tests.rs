@@ -3,12 +3,10 @@
 use ndarray::Array2;
 
 use super::super::choreograph;
-use super::super::tests::{Music, SONGS, column, repertoire};
+use super::super::tests::{Music, SONGS, check_identities, column, repertoire};
 use super::*;
 use crate::motion::group::RADIUS_M;
 use crate::motion::locking::bar_locking;
-use crate::motion::quaternion::{angular_velocity, normalize};
-use crate::motion::trajectory::{ChannelLimits, Trajectory};
 use crate::units::FPS;
 
 fn rules(n_dancers: usize, seed: u64) -> GroupRules {
@@ -200,28 +198,7 @@ fn every_frame_of_every_dancer_obeys_the_identities() {
     for (tempo_bpm, beats_per_bar) in SONGS {
         let music = Music::new(tempo_bpm, beats_per_bar, 60.0);
         let dance = choreograph_group(&music.song(), &repertoire, &rules(5, 8));
-        let phase = bar_phase(&music.times_s, &music.beats);
-        for k in 0..5 {
-            let frames = dancer(&dance, k);
-            Trajectory::new(frames.clone()).unwrap().check(&ChannelLimits::Wide).unwrap();
-            let x = frames.mapv(f64::from);
-            for t in 0..x.nrows() - 1 {
-                for i in 0..6 {
-                    let derived = (x[[t + 1, i]] - x[[t, i]]) * FPS;
-                    let size = (x[[t, i]].abs() + x[[t + 1, i]].abs()) * FPS + derived.abs();
-                    // Three roundings to f32, two of them times 30.
-                    let tolerance = f64::from(f32::EPSILON) * size + 1e-9;
-                    assert!((x[[t, i + 3]] - derived).abs() <= tolerance, "{i} at {t}");
-                }
-                let q = |t: usize| normalize(std::array::from_fn(|c| x[[t, 9 + c]]));
-                let omega = angular_velocity(q(t), q(t + 1), FPS);
-                for axis in 0..3 {
-                    // Rounding of quaternions (3e-8 each) times 2 · 30.
-                    assert!((x[[t, 13 + axis]] - omega[axis]).abs() < 2e-5, "{axis} at {t}");
-                }
-            }
-            assert!(phase.iter().zip(frames.column(16)).all(|(p, &x)| *p as f32 == x));
-        }
+        (0..5).for_each(|k| check_identities(&dancer(&dance, k), &music));
     }
 }
 

@@ -172,7 +172,7 @@ fn errors_shrink_as_theory_says() {
     let n = 201;
     let poses = truth(n);
     let mut measured = exact(&poses);
-    let mut noise = Noise(8);
+    let mut noise = Noise::new(8);
     let mut mean = [0.0; 3];
     for p in &mut measured.position {
         let error = noise.vector(&variances.position_m2);
@@ -392,7 +392,7 @@ fn filters_with_a_long_memory_are_as_smooth_as_the_solution() {
     let variances = FusionVariances { position_m2: start.position_m2.times(128.0), ..start };
     let filters = FusionFilters::new(&variances);
     let n = 120;
-    let mut noise = Noise(5);
+    let mut noise = Noise::new(5);
     let still = vec![[0.0; 3]; n];
     let velocity: Vec<[f64; 3]> =
         (0..n).map(|_| std::array::from_fn(|_| 0.2 * noise.normal())).collect();

@@ -10,7 +10,7 @@ use crate::motion::quaternion::from_axis_angle;
 #[test]
 fn turns_about_one_axis_are_fused_as_numbers_are() {
     let n = 80;
-    let mut noise = Noise(41);
+    let mut noise = Noise::new(41);
     let angles: Vec<f64> = (0..n).map(|t| 0.7 * t as f64 + 0.3 * noise.normal()).collect();
     let rates: Vec<f64> = (0..n).map(|_| FPS * (0.7 + 0.1 * noise.normal())).collect();
     let variances = FusionVariances {

@@ -1,0 +1,144 @@
+//! What operations over the frames of a motion are in ONNX.
+
+use ndarray::Array2;
+
+use super::builder::{Axes, Builder, Form, Value, expect};
+use super::literals::{integer, integers, word};
+use super::proto::DataType;
+use crate::model::{GraphError, Mirror, Result};
+
+/// Repeats the last frame until the number of frames is a multiple.
+pub(super) fn hold(g: &mut Builder<'_>, x: Value, multiple: usize) -> Result<Value> {
+    g.begin("hold_frames", None);
+    expect("hold_frames", x, Axes::Frames)?;
+    if multiple == 1 {
+        return Ok(x);
+    }
+    let frames = g.n_frames(x)?;
+    let missing = g.n_missing(&frames, multiple);
+    let name = g.last(x)?;
+    let (none, axes) = (g.integers(&[0]), g.integers(&[1]));
+    let pads = g.node("Concat", &[&none, &missing], vec![integer("axis", 0)]);
+    let y = g.node("Pad", &[&name, &pads, "", &axes], vec![word("mode", "edge")]);
+    Ok(g.new_last(Axes::Frames, x.channels, y))
+}
+
+/// Takes frame t + `shift` as frame t, held within what is there, `spare` frames from the end.
+pub(super) fn shift(g: &mut Builder<'_>, x: Value, shift: isize, spare: usize) -> Result<Value> {
+    g.begin("shift_frames", None);
+    expect("shift_frames", x, Axes::Frames)?;
+    let frames = g.n_frames(x)?;
+    let places = g.places(&frames);
+    let [shift, spare, zero] = [shift as i64, spare as i64 + 1, 0].map(|n| g.integers(&[n]));
+    let last = g.node("Sub", &[&frames, &spare], vec![]);
+    let last = g.node("Max", &[&last, &zero], vec![]);
+    let places = g.node("Add", &[&places, &shift], vec![]);
+    let places = g.node("Max", &[&places, &zero], vec![]);
+    let places = g.node("Min", &[&places, &last], vec![]);
+    let axis = if g.has_last(x) { 1 } else { g.frames_axis() };
+    g.map(x, x.channels, |g, x| g.node("Gather", &[x, &places], vec![integer("axis", axis)]))
+}
+
+/// Puts the frames of `first` and `last` in the place of the first and the last frame.
+pub(super) fn replace_ends(
+    g: &mut Builder<'_>,
+    x: Value,
+    first: Value,
+    last: Value,
+) -> Result<Value> {
+    g.begin("replace_ends", None);
+    let frames = g.n_frames(x)?;
+    let places = g.places(&frames);
+    let [zero, one] = [0, 1].map(|n| g.integers(&[n]));
+    let end = g.node("Sub", &[&frames, &one], vec![]);
+    let is_first = g.node("Equal", &[&places, &zero], vec![]);
+    let is_last = g.node("Equal", &[&places, &end], vec![]);
+    // Frames are the last axis in either form.
+    let [x_name, first, last] = [
+        g.first("replace_ends", x)?,
+        g.first("replace_ends", first)?,
+        g.first("replace_ends", last)?,
+    ];
+    let y = g.node("Where", &[&is_first, &first, &x_name], vec![]);
+    let y = g.node("Where", &[&is_last, &last, &y], vec![]);
+    Ok(g.new_first(x.channels, y))
+}
+
+/// Filters every channel by its own kernel, \[channels, taps\], mirrored at the ends.
+pub(super) fn filter(
+    g: &mut Builder<'_>,
+    x: Value,
+    kernel: &Array2<f64>,
+    mirror: Mirror,
+) -> Result<Value> {
+    g.begin("filter_frames", None);
+    let (channels, taps) = kernel.dim();
+    if x.channels != channels || taps % 2 == 0 {
+        let problem = format!(
+            "input has {} channels, the filter has {channels} with {taps} taps, of which an odd number is asked",
+            x.channels
+        );
+        return Err(GraphError::shape("filter_frames", problem));
+    }
+    let name = g.first("filter_frames", x)?;
+    let frames = g.n_frames(x)?;
+    let name = g.mirrored(&name, &frames, (taps / 2) as i64, mirror);
+    let numbers: Vec<f32> = kernel.iter().map(|&h| h as f32).collect();
+    let (dims, shape) = match g.form {
+        Form::Line => (vec![channels, 1, taps], vec![taps as i64]),
+        Form::Image => (vec![channels, 1, 1, taps], vec![1, taps as i64]),
+    };
+    let kernel = g.table(&dims, &numbers);
+    let attributes = vec![integers("kernel_shape", &shape), integer("group", channels as i64)];
+    let y = g.node("Conv", &[&name, &kernel], attributes);
+    Ok(g.new_first(channels, y))
+}
+
+/// Returns which frames count once they are held to a multiple, \[batch, frames\] or \[1, frames\].
+pub(super) fn mask(
+    g: &mut Builder<'_>,
+    x: Value,
+    mask: Option<Value>,
+    multiple: usize,
+) -> Result<Value> {
+    g.begin("frame_mask", None);
+    let frames = g.n_frames(x)?;
+    let missing = g.n_missing(&frames, multiple);
+    let y = match mask {
+        Some(mask) => {
+            let mask = g.last(mask)?;
+            let (none, axes) = (g.integers(&[0]), g.integers(&[1]));
+            let pads = g.node("Concat", &[&none, &missing], vec![integer("axis", 0)]);
+            g.node("Pad", &[&mask, &pads, "", &axes], vec![word("mode", "constant")])
+        }
+        None => {
+            let held = g.node("Add", &[&frames, &missing], vec![]);
+            let places = g.places(&held);
+            let counts = g.node("Less", &[&places, &frames], vec![]);
+            let counts = g.cast(&counts, DataType::Float);
+            let axes = g.integers(&[0]);
+            g.node("Unsqueeze", &[&counts, &axes], vec![])
+        }
+    };
+    Ok(g.new_last(Axes::Mask, 0, y))
+}
+
+/// Joins frames in time; samples count as one frame.
+pub(super) fn concat(g: &mut Builder<'_>, parts: &[&Value]) -> Result<Value> {
+    g.begin("concat_frames", None);
+    let Some(&&one) = parts.first() else {
+        return Err(GraphError::shape("concat_frames", "there is nothing to join"));
+    };
+    let axes = g.integers(&[1]);
+    let mut names = Vec::with_capacity(parts.len());
+    for part in parts {
+        let name = g.last(**part)?;
+        names.push(match part.axes {
+            Axes::Samples => g.node("Unsqueeze", &[&name, &axes], vec![]),
+            _ => name,
+        });
+    }
+    let names: Vec<&str> = names.iter().map(String::as_str).collect();
+    let y = g.node("Concat", &names, vec![integer("axis", 1)]);
+    Ok(g.new_last(Axes::Frames, one.channels, y))
+}
