@@ -16,6 +16,7 @@ use crate::audio::Tuning;
 use crate::store::{Location, Shard, digest};
 
 pub use one::{ExtractRules, ExtractedFeatures};
+pub(in crate::stages) use phrases::survey;
 pub(in crate::stages) use one::{Origin, extract, needed_bytes};
 
 /// Raised when extract writes something else for the same input and parameters.

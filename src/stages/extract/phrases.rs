@@ -10,11 +10,12 @@ use std::sync::Mutex;
 
 use super::one::{ExtractedFeatures, Origin, extract, needed_bytes};
 use super::pool::{self, Budget, lock};
-use super::{Extract, ExtractJob, ExtractTally};
+use super::{Extract, ExtractJob, ExtractTally, params_hash};
 use crate::stages::Stage as _;
 use crate::stages::beats::{self, BeatSource};
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::ingest::content_hash_of_audio;
+use crate::stages::item_state::{ItemState, last_params_hash};
 use crate::store::tables::{self, BeatRow, ExtractionRow, FailureRow, PhraseRow};
 use crate::store::{
     ClientOptions, Commit, Content, Item, Ledger, Location, OrderedContents, Row as _, Shard,
@@ -94,7 +95,7 @@ pub fn run(job: &ExtractJob<'_>, target: &StoreTarget<'_>) -> anyhow::Result<Ext
         ExtractTally { n_without: n_phrases - tasks.len() as u64, ..ExtractTally::default() };
     tasks.retain(|task| target.shard.takes(&task.row.phrase_id));
     let n_mine = tasks.len();
-    tasks.retain(|task| target.force || !is_settled(task, &ledger, target.params_hash));
+    tasks.retain(|task| target.force || !state(task, &ledger, target.params_hash).is_done());
     done.n_unchanged = (n_mine - tasks.len()) as u64;
     done.n_todo = tasks.len() as u64;
     // An empty sum of f64 is -0.
@@ -167,17 +168,37 @@ fn plan(rows: Vec<PhraseRow>, listed: &BTreeSet<String>) -> Vec<PhraseTask> {
     tasks
 }
 
-/// Returns whether the store has the phrase's features for this content and these parameters.
-fn is_settled(task: &PhraseTask, ledger: &Ledger, params_hash: &str) -> bool {
+/// Returns what the store has of the phrase's features for this content and these parameters.
+fn state(task: &PhraseTask, ledger: &Ledger, params_hash: &str) -> ItemState {
     let id = &task.row.phrase_id;
-    let is_refused = ledger.get(&beside(id)).is_some_and(|known| known.item.failure.is_some());
-    !is_refused
-        && ledger.get(id).is_some_and(|known| {
-            known.params_hash == params_hash
-                && known.item.succeeded()
-                && known.item.input_hash == task.row.content_hash
-                && known.item.fingerprint == task.fingerprint()
-        })
+    if ledger.get(&beside(id)).is_some_and(|known| known.item.failure.is_some()) {
+        return ItemState::Failed;
+    }
+    ItemState::of(ledger.get(id), |known| {
+        known.params_hash == params_hash
+            && known.item.input_hash == task.row.content_hash
+            && known.item.fingerprint == task.fingerprint()
+    })
+}
+
+/// Returns every phrase that can have features with what the store has of them, by the parameters of the last run, and
+/// whether those are the ones without `--tuning`.
+///
+/// # Errors
+/// [`StoreError`] when the store cannot be read.
+pub fn survey(snapshot: &StoreSnapshot) -> Result<(Vec<(String, ItemState)>, bool), StoreError> {
+    let rows: Vec<PhraseRow> = snapshot.table(PhraseRow::schema())?.rows()?;
+    let ledger = snapshot.ledger(Extract::NAME)?;
+    let usual = params_hash(None);
+    let params_hash =
+        last_params_hash(&ledger, &usual, |_| true).unwrap_or_else(|| usual.clone());
+    let listed = with_listed_beats(snapshot, &rows)?;
+    let tasks = plan(rows, &listed);
+    let states = tasks.iter().map(|task| {
+        let state = state(task, &ledger, &params_hash);
+        (task.row.phrase_id.clone(), state)
+    });
+    Ok((states.collect(), params_hash == usual))
 }
 
 /// Returns whether a file with this digest can be the one that ingest saw.

@@ -4,6 +4,7 @@ mod group;
 mod params;
 pub mod session;
 mod summary;
+pub(in crate::stages) mod survey;
 
 use std::sync::Arc;
 use std::time::Duration;
