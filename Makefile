@@ -54,6 +54,18 @@ pretrained: build setup ## train the model that ships with the program again (mo
 ingest: build ## ingest your own files: make ingest SOURCE=… STORE=… [SHARDS=8 -j4]
 	@$(MAKE) --file pipelines/ingest.mk BIN=$(BIN)
 
+.PHONY: cluster
+cluster: ## submit all stages to Slurm as a chain: make cluster SOURCE=… STORE=… RUN=… [SHARDS=16 AGAIN=1 DRY_RUN=1] (docs/cluster.md)
+	@MOTIONGEN="$${MOTIONGEN:-$(BIN)/motiongen}" pipelines/slurm/submit.sh
+
+.PHONY: cluster-demo
+cluster-demo: build build-diff-tables ## start a Slurm of two nodes here, kill one under ingest, extract and generate, and compare the tables
+	@$(PYTHON) pipelines/slurm/demo.py --bin $(BIN)
+
+.PHONY: check-kubernetes
+check-kubernetes: build/kubernetes-venv/ready ## hold the manifests of pipelines/kubernetes against the API's schema
+	@build/kubernetes-venv/bin/python pipelines/kubernetes/check.py
+
 .PHONY: train
 train: build ## train and fine-tune: make train STORE=… RUN=… [TRAIN='--preset base --epochs 100']
 	@$(MAKE) --file pipelines/train.mk BIN=$(BIN)
@@ -189,7 +201,8 @@ clean-demo: ## remove what the demo made
 build/venv/ready: tests/requirements.txt
 build/bench-venv/ready: benches/requirements.txt
 build/engine-venv/ready: benches/requirements-engine.txt
-build/venv/ready build/bench-venv/ready build/engine-venv/ready:
+build/kubernetes-venv/ready: pipelines/kubernetes/requirements.txt
+build/venv/ready build/bench-venv/ready build/engine-venv/ready build/kubernetes-venv/ready:
 	rm -rf $(@D)
 	$(PYTHON) -m venv $(@D)
 	$(@D)/bin/pip install --quiet --disable-pip-version-check --requirement $<

@@ -127,6 +127,23 @@ pub fn save_to_file<E: Element>(
     Ok(NamedTempFile::from_parts(open, path))
 }
 
+/// Bytes before the header of a safetensors file, which tell its length.
+pub const N_LENGTH_BYTES: u64 = 8;
+
+/// Returns the length of the header, in bytes, that the first bytes of a file tell; none where there are too few.
+pub fn header_length(start: &[u8]) -> Option<u64> {
+    start.get(..N_LENGTH_BYTES as usize)?.try_into().ok().map(u64::from_le_bytes)
+}
+
+/// Returns what was written beside the tensors, of a file that is read up to the end of its header.
+///
+/// # Errors
+/// If the bytes are not the start of a safetensors file.
+pub fn metadata(start: &[u8]) -> Result<BTreeMap<String, String>, WeightsError> {
+    let (_, header) = SafeTensors::read_metadata(start)?;
+    Ok(header.metadata().clone().unwrap_or_default().into_iter().collect())
+}
+
 /// A safetensors file that was read.
 pub struct Archive<'a> {
     file: SafeTensors<'a>,
@@ -139,10 +156,7 @@ impl<'a> Archive<'a> {
     /// # Errors
     /// If the bytes are no safetensors file.
     pub fn open(bytes: &'a [u8]) -> Result<Self, WeightsError> {
-        let file = SafeTensors::deserialize(bytes)?;
-        let (_, header) = SafeTensors::read_metadata(bytes)?;
-        let metadata = header.metadata().clone().unwrap_or_default().into_iter().collect();
-        Ok(Self { file, metadata })
+        Ok(Self { file: SafeTensors::deserialize(bytes)?, metadata: metadata(bytes)? })
     }
 
     /// Returns what was written beside the tensors.

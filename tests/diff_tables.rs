@@ -119,6 +119,11 @@ fn rows_that_change_places_and_columns_that_come_and_go_are_told() {
     assert_eq!(compare::tables("t", &a, &fewer, &exact()), ["t: 3 rows, then 2"]);
     let null = table(vec![("x".into(), Values::Numbers(vec![Some(1.0), None, Some(4.0)]))]);
     assert_eq!(compare::tables("t", &a, &null, &exact()).len(), 1);
+    let signed = |x: f64| table(vec![("x".into(), numbers([1.0, x, 4.0]))]);
+    let told = compare::tables("t", &signed(0.0), &signed(-0.0), &exact());
+    assert_eq!(told.len(), 1, "to the last bit: {told:?}");
+    let near = Tolerances { usual: 1e-12, named: Vec::new() };
+    assert_eq!(compare::tables("t", &signed(0.0), &signed(-0.0), &near).len(), 0);
     let text = |x: [Option<&str>; 3]| {
         table(vec![("s".into(), Values::Texts(x.map(|x| x.map(str::to_owned)).to_vec()))])
     };

@@ -1,5 +1,6 @@
 //! Jobs that can be trusted: exit codes, dry runs, what is done and what is not, and the pipelines around them.
 
+mod cluster;
 mod configuration;
 mod content;
 mod dry_run;

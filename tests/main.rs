@@ -42,6 +42,7 @@ mod rooms;
 mod schemas;
 mod servers;
 mod shell;
+mod status;
 mod store_suite;
 mod support;
 mod train;

@@ -5,9 +5,9 @@ use std::process::{Command, Stdio};
 
 use crate::support::run;
 
-const STAGES: [&str; 14] = [
+const STAGES: [&str; 15] = [
     "ingest", "extract", "library", "train", "finetune", "export", "generate", "evaluate", "model",
-    "plot", "view", "query", "compact", "vacuum",
+    "plot", "view", "query", "status", "compact", "vacuum",
 ];
 
 #[test]

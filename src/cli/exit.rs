@@ -14,7 +14,7 @@ use crate::stages::{Summary, lines, one_line, redacted};
 pub const SOME_FAILED: u8 = 1;
 /// Could not run.
 pub const COULD_NOT_RUN: u8 = 2;
-/// Stopped before it was done: EX_TEMPFAIL of sysexits.h, which asks to try again.
+/// Stopped before it was done, or work is left: EX_TEMPFAIL of sysexits.h, which asks to try again.
 pub const STOPPED: u8 = 75;
 
 /// The flag that chooses the form of the summary.
@@ -57,7 +57,8 @@ pub fn report(stage: &str, form: Form, outcome: anyhow::Result<Box<dyn Summary>>
         }
     };
     let (n_failed, is_stopped) = (summary.n_failed(), summary.is_stopped());
-    let code = match (is_stopped, n_failed) {
+    let has_work_left = summary.has_work_left();
+    let code = match (is_stopped || has_work_left, n_failed) {
         (true, _) => STOPPED,
         (false, 0) => 0,
         (false, _) => SOME_FAILED,
@@ -66,6 +67,9 @@ pub fn report(stage: &str, form: Form, outcome: anyhow::Result<Box<dyn Summary>>
         Form::Text => print(summary.as_mut()),
         Form::Json => {
             let mut object = outcome_of(stage, code, n_failed);
+            if has_work_left {
+                object["outcome"] = "work_left".into();
+            }
             if let (Value::Object(all), Value::Object(more)) = (&mut object, summary.figures()) {
                 more.into_iter().for_each(|(name, value)| {
                     all.entry(name).or_insert(value);

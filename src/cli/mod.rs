@@ -33,6 +33,7 @@ use crate::stages::model::Model;
 use crate::stages::plot::Plot;
 #[cfg(feature = "query")]
 use crate::stages::query::Query;
+use crate::stages::status::Status;
 use crate::stages::train::Train;
 use crate::stages::vacuum::Vacuum;
 use crate::stages::view::View;
@@ -70,6 +71,7 @@ fn entries() -> Vec<StageEntry> {
         StageEntry::of::<View>(),
         #[cfg(feature = "query")]
         StageEntry::of::<Query>(),
+        StageEntry::of::<Status>(),
         StageEntry::of::<Compact>(),
         StageEntry::of::<Vacuum>(),
     ]
@@ -91,6 +93,9 @@ fn commands() -> Vec<Command> {
         command::<View>(),
         #[cfg(feature = "query")]
         command::<Query>(),
+        command::<Status>(),
+        command::<Compact>(),
+        command::<Vacuum>(),
     ]
 }
 

@@ -230,6 +230,18 @@ pub fn has_weights(store: &Location, model: &str, weights: &str) -> Result<bool,
     Ok(card.is_some_and(|card| weights_digest(&card) == weights))
 }
 
+/// Returns the digest of the weights that a model has now, as its card says; none where there is no such model.
+///
+/// # Errors
+/// [`StoreError`] when the store cannot be read.
+pub fn weights_now(store: &Location, model: &str) -> Result<Option<String>, StoreError> {
+    let path = format!("{}/{}", folder_of(model), file_names::CARD);
+    let card = card_of(store, model)?;
+    Ok(card
+        .and_then(|card| weights_and_music(&card, &store.url_of(&path)).ok())
+        .map(|found| found.0))
+}
+
 /// Returns the card of a model of the store, or of the one that ships with the program.
 fn card_of(store: &Location, model: &str) -> Result<Option<Bytes>, StoreError> {
     // The name is from a table, where a foreign one may say anything.

@@ -11,6 +11,7 @@ pub mod feature_file;
 pub mod finetune;
 pub mod generate;
 pub mod ingest;
+mod item_state;
 pub mod learned;
 mod lease;
 pub mod library;
@@ -25,6 +26,7 @@ mod pretrained;
 pub mod query;
 mod retrieval;
 mod seen;
+pub mod status;
 pub mod train;
 mod trained;
 pub mod vacuum;
@@ -119,6 +121,11 @@ pub trait Summary {
 
     /// Returns whether the stage was stopped before it was done.
     fn is_stopped(&self) -> bool {
+        false
+    }
+
+    /// Returns whether work is left that nobody was asked to do; of a stage that looks and does nothing.
+    fn has_work_left(&self) -> bool {
         false
     }
 

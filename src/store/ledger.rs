@@ -75,14 +75,14 @@ impl Ledger {
     /// Returns the items from `origin` that failed last time, in order of id.
     pub fn failed(&self, origin: &str) -> Vec<&str> {
         let failed = |s: &&SettledItem| s.item.failure.is_some() && s.origin == origin;
-        let mut ids: Vec<_> = self.all().filter(failed).map(|s| s.item.id.as_str()).collect();
+        let mut ids: Vec<_> = self.iter().filter(failed).map(|s| s.item.id.as_str()).collect();
         ids.sort_unstable();
         ids
     }
 
     /// Returns the items that anything is known of, in no order.
     pub fn ids(&self) -> impl Iterator<Item = &str> {
-        self.all().map(|settled| settled.item.id.as_str())
+        self.iter().map(|settled| settled.item.id.as_str())
     }
 
     /// Returns the latest word on an item.
@@ -95,7 +95,8 @@ impl Ledger {
         self.added.get(id).or_else(before)
     }
 
-    fn all(&self) -> impl Iterator<Item = &SettledItem> {
+    /// Returns the latest word on every item, in no order.
+    pub fn iter(&self) -> impl Iterator<Item = &SettledItem> {
         let is_latest = |known: &&SettledItem| !self.added.contains_key(&known.item.id);
         self.settled.iter().filter(is_latest).chain(self.added.values())
     }

@@ -256,6 +256,29 @@ impl Location {
         }
     }
 
+    /// Reads the first bytes of an object; all of a shorter one.
+    ///
+    /// # Errors
+    /// [`StoreError::NotFound`] or what the storage says.
+    pub fn read_start(&self, path: &str, n_bytes: u64) -> Result<Bytes, StoreError> {
+        use std::io::Read as _;
+        let place = || self.url_of(path);
+        match &self.kind {
+            LocationKind::Local(root) => {
+                let read = || {
+                    let mut start = Vec::new();
+                    std::fs::File::open(root.join(path))?.take(n_bytes).read_to_end(&mut start)?;
+                    Ok(Bytes::from(start))
+                };
+                read().map_err(|e| StoreError::io("read", &place(), e))
+            }
+            LocationKind::Remote { store, prefix } => {
+                block_on(store.get_range(&remote::join(prefix, path), 0..n_bytes))
+                    .map_err(|e| StoreError::remote("read", &place(), e))
+            }
+        }
+    }
+
     /// Reads a whole object that another program wrote, if it is a regular file of at most `max_bytes`.
     ///
     /// # Errors

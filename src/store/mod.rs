@@ -69,7 +69,7 @@ pub use query::{Answer, DataFormat, Format, TableInfo, TextTable, query, table_i
 pub use reader::Snapshot;
 pub use redaction::{lines, one_line, redacted};
 pub use schema::{Cell, Column, ColumnType, Row, TableSchema, TimestampUs};
-pub use shard::{Shard, batch_of, split_of};
+pub use shard::{Shard, batch_of, shard_of, split_of};
 pub use source::{
     Content, Listing, OrderedContents, Source, SourceFile, SourceProblem, SourceProblemKind,
     content_of,

@@ -5,6 +5,7 @@
 //! shards gives the same rows.
 
 use std::fmt;
+use std::num::NonZeroU32;
 
 use xxhash_rust::xxh3::xxh3_64_with_seed;
 
@@ -93,6 +94,12 @@ impl Shard {
     }
 }
 
+/// Returns which of `count` shards takes `item`.
+pub fn shard_of(item: &str, count: NonZeroU32) -> u32 {
+    let shard = range_of(stable_hash(item), u64::from(count.get()));
+    u32::try_from(shard).expect("invariant: a range is below their count")
+}
+
 /// Returns the place of a Slurm task among the `count` of its array.
 ///
 /// A list of tasks does not say how many there were when the job was cut into shards; if each task did only its
@@ -175,6 +182,8 @@ mod tests {
                 .filter(|i| Shard::new(*i, count).expect("index below count").takes(&item))
                 .count();
             prop_assert_eq!(takers, 1);
+            let named = shard_of(&item, NonZeroU32::new(count).expect("at least 1"));
+            prop_assert!(Shard::new(named, count).expect("index below count").takes(&item));
         }
 
         #[test]

@@ -6,7 +6,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::store::{Location, PutOutcome, StoreError};
-use crate::weights::{Archive, Precision, Section, save_to_file};
+use crate::weights::{self, Archive, Precision, Section, save_to_file};
 
 use super::error::TrainingError;
 use super::window::Scales;
@@ -15,6 +15,8 @@ use super::window::Scales;
 const FORMAT: u32 = 1;
 /// Key of the state in the file's header.
 const STATE: &str = "motiongen.state";
+/// Longest header of a checkpoint, in bytes.
+const MAX_HEADER_BYTES: u64 = 100_000_000;
 /// Checkpoints of the newest steps that are kept.
 const N_KEPT: usize = 2;
 
@@ -52,6 +54,9 @@ pub struct Progress {
     pub best: Option<Best>,
     /// Validations since the best one.
     pub n_stale: u64,
+    /// Whether training came to its end: all steps, its time, or its patience.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub has_ended: bool,
 }
 
 /// The best validation.
@@ -96,13 +101,20 @@ impl<C: Serialize + DeserializeOwned> State<C> {
     /// # Errors
     /// [`TrainingError::Checkpoint`] when there is none, or it has another format.
     pub fn of(archive: &Archive, place: &str) -> Result<Self, TrainingError> {
+        Self::of_metadata(archive.metadata(), place)
+    }
+
+    fn of_metadata(
+        metadata: &BTreeMap<String, String>,
+        place: &str,
+    ) -> Result<Self, TrainingError> {
         let refuse =
             |reason: String| Err(TrainingError::Checkpoint { place: place.to_owned(), reason });
         #[derive(Deserialize)]
         struct Head {
             format: u32,
         }
-        let Some(text) = archive.metadata().get(STATE) else {
+        let Some(text) = metadata.get(STATE) else {
             return refuse("holds weights but no state; name a checkpoint that train wrote".into());
         };
         match serde_json::from_str::<Head>(text) {
@@ -236,6 +248,28 @@ impl<'a> Checkpoints<'a> {
             }
         }
         Ok(())
+    }
+
+    /// Reads the state of a checkpoint alone, without its numbers.
+    ///
+    /// # Errors
+    /// When it cannot be read, or is no checkpoint.
+    pub fn state<C: Serialize + DeserializeOwned>(
+        &self,
+        kind: CheckpointKind,
+        step: u64,
+    ) -> Result<State<C>, TrainingError> {
+        let (place, path) = (self.place(kind, step), self.path(kind, step));
+        let start = self.store.read_start(&path, weights::N_LENGTH_BYTES)?;
+        let n_header = weights::header_length(&start).filter(|n| *n <= MAX_HEADER_BYTES);
+        let Some(n_header) = n_header else {
+            let reason = "is damaged: it has no header".to_owned();
+            return Err(TrainingError::Checkpoint { place, reason });
+        };
+        let start = self.store.read_start(&path, weights::N_LENGTH_BYTES + n_header)?;
+        let metadata = weights::metadata(&start)
+            .map_err(|source| TrainingError::Weights { place: place.clone(), source })?;
+        State::of_metadata(&metadata, &place)
     }
 
     /// Reads a checkpoint and hands it to `load`.

@@ -247,6 +247,7 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
         } else if let Some(n_steps) = self.plan.named_steps() {
             self.state.progress.n_steps = n_steps;
         }
+        self.state.progress.has_ended = false;
         let n_steps = self.state.progress.n_steps;
         self.watch.begin(L::STAGE, self.state.progress.step, n_steps);
         self.journal.determined_by(&self.state.config, &self.state.data, n_steps);
@@ -304,6 +305,7 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
         if end == TrainingEnd::OutOfTime {
             self.validate(learner)?;
         }
+        self.state.progress.has_ended = end != TrainingEnd::Interrupted;
         self.save(learner)?;
         self.watch.end();
         Ok(end)

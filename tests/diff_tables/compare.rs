@@ -45,13 +45,16 @@ pub fn tables(name: &str, a: &Table, b: &Table, tolerances: &Tolerances) -> Vec<
     found
 }
 
-/// Returns how two columns of numbers differ; nothing where they agree within `tolerance` of their root mean square.
+/// Returns how two columns of numbers differ; nothing where they agree within `tolerance` of their root mean square, or, where
+/// that is 0, to the last bit.
 fn numbers(a: &[Option<f64>], b: &[Option<f64>], tolerance: f64) -> Option<String> {
     let squares = a.iter().flatten().filter(|x| x.is_finite()).map(|x| x * x);
     let rms = (squares.sum::<f64>() / a.len().max(1) as f64).sqrt();
     let differs = |(a, b): (&Option<f64>, &Option<f64>)| match (a, b) {
         (Some(a), Some(b)) if a.is_finite() && b.is_finite() => {
-            ((a - b).abs() > tolerance * rms).then_some((a - b).abs())
+            // Zeros of either sign lie 0 apart.
+            let is_other = tolerance == 0.0 && a.to_bits() != b.to_bits();
+            (is_other || (a - b).abs() > tolerance * rms).then_some((a - b).abs())
         }
         (Some(a), Some(b)) => (a.to_bits() != b.to_bits()).then_some(f64::INFINITY),
         (a, b) => (a != b).then_some(f64::INFINITY),

@@ -76,7 +76,11 @@ impl Evaluand {
         }
     }
 
-    fn of_run(snapshot: StoreSnapshot, run: &str, most: Option<usize>) -> anyhow::Result<Self> {
+    /// Reads what is known of the motions of a run, at most so many of them.
+    ///
+    /// # Errors
+    /// When the store cannot be read, or one sentence where there are no motions.
+    pub fn of_run(snapshot: StoreSnapshot, run: &str, most: Option<usize>) -> anyhow::Result<Self> {
         let store = snapshot.store();
         let (generations, n_groups) = motions::of_run(&snapshot, run, most)?;
         let phrases =

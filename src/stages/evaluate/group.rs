@@ -14,6 +14,7 @@ use super::evaluand::splits_of;
 use super::motions::PhraseIndex;
 use super::params::Params;
 use super::rows::{EvaluationRows, RunIdentity};
+use super::splits::MusicSplit;
 use crate::evaluation::frechet::{Gaussian, frechet_distance};
 use crate::evaluation::group::realism::kinetic_features;
 use crate::evaluation::group::{GroupMeasures, dancers, measure};
@@ -166,6 +167,51 @@ pub fn is_of_groups(store: &Location, run: &str) -> Result<bool, StoreError> {
     Ok(n_groups > 0 && n_soloists == 0)
 }
 
+/// The motions of a run of groups, and what they are held against.
+pub struct GroupEvaluand {
+    snapshot: StoreSnapshot,
+    generations: Vec<GenerationRow>,
+    phrases: PhraseIndex,
+    splits: Vec<MusicSplit>,
+    notes: Vec<String>,
+    real_rows: Vec<PhraseRow>,
+    /// Digest of the motions, of the splits that they are in, and of real groups.
+    pub input_hash: String,
+}
+
+impl GroupEvaluand {
+    /// Reads what is known of the motions of a run, without their frames.
+    ///
+    /// # Errors
+    /// When the store cannot be read.
+    pub fn read(snapshot: StoreSnapshot, run: &str) -> anyhow::Result<Self> {
+        let mut generations: Vec<GenerationRow> = snapshot
+            .table(GenerationRow::schema())?
+            .rows_where(|row: &GenerationRow| row.run == run && row.selected)?;
+        generations.sort_by(|a, b| a.generation.cmp(&b.generation));
+        let ids = generations.iter().map(|row| row.phrase_id.as_str());
+        let phrases = PhraseIndex::read(&snapshot, ids)?;
+        let (splits, notes) = splits_of(snapshot.store(), &phrases, &generations)?;
+        let lines: Vec<String> = generations
+            .iter()
+            .zip(&splits)
+            .map(|(row, split)| {
+                format!("{} {} {} {}", row.generation, row.weights, row.time.0, split.name())
+            })
+            .collect();
+        let real_rows = real_groups(&snapshot)?;
+        let data = digest(
+            real_rows
+                .iter()
+                .map(|row| format!("{} {}\n", row.phrase_id, row.content_hash))
+                .collect::<String>()
+                .as_bytes(),
+        );
+        let input_hash = digest(format!("{data}\n{}", lines.join("\n")).as_bytes());
+        Ok(Self { snapshot, generations, phrases, splits, notes, real_rows, input_hash })
+    }
+}
+
 /// Runs the stage on a run of groups.
 ///
 /// # Errors
@@ -177,39 +223,18 @@ pub fn run(
     progress: &dyn Progress,
 ) -> anyhow::Result<Box<dyn Summary>> {
     let started = Instant::now();
-    let snapshot = StoreSnapshot::take(store)?;
-    let mut generations: Vec<GenerationRow> = snapshot
-        .table(GenerationRow::schema())?
-        .rows_where(|row: &GenerationRow| row.run == run && row.selected)?;
-    generations.sort_by(|a, b| a.generation.cmp(&b.generation));
-    let ids = generations.iter().map(|row| row.phrase_id.as_str());
-    let phrases = PhraseIndex::read(&snapshot, ids)?;
-    let (splits, notes) = splits_of(store, &phrases, &generations)?;
+    let GroupEvaluand { snapshot, generations, phrases, splits, notes, real_rows, input_hash } =
+        GroupEvaluand::read(StoreSnapshot::take(store)?, run)?;
     for note in &notes {
         progress.note(note);
     }
-    let lines: Vec<String> = generations
-        .iter()
-        .zip(&splits)
-        .map(|(row, split)| {
-            format!("{} {} {} {}", row.generation, row.weights, row.time.0, split.name())
-        })
-        .collect();
-    let real_rows = real_groups(&snapshot)?;
-    let data = digest(
-        real_rows
-            .iter()
-            .map(|row| format!("{} {}\n", row.phrase_id, row.content_hash))
-            .collect::<String>()
-            .as_bytes(),
-    );
     let params_hash = digest(format!("groups {OUTPUT_VERSION}").as_bytes());
     let identity = RunIdentity {
         store,
         run,
         params_hash: &params_hash,
         whole_hash: &params_hash,
-        input_hash: &digest(format!("{data}\n{}", lines.join("\n")).as_bytes()),
+        input_hash: &input_hash,
     };
     let is_up_to_date = !params.force && identity.is_up_to_date(Evaluate::NAME)?;
     let n_frames: i64 = generations.iter().map(|row| row.n_frames).sum();

@@ -14,6 +14,7 @@ mod rows;
 mod sampled;
 mod splits;
 mod subjects;
+mod survey;
 mod truth;
 
 use std::collections::BTreeSet;
@@ -35,6 +36,7 @@ use foreign::RefusedFile;
 use job::MotionStage;
 pub use params::{Params, RequiredVerdict};
 use rows::{EvaluationRows, RunIdentity};
+pub(in crate::stages) use survey::{runs, survey};
 
 /// The name under which sanity checks are committed; numbers and verdicts have the stage's.
 const CHECKS: &str = "evaluate-checks";

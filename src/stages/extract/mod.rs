@@ -16,6 +16,7 @@ use crate::store::{Location, Shard, digest};
 
 pub use one::{ExtractRules, ExtractedFeatures};
 pub(in crate::stages) use one::{Origin, extract, needed_bytes};
+pub(in crate::stages) use phrases::survey;
 
 /// Raised when extract writes something else for the same input and parameters.
 const OUTPUT_VERSION: u32 = 2;

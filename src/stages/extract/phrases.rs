@@ -9,17 +9,18 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Mutex;
 
 use super::one::{ExtractedFeatures, Origin, extract, needed_bytes};
-use super::{Extract, ExtractJob, ExtractTally};
+use super::{Extract, ExtractJob, ExtractTally, params_hash};
 use crate::stages::Stage as _;
 use crate::stages::batch::{BatchCommit, BatchJob, n_batches};
 use crate::stages::beats::{self, BeatSource};
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::ingest::content_hash_of_audio;
+use crate::stages::item_state::{ItemState, last_params_hash};
 use crate::stages::pool::{self, Budget, lock};
 use crate::store::tables::{self, BeatRow, ExtractionRow, PhraseRow};
 use crate::store::{
-    ClientOptions, Content, Item, Location, OrderedContents, Row as _, Shard, Source, SourceFile,
-    StoreError, StoreSnapshot, batch_of, checkpoint,
+    ClientOptions, Content, Item, Ledger, Location, OrderedContents, Row as _, Shard, Source,
+    SourceFile, StoreError, StoreSnapshot, batch_of, checkpoint,
 };
 use crate::units::frames_to_s;
 
@@ -102,7 +103,7 @@ pub fn run(job: &ExtractJob<'_>, target: &StoreTarget<'_>) -> anyhow::Result<Ext
         origin: ITEMS_FROM,
         ledger: &ledger,
     };
-    tasks.retain(|task| target.force || !is_settled(task, &batches));
+    tasks.retain(|task| target.force || !state(task, &ledger, target.params_hash).is_done());
     done.n_unchanged = (n_mine - tasks.len()) as u64;
     done.n_todo = tasks.len() as u64;
     // An empty sum of f64 is -0.
@@ -178,15 +179,36 @@ fn plan(rows: Vec<PhraseRow>, listed: &BTreeSet<String>) -> Vec<PhraseTask> {
     tasks
 }
 
-/// Returns whether the store has the phrase's features for this content and these parameters.
-fn is_settled(task: &PhraseTask, batches: &BatchJob) -> bool {
+/// Returns what the store has of the phrase's features for this content and these parameters.
+fn state(task: &PhraseTask, ledger: &Ledger, params_hash: &str) -> ItemState {
     let id = &task.row.phrase_id;
-    !batches.has_failed(&beside(id))
-        && batches.known(id).is_some_and(|known| {
-            known.item.succeeded()
-                && known.item.input_hash == task.row.content_hash
-                && known.item.fingerprint == task.fingerprint()
-        })
+    if ledger.get(&beside(id)).is_some_and(|known| known.item.failure.is_some()) {
+        return ItemState::Failed;
+    }
+    ItemState::of(ledger.get(id), |known| {
+        known.params_hash == params_hash
+            && known.item.input_hash == task.row.content_hash
+            && known.item.fingerprint == task.fingerprint()
+    })
+}
+
+/// Returns every phrase that can have features with what the store has of them, by the parameters of the last run, and
+/// whether those are the ones without `--tuning`.
+///
+/// # Errors
+/// [`StoreError`] when the store cannot be read.
+pub fn survey(snapshot: &StoreSnapshot) -> Result<(Vec<(String, ItemState)>, bool), StoreError> {
+    let rows: Vec<PhraseRow> = snapshot.table(PhraseRow::schema())?.rows()?;
+    let ledger = snapshot.ledger(Extract::NAME)?;
+    let usual = params_hash(None);
+    let params_hash = last_params_hash(&ledger, &usual, |_| true).unwrap_or_else(|| usual.clone());
+    let listed = with_listed_beats(snapshot, &rows)?;
+    let tasks = plan(rows, &listed);
+    let states = tasks.iter().map(|task| {
+        let state = state(task, &ledger, &params_hash);
+        (task.row.phrase_id.clone(), state)
+    });
+    Ok((states.collect(), params_hash == usual))
 }
 
 /// Returns whether a file with this digest can be the one that ingest saw.

@@ -10,6 +10,7 @@ mod params;
 mod receipt;
 mod report;
 mod settings;
+mod survey;
 mod tracks;
 
 use std::collections::BTreeMap;
@@ -40,6 +41,7 @@ pub(in crate::stages) use files::listen;
 pub(in crate::stages) use maker::{generation_id, seed_of};
 pub(in crate::stages) use params::PostProcessParams;
 pub(in crate::stages) use settings::MotionSettings;
+pub(in crate::stages) use survey::{SurveyedRun, runs, survey};
 pub(in crate::stages) use tracks::url_of;
 
 /// The stage.

@@ -18,6 +18,7 @@ use super::{Generate, GenerateTally};
 use crate::stages::batch::{BatchJob, n_batches};
 use crate::stages::beats::{self, BeatSource, PhraseBeats};
 use crate::stages::failure::{Failure, FailureKind};
+use crate::stages::item_state::ItemState;
 use crate::stages::pool::{self, lock};
 use crate::stages::{Progress, Stage as _, lease};
 use crate::store::tables::{self, ExtractionRow, GenerationRow, PhraseRow};
@@ -64,9 +65,9 @@ impl<'a> TrackTarget<'a> {
 }
 
 /// A phrase to generate motion for.
-struct TrackTask {
+pub struct TrackTask {
     batch: u64,
-    row: PhraseRow,
+    pub row: PhraseRow,
     n_frames: usize,
     beats: PhraseBeats,
     /// Whether its features are of other content than it has now.
@@ -87,6 +88,36 @@ impl TrackTask {
         } else {
             content_hash.clone()
         }
+    }
+
+    /// Returns what the store has of a motion of a run for this content, these beats and the parameters of `target`.
+    pub fn state(
+        &self,
+        run: &str,
+        sample: usize,
+        ledger: &Ledger,
+        target: &TrackTarget,
+    ) -> ItemState {
+        let known = ledger.get(&generation_id(run, &self.row.phrase_id, sample));
+        let state = ItemState::of(known, |known| {
+            known.params_hash == target.params_hash
+                && known.item.input_hash == self.row.content_hash
+                && known.item.fingerprint == self.fingerprint()
+        });
+        let failure = known.and_then(|known| known.item.failure.as_deref());
+        match failure {
+            Some(failure) if self.is_mended(failure, target.store) => ItemState::Missing,
+            _ => state,
+        }
+    }
+
+    /// Returns whether a failure was for want of features that are there now.
+    fn is_mended(&self, failure: &str, store: &Location) -> bool {
+        let for_want =
+            || [with_old_features(&self.row, store), without_features(&self.row, store, None)];
+        self.n_frames > 0
+            && !self.has_old_features
+            && for_want().iter().any(|known| known.digest() == failure)
     }
 }
 
@@ -153,7 +184,15 @@ impl TrackPlan {
         let snapshot = StoreSnapshot::take(target.store)?;
         let ledger = snapshot.ledger(Generate::NAME)?;
         let mut done = GenerateTally::default();
-        let tasks = plan(maker, target, &snapshot, target.batches(&ledger), &mut done)?;
+        let mut tasks = plan(target, &snapshot)?;
+        for task in &mut tasks {
+            let is_left = |sample: &usize| {
+                target.force || !task.state(maker.run(), *sample, &ledger, target).is_done()
+            };
+            task.samples = (0..target.n_samples).filter(is_left).collect();
+            done.n_unchanged += (target.n_samples - task.samples.len()) as u64;
+        }
+        tasks.retain(|task| !task.samples.is_empty());
         done.n_todo = tasks.iter().map(|task| task.samples.len() as u64).sum();
         done.todo_s =
             tasks.iter().map(|task| frames_to_s(task.n_frames) * task.samples.len() as f64).sum();
@@ -209,14 +248,8 @@ impl MusicAhead {
     }
 }
 
-/// Returns the phrases that lack motions, in the order in which they are made.
-fn plan(
-    maker: &dyn MotionMaker,
-    target: &TrackTarget,
-    snapshot: &StoreSnapshot,
-    batches: BatchJob,
-    done: &mut GenerateTally,
-) -> anyhow::Result<Vec<TrackTask>> {
+/// Returns the phrases that are to have motions, in the order in which they are made.
+pub fn plan(target: &TrackTarget, snapshot: &StoreSnapshot) -> anyhow::Result<Vec<TrackTask>> {
     let store = target.store;
     let rows: Vec<PhraseRow> = snapshot.table(PhraseRow::schema())?.rows()?;
     if rows.is_empty() {
@@ -265,20 +298,8 @@ fn plan(
     let mut beats = beats::of_phrases(snapshot, |id| ids.contains(id))?;
     for task in &mut tasks {
         task.beats = beats.remove(&task.row.phrase_id).unwrap_or_default();
-        let (id, fingerprint) = (&task.row.phrase_id, task.fingerprint());
-        task.batch = batch_of(id, n_batches);
-        let is_missing = |sample: &usize| {
-            target.force
-                || !batches.known(&generation_id(maker.run(), id, *sample)).is_some_and(|known| {
-                    known.item.succeeded()
-                        && known.item.input_hash == task.row.content_hash
-                        && known.item.fingerprint == fingerprint
-                })
-        };
-        task.samples = (0..target.n_samples).filter(is_missing).collect();
-        done.n_unchanged += (target.n_samples - task.samples.len()) as u64;
+        task.batch = batch_of(&task.row.phrase_id, n_batches);
     }
-    tasks.retain(|task| !task.samples.is_empty());
     tasks.sort_by(|a, b| (a.batch, &a.row.phrase_id).cmp(&(b.batch, &b.row.phrase_id)));
     Ok(tasks)
 }

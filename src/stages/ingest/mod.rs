@@ -4,6 +4,7 @@ mod batch;
 mod layout;
 mod motion;
 mod phrase;
+mod survey;
 
 use std::collections::BTreeSet;
 use std::io::{self, Write};
@@ -14,11 +15,12 @@ use std::time::Instant;
 use super::{ClientParams, Contract, LinkParams, Progress, RARE, Stage, Summary, all_threads};
 use crate::store::tables::PhraseRow;
 use crate::store::{
-    Cache, Location, Row as _, Shard, Source, StoreError, StoreSnapshot, checkpoint, digest,
+    Cache, Ledger, Location, Row as _, Shard, Source, StoreError, StoreSnapshot, checkpoint, digest,
 };
 
 use super::batch::BatchJob;
 use super::failure::{Failure, failures_json, write_failures, write_notes};
+use super::item_state::ItemState;
 use super::seen::SeenContent;
 pub(in crate::stages) use crate::audio::formats::is_audio_extension as is_audio;
 pub use layout::{IngestPlan, Layout, PlannedPhrase, Role, plan};
@@ -27,6 +29,7 @@ pub(in crate::stages) use motion::{
 };
 pub(in crate::stages) use phrase::read_beats;
 pub use phrase::{IngestRules, content_hash_of_audio};
+pub(in crate::stages) use survey::{origins, survey};
 
 /// Raised when ingest writes something else for the same input and rules.
 const OUTPUT_VERSION: u32 = 1;
@@ -133,7 +136,7 @@ impl Stage for Ingest {
             !params.force
                 && !params.verify
                 && !unidentified.contains(&p.id)
-                && is_settled(p, &batches, &seen)
+                && state(p, &ledger, &seen, &params_hash, origin).is_done()
         };
         let (done, todo): (Vec<_>, Vec<_>) = mine.into_iter().partition(|p| is_done(p));
         tracing::info!(
@@ -203,16 +206,25 @@ fn params_hash(rules: &IngestRules) -> String {
     digest(text.as_bytes())
 }
 
-/// Returns whether the store has a phrase's rows for these files and rules.
+/// Returns what the store has of a phrase for these files and rules.
 ///
 /// Size and time tell a file's versions apart, not the files of two sources.
-fn is_settled(planned: &PlannedPhrase, batches: &BatchJob, seen: &SeenContent) -> bool {
-    let (origin, fingerprint) = (batches.origin, batch::fingerprint(planned));
-    !batches.has_failed(&batch::contested(&planned.id, origin))
-        && batches.known(&planned.id).is_some_and(|known| {
-            let is_same = known.origin == origin && known.item.fingerprint == fingerprint;
-            known.item.succeeded() && (is_same || seen.has(known, origin, &fingerprint))
-        })
+fn state(
+    planned: &PlannedPhrase,
+    ledger: &Ledger,
+    seen: &SeenContent,
+    params_hash: &str,
+    origin: &str,
+) -> ItemState {
+    let fingerprint = batch::fingerprint(planned);
+    let refused = ledger.get(&batch::contested(&planned.id, origin));
+    if refused.is_some_and(|known| known.item.failure.is_some()) {
+        return ItemState::Failed;
+    }
+    ItemState::of(ledger.get(&planned.id), |known| {
+        let is_same = known.origin == origin && known.item.fingerprint == fingerprint;
+        known.params_hash == params_hash && (is_same || seen.has(known, origin, &fingerprint))
+    })
 }
 
 /// Returns the phrases with audio or a feature file whose rows do not tell the identity of the music: release 0.1

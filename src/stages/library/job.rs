@@ -12,7 +12,7 @@ use super::layout::PhraseFolder;
 use super::made::{self, Band, perform};
 use super::report::{LibrarySummary, LibraryTally};
 use super::songs::{Song, SongFiles, SongInput, Songs};
-use super::write::{Refusal, SongWriter, fingerprint, is_settled};
+use super::write::{Refusal, SongWriter, fingerprint, state};
 use super::{Library, Params, one, params_hash};
 use crate::stages::batch::BatchJob;
 use crate::stages::extract::needed_bytes;
@@ -65,7 +65,14 @@ impl LibraryJob<'_> {
             !force
                 && output.is_none()
                 && (compose_audio.is_none() || !song.is_made())
-                && is_settled(song, (&batches, &self.seen), rules, &print)
+                && state(
+                    song,
+                    self.ledger.get(&one::phrase_id(song, rules, 0, 0)),
+                    (&self.ledger, &self.seen),
+                    (&songs.origin, &params_hash),
+                    &print,
+                )
+                .is_done()
         };
         let (sound, problems): (Vec<Song>, Vec<Song>) =
             songs.songs.iter().cloned().partition(|song| song.problem.is_none());

@@ -12,6 +12,7 @@ mod report;
 mod rows;
 mod songs;
 mod split;
+mod survey;
 mod write;
 
 use std::num::{NonZeroU32, NonZeroUsize};
@@ -31,6 +32,7 @@ use made::Band;
 use report::{LibraryPlace, LibrarySummary, LibraryTally};
 use songs::{Song, SongFiles, Songs};
 use split::SongShare;
+pub(in crate::stages) use survey::{SurveyedSongs, survey};
 
 /// Raised when library writes something else for the same inputs and parameters.
 const OUTPUT_VERSION: u32 = 2;

@@ -11,9 +11,10 @@ use super::songs::Song;
 use crate::motion::choreography::Repertoire;
 use crate::stages::batch::{BatchCommit, BatchJob};
 use crate::stages::failure::{Failure, FailureKind};
+use crate::stages::item_state::ItemState;
 use crate::stages::seen::SeenContent;
 use crate::store::tables::{self, BeatRow, PhraseRow};
-use crate::store::{Item, SettledItem, StoreError, digest};
+use crate::store::{Item, Ledger, SettledItem, StoreError, digest};
 
 /// Writes songs and failures.
 pub struct SongWriter<'a> {
@@ -67,24 +68,25 @@ pub fn fingerprint(song: &Song, captures_fingerprint: &str) -> String {
     digest(known.as_bytes())[..32].to_owned()
 }
 
-/// Returns whether the store has the phrases of a song, made from these inputs with these parameters.
+/// Returns what the store has of the phrases of a song, made from these inputs with these parameters.
 ///
 /// A song is committed whole, so its first phrase stands for all.
-pub fn is_settled(
+pub fn state(
     song: &Song,
-    (batches, seen): (&BatchJob, &SeenContent),
-    rules: &LibraryRules,
+    first: Option<&SettledItem>,
+    (ledger, seen): (&Ledger, &SeenContent),
+    (origin, params_hash): (&str, &str),
     fingerprint: &str,
-) -> bool {
-    let origin = batches.origin;
-    let first = batches.known(&one::phrase_id(song, rules, 0, 0));
-    !batches.has_failed(&song.id)
-        && !song.is_unidentified
-        && first.is_some_and(|known| {
-            known.origin == origin
-                && known.item.succeeded()
-                && (known.item.fingerprint == fingerprint || seen.has(known, origin, fingerprint))
-        })
+) -> ItemState {
+    if ledger.get(&song.id).is_some_and(|known| known.item.failure.is_some()) {
+        return ItemState::Failed;
+    }
+    ItemState::of(first, |known| {
+        !song.is_unidentified
+            && known.params_hash == params_hash
+            && known.origin == origin
+            && (known.item.fingerprint == fingerprint || seen.has(known, origin, fingerprint))
+    })
 }
 
 impl SongWriter<'_> {

@@ -6,6 +6,7 @@ mod judge;
 mod params;
 pub mod session;
 mod summary;
+pub(in crate::stages) mod survey;
 
 use std::sync::Arc;
 
