@@ -173,6 +173,8 @@ impl<'a> Journal<'a> {
             speed_ratio: part("speed_ratio"),
             markers: part("markers"),
             contrast: part("contrast"),
+            commitment: part("commitment"),
+            perplexity: part("perplexity"),
             gradient_norm: entry.taken.and_then(|taken| finite(taken.gradient_norm)),
             skipped: entry.is_skipped,
             samples_per_s: entry.samples_per_s,

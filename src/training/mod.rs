@@ -23,6 +23,7 @@ mod objective;
 mod pipeline;
 mod sampling;
 mod temporal;
+mod tokens;
 mod window;
 
 pub use checkpoint::{Best, CheckpointKind, Checkpoints, Progress, State};
@@ -49,4 +50,8 @@ pub use loader::Loader;
 pub use objective::{ChannelWeights, Objective, Reconstruction, reconstruction};
 pub use sampling::{Condition, Denoiser};
 pub use temporal::{TemporalConfig, TemporalLosses, temporal_losses};
+pub use tokens::{
+    Codebook, CodebookConfig, TOKENS, TokensLearner, TokensNetworkConfig, TokensTrainConfig,
+    TokensTraining, perplexity,
+};
 pub use window::{Augmentation, Batch, Chances, Scales, Windows, fit_scales};

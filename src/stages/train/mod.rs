@@ -4,6 +4,7 @@ mod group;
 mod params;
 pub mod session;
 mod summary;
+mod tokens;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -21,8 +22,8 @@ use crate::motion::Normalizer;
 use crate::store::{Lease, Location};
 use crate::training::{
     Augmentation, CheckpointKind, Checkpoints, DecoderLearner, Denoiser, DiffusionLearner, Drive,
-    GroupLearner, Journal, Learner, Loader, Plan, State, TrainConfig, TrainingEnd, TrainingError,
-    Windows,
+    GroupLearner, Journal, Learner, Loader, Plan, State, TokensLearner, TrainConfig, TrainingEnd,
+    TrainingError, Windows,
 };
 use session::{
     MachineParams, ProgressWatch, check_run_name, claim, claim_path, lease_of, read_phrases, scales,
@@ -31,6 +32,10 @@ pub use summary::{StageSummary, TrainDryRun, TrainSummary};
 
 /// Share of a time budget that the decoder gets.
 const DECODER_SHARE: f64 = 0.1;
+
+/// What this command trains, of any family.
+const STAGES: [&str; 4] =
+    [DiffusionLearner::STAGE, DecoderLearner::STAGE, GroupLearner::STAGE, TokensLearner::STAGE];
 
 /// The stage.
 pub struct Train;
@@ -110,8 +115,10 @@ impl Stage for Train {
 
     fn run(params: Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
         check_run_name(&params.run)?;
-        if params.config.network.family == Family::Group {
-            return group::run(&params, progress);
+        match params.config.network.family {
+            Family::Unet => {}
+            Family::Group => return group::run(&params, progress),
+            Family::Tokens => return tokens::run(&params, progress),
         }
         let config = params.config.config(params.seed);
         config.network.check()?;
@@ -213,14 +220,11 @@ impl<'a> Run<'a> {
 
     /// Removes what the run has left, so that it can begin anew.
     fn clear(&mut self) -> anyhow::Result<()> {
-        for stage in
-            [DiffusionLearner::STAGE, DecoderLearner::STAGE, GroupLearner::STAGE, "finetune"]
-        {
+        for stage in STAGES {
             self.checkpoints(stage).clear()?;
-        }
-        for stage in [DiffusionLearner::STAGE, DecoderLearner::STAGE, GroupLearner::STAGE] {
             self.journal(stage)?.clear()?;
         }
+        self.checkpoints("finetune").clear()?;
         Journal::open(self.store, "finetune", &self.params.run, "finetune")?.clear()?;
         for command in [Train::NAME, "finetune"] {
             self.store.remove(&claim_path(&self.params.run, command))?;
