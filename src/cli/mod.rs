@@ -32,6 +32,7 @@ use crate::stages::model::Model;
 use crate::stages::plot::Plot;
 #[cfg(feature = "query")]
 use crate::stages::query::Query;
+use crate::stages::tokenize::Tokenize;
 use crate::stages::train::Train;
 use crate::stages::vacuum::Vacuum;
 use crate::stages::view::View;
@@ -61,6 +62,7 @@ fn entries() -> Vec<StageEntry> {
         StageEntry::of::<Library>(),
         StageEntry::of::<Train>(),
         StageEntry::of::<Finetune>(),
+        StageEntry::of::<Tokenize>(),
         StageEntry::of::<Export>(),
         StageEntry::of::<Generate>(),
         StageEntry::of::<Evaluate>(),
@@ -82,6 +84,7 @@ fn commands() -> Vec<Command> {
         command::<Library>(),
         command::<Train>(),
         command::<Finetune>(),
+        command::<Tokenize>(),
         command::<Export>(),
         command::<Generate>(),
         command::<Evaluate>(),

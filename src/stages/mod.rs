@@ -23,6 +23,7 @@ mod pretrained;
 pub mod query;
 mod retrieval;
 mod seen;
+pub mod tokenize;
 pub mod train;
 mod trained;
 pub mod vacuum;

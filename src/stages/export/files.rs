@@ -126,7 +126,7 @@ impl ExportedFiles {
 }
 
 /// Returns the SHA-256 of a network's weights: f32, little-endian, in the order of its layers.
-pub(super) fn weights_sha256(parameters: &Parameters<f32>) -> String {
+pub(in crate::stages) fn weights_sha256(parameters: &Parameters<f32>) -> String {
     let mut hash = Sha256::new();
     for (id, _) in parameters.list().iter() {
         let bytes: Vec<u8> = parameters.unpacked(id).iter().flat_map(|x| x.to_le_bytes()).collect();
