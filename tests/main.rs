@@ -43,6 +43,7 @@ mod servers;
 mod shell;
 mod store_suite;
 mod support;
+mod tokens;
 mod train;
 mod training;
 mod view;

@@ -5,8 +5,8 @@ use std::process::{Command, Stdio};
 
 use crate::support::run;
 
-const STAGES: [&str; 14] = [
-    "ingest", "extract", "library", "train", "finetune", "export", "generate", "evaluate", "model",
+const STAGES: [&str; 15] = [
+    "ingest", "extract", "library", "train", "finetune", "tokenize", "export", "generate", "evaluate", "model",
     "plot", "view", "query", "compact", "vacuum",
 ];
 

@@ -15,7 +15,7 @@ fn commits(store: &Path, stage: &str) -> usize {
 #[test]
 fn every_help_names_the_codes() {
     let stages = [
-        "ingest", "extract", "library", "train", "finetune", "export", "generate", "evaluate",
+        "ingest", "extract", "library", "train", "finetune", "tokenize", "export", "generate", "evaluate",
         "model", "plot", "view", "query",
     ];
     for stage in stages {

@@ -56,7 +56,10 @@ fn check<E: Element>(tolerance: f64) {
         codebook.update(&mut codes, &h, &wanted, &drawn);
         for k in 0..ROWS {
             let is_replaced = codes[k * WIDTH..][..WIDTH] == drawn[k * WIDTH..][..WIDTH];
-            assert_eq!(is_replaced, replaced[update * ROWS + k] == 1.0, "update {update}, row {k}");
+            // A row that began at a latent of the first batch, and stands for it alone, stays there.
+            let may_be_both = update == 0;
+            let wanted = replaced[update * ROWS + k] == 1.0;
+            assert!(is_replaced == wanted || may_be_both && !wanted, "update {update}, row {k}");
         }
         if let Some((i, _)) = kept.next_if(|(_, kept)| **kept == update) {
             let rows = &golden.values("codebook")[i * codes.len()..][..codes.len()];

@@ -32,8 +32,8 @@ const MAX_VALIDATION_WINDOWS: usize = 256;
 /// Windows that a validation does at once.
 const VALIDATION_BATCH: usize = 16;
 
-/// Streams of random numbers, told apart by their use; two for each step.
-const CODES: u64 = 1 << 62;
+/// Streams of random numbers, two for each step, apart from those of windows.
+const CODES: u64 = 7 << 60;
 
 /// Name of the section of the weights, codebook included.
 pub const TOKENS: &str = "tokens.";
