@@ -11,3 +11,4 @@ mod optimizer;
 mod outline;
 mod overfit;
 mod state_dict;
+mod tokens;

@@ -296,8 +296,8 @@ fn learners_of_soloists_leave_groups_out_and_learners_of_groups_read_them() {
     assert_eq!(
         said,
         [
-            ("group", "phrase b has 3 dancers; a model of the family unet learns from soloists"),
-            ("group", "phrase c has 5 dancers; a model of the family unet learns from soloists"),
+            ("group", "phrase b has 3 dancers; a model of one dancer learns from soloists"),
+            ("group", "phrase c has 5 dancers; a model of one dancer learns from soloists"),
         ]
     );
     let (dataset, left_out) = read(Ensemble::Groups { most: 4 });
@@ -342,7 +342,7 @@ fn a_store_of_groups_alone_is_nothing_for_soloists() {
         error.to_string(),
         format!(
             "store {location} has 1 phrases with both motion and features, all of groups of dancers; a model of \
-             the family unet learns from soloists"
+             one dancer learns from soloists"
         )
     );
 }

@@ -10,6 +10,7 @@ use motiongen::stages::ingest::Ingest;
 use motiongen::stages::library::Library;
 #[cfg(feature = "query")]
 use motiongen::stages::query::Query;
+use motiongen::stages::tokenize::Tokenize;
 use motiongen::stages::train::Train;
 use motiongen::stages::view::View;
 use motiongen::stages::{Silent, Stage};
@@ -82,6 +83,10 @@ fn costs(n: usize) -> BTreeMap<&'static str, Traffic> {
         let quick = ["--model=m", "--steps=1", "--engine=eager", "--run=g", "--tracks=all"];
         run_stage::<Generate>(&[&[store.as_str()][..], &quick].concat());
     });
+    let tokens = ["--family=tokens", "--run=t", "--preset=tiny", "--steps=1", "--batch-size=2"];
+    run_stage::<Train>(&[&[store.as_str(), "--window-frames=24"][..], &tokens].concat());
+    count("tokenize", &|| run_stage::<Tokenize>(&[&store, "--run=t"]));
+    count("tokenize again", &|| run_stage::<Tokenize>(&[&store, "--run=t"]));
     count("evaluate", &|| run_stage::<Evaluate>(&[&store, "--run=g", "--quick"]));
     count("library", &|| run_stage::<Library>(&[&store, "--compose=1", "--takes=1"]));
     count("view", &|| run_stage::<View>(&[&store, "--phrase=p00000", &page]));

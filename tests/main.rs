@@ -45,6 +45,7 @@ mod shell;
 mod status;
 mod store_suite;
 mod support;
+mod tokens;
 mod train;
 mod training;
 mod view;

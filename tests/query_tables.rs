@@ -26,12 +26,14 @@ const PHRASES: [(&str, usize, bool); 5] = [
 ];
 
 /// The tables that are empty until there are models.
-const OF_MODELS: [&str; 9] = [
+const OF_MODELS: [&str; 11] = [
     "training_log",
     "onnx_checks",
     "generations",
     "generated",
     "decoded",
+    "tokens",
+    "tokenizations",
     "sanity_checks",
     "metrics",
     "verdicts",
@@ -210,10 +212,8 @@ fn tables_counts_rows_bytes_and_parts_of_what_is_live() {
             let version = match name {
                 "phrases" => 5,
                 "generations" => 4,
-                "extractions" => 3,
-                "motion" | "generated" | "decoded" | "training_log" | "beats" | "sanity_checks" => {
-                    2
-                }
+                "extractions" | "training_log" => 3,
+                "motion" | "generated" | "decoded" | "beats" | "sanity_checks" => 2,
                 _ => 1,
             };
             let n_parts = live.len();
@@ -338,11 +338,13 @@ features                    0              0       0        1
 extractions                 0              0       0        3
 beats                       0              0       0        2
 failures                    0              0       0        1
-training_log                0              0       0        2
+training_log                0              0       0        3
 onnx_checks                 0              0       0        1
 generations                 0              0       0        4
 generated                   0              0       0        2
 decoded                     0              0       0        2
+tokens                      0              0       0        1
+tokenizations               0              0       0        1
 sanity_checks               0              0       0        2
 metrics                     0              0       0        1
 verdicts                    0              0       0        1

@@ -5,9 +5,9 @@ use std::process::{Command, Stdio};
 
 use crate::support::run;
 
-const STAGES: [&str; 15] = [
-    "ingest", "extract", "library", "train", "finetune", "export", "generate", "evaluate", "model",
-    "plot", "view", "query", "status", "compact", "vacuum",
+const STAGES: [&str; 16] = [
+    "ingest", "extract", "library", "train", "finetune", "tokenize", "export", "generate",
+    "evaluate", "model", "plot", "view", "query", "status", "compact", "vacuum",
 ];
 
 #[test]

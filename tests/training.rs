@@ -1,5 +1,6 @@
 //! Training and fine-tuning: data, and losses, gradients and steps against PyTorch.
 
+mod codebook;
 mod dataset;
 mod finetune;
 mod given;

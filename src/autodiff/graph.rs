@@ -21,7 +21,7 @@ use super::op::filter::FilterFrames;
 use super::op::frames::{FrameMask, ReplaceEnds, StrideMask, TakeFrames};
 use super::op::group_norm::NormFilmActivate;
 use super::op::layer_norm::LayerNormalize;
-use super::op::lookup::{Embed, Gather};
+use super::op::lookup::{Embed, Gather, NearestRow, StraightThrough};
 use super::op::modulation::{MeanFrames, Modulate, NormalizeFrames};
 use super::op::normalize::Normalize;
 use super::op::parameter::Take;
@@ -143,6 +143,14 @@ impl<I: Interpreter> Graph for I {
 
     fn embedding(&mut self, table: ParameterId, index: &Self::Tensor) -> Result<Self::Tensor> {
         self.apply(Embed::new(table), &[index])
+    }
+
+    fn nearest_row(&mut self, x: &Self::Tensor, table: ParameterId) -> Result<Self::Tensor> {
+        self.apply(NearestRow(table), &[x])
+    }
+
+    fn straight_through(&mut self, x: &Self::Tensor, value: &Self::Tensor) -> Result<Self::Tensor> {
+        self.apply(StraightThrough, &[x, value])
     }
 
     fn dropout(&mut self, x: &Self::Tensor, probability: f64) -> Result<Self::Tensor> {

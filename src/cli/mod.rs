@@ -34,6 +34,7 @@ use crate::stages::plot::Plot;
 #[cfg(feature = "query")]
 use crate::stages::query::Query;
 use crate::stages::status::Status;
+use crate::stages::tokenize::Tokenize;
 use crate::stages::train::Train;
 use crate::stages::vacuum::Vacuum;
 use crate::stages::view::View;
@@ -63,6 +64,7 @@ fn entries() -> Vec<StageEntry> {
         StageEntry::of::<Library>(),
         StageEntry::of::<Train>(),
         StageEntry::of::<Finetune>(),
+        StageEntry::of::<Tokenize>(),
         StageEntry::of::<Export>(),
         StageEntry::of::<Generate>(),
         StageEntry::of::<Evaluate>(),
@@ -85,6 +87,7 @@ fn commands() -> Vec<Command> {
         command::<Library>(),
         command::<Train>(),
         command::<Finetune>(),
+        command::<Tokenize>(),
         command::<Export>(),
         command::<Generate>(),
         command::<Evaluate>(),

@@ -136,6 +136,11 @@ pub enum DiffusionError {
     )]
     SamplerSteps { n_steps: usize, n_train: usize },
     #[error(
+        "the spacing fast27 takes 27 of at least 50 steps, and {n_steps} of {n_train} are asked for; \
+         give the sampler 27 steps, or another spacing"
+    )]
+    Fast27 { n_steps: usize, n_train: usize },
+    #[error(
         "eta is {eta}; it must be 0 (no noise is added while sampling) to 1 (as much as DDPM adds)"
     )]
     Eta { eta: f64 },

@@ -7,7 +7,7 @@ use super::ddim::ddim_update;
 use super::ddpm::posterior;
 use super::dpm_solver::dpm_solver_update;
 use super::schedule::Schedule;
-use super::spacing::{SamplerStep, Spacing, steps};
+use super::spacing::{N_FAST27, SamplerStep, Spacing, steps};
 
 /// DPM-Solver++ takes its last step in first order below this many steps, as diffusers does.
 const LOWER_ORDER_FINAL_BELOW: usize = 15;
@@ -89,6 +89,12 @@ impl Default for SamplerConfig {
 }
 
 impl SamplerConfig {
+    /// Draws from the posterior at the 27 steps of GLIDE, as MoTok decodes tokens.
+    pub fn fast27() -> Self {
+        let (sampler, spacing) = (Sampler::Ddpm, Spacing::Fast27);
+        Self { sampler, n_steps: N_FAST27, spacing, clip: true }
+    }
+
     /// Refuses what cannot be sampled with a diffusion of `n_train` steps.
     ///
     /// # Errors

@@ -23,6 +23,31 @@ pub enum Spacing {
     /// From T − 1 down, ⌊T/n⌋ apart, as the reference design samples: its last step leads to ᾱ_0
     /// instead of 1, so that what comes out keeps the noise of step 0. To reproduce its numbers only.
     Reference,
+    /// The 27 steps of GLIDE (Nichol et al., ICML 2022, `respace.py`), dense where there is little noise; the first
+    /// visited is T − 3.
+    Fast27,
+}
+
+/// Steps that [`Spacing::Fast27`] has in each fifth of those that were trained, from the least noise on.
+const FAST27: [usize; 5] = [10, 10, 3, 2, 2];
+/// How many that are.
+pub(super) const N_FAST27: usize = 27;
+
+/// Returns GLIDE's 27 of T steps, T at least 50, highest first.
+///
+/// In each fifth n steps from its first to its last, evenly; then T − 3 in place of T − 1.
+fn fast27(n_train: usize) -> Vec<usize> {
+    let (size, more) = (n_train / FAST27.len(), n_train % FAST27.len());
+    let (mut found, mut first) = (Vec::new(), 0);
+    for (i, n) in FAST27.into_iter().enumerate() {
+        let size = size + usize::from(i < more);
+        found.extend((0..n).map(|j| first + rounded_ratio(j * (size - 1), n - 1)));
+        first += size;
+    }
+    found.retain(|&t| t != n_train - 1);
+    found.push(n_train - 3);
+    found.sort_unstable_by(|a, b| b.cmp(a));
+    found
 }
 
 /// One step of a sampler: from x_t to x at `next`.
@@ -41,11 +66,12 @@ pub struct SamplerStep {
 /// - leading: (n − 1 − i) ⌊T/n⌋
 /// - linspace: round((n − 1 − i) (T−1)/(n−1)), and T − 1 where n is 1
 /// - reference: T − 1 − i ⌊T/n⌋
+/// - fast27: see [`Spacing::Fast27`]
 ///
 /// The timesteps are those of NumPy's `arange`, `linspace` and `round` in exact arithmetic.
 ///
 /// # Errors
-/// An `n_steps` of 0 or above `n_train`.
+/// An `n_steps` of 0 or above `n_train`, or other than a spacing of a number of its own has.
 pub fn timesteps(
     n_train: usize,
     n_steps: usize,
@@ -54,13 +80,21 @@ pub fn timesteps(
     if n_steps == 0 || n_steps > n_train {
         return Err(DiffusionError::SamplerSteps { n_steps, n_train });
     }
+    if spacing == Spacing::Fast27 {
+        // A fifth has at least as many steps as are taken of it.
+        let is_long_enough = n_train / FAST27.len() >= FAST27[0];
+        if n_steps != N_FAST27 || !is_long_enough {
+            return Err(DiffusionError::Fast27 { n_steps, n_train });
+        }
+        return Ok(fast27(n_train));
+    }
     let stride = n_train / n_steps;
     let step = |i: usize| match spacing {
         Spacing::Trailing => rounded_ratio(n_train * (n_steps - i), n_steps) - 1,
         Spacing::Leading => (n_steps - 1 - i) * stride,
         Spacing::Linspace if n_steps == 1 => n_train - 1,
         Spacing::Linspace => rounded_ratio((n_steps - 1 - i) * (n_train - 1), n_steps - 1),
-        Spacing::Reference => n_train - 1 - i * stride,
+        Spacing::Reference | Spacing::Fast27 => n_train - 1 - i * stride,
     };
     Ok((0..n_steps).map(step).collect())
 }
@@ -117,6 +151,31 @@ mod tests {
         // 1000/3 is not whole: the reference's stride is 333, trailing rounds 666.67 and 333.33.
         assert_eq!(timesteps(1000, 3, Spacing::Reference), Ok(vec![999, 666, 333]));
         assert_eq!(timesteps(1000, 3, Spacing::Trailing), Ok(vec![999, 666, 332]));
+    }
+
+    #[test]
+    fn the_fast_ones_are_glides() {
+        // `space_timesteps(1000, "fast27")` of glide_text2im/respace.py.
+        let mut glide = [
+            0, 22, 44, 66, 88, 111, 133, 155, 177, 199, 200, 222, 244, 266, 288, 311, 333, 355,
+            377, 399, 400, 500, 599, 600, 799, 800, 997,
+        ];
+        glide.reverse();
+        assert_eq!(timesteps(1000, 27, Spacing::Fast27).as_deref(), Ok(&glide[..]));
+        for n_train in [50, 53, 999] {
+            let t = timesteps(n_train, 27, Spacing::Fast27).expect("steps");
+            assert_eq!((t.len(), t[0], t[26]), (27, n_train - 3, 0), "{n_train}");
+            assert!(t.windows(2).all(|pair| pair[0] > pair[1]), "{t:?}");
+        }
+        for (n_train, n_steps) in [(1000, 20), (49, 27)] {
+            assert_eq!(
+                timesteps(n_train, n_steps, Spacing::Fast27).expect_err("others").to_string(),
+                format!(
+                    "the spacing fast27 takes 27 of at least 50 steps, and {n_steps} of {n_train} are asked for; \
+                     give the sampler 27 steps, or another spacing"
+                )
+            );
+        }
     }
 
     #[test]

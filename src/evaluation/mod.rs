@@ -18,6 +18,7 @@ pub mod kinetic;
 pub mod locking;
 pub mod measured;
 pub mod metrics;
+mod reconstruction;
 pub mod reference_statistics;
 pub mod sanity;
 pub mod score;
@@ -26,6 +27,7 @@ pub mod window;
 pub mod window_range;
 
 pub use measured::WindowMeasures;
+pub use reconstruction::{ReconstructionError, reconstruction_error};
 pub use sanity::{
     Check, CheckSet, checks, derivative_error, holds_by_construction, holds_by_derivation,
 };

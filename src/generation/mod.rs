@@ -14,6 +14,7 @@ mod retrieval;
 mod runtime;
 mod sampling;
 mod seam;
+mod tokens;
 mod track;
 #[cfg(test)]
 mod walk;
@@ -36,6 +37,7 @@ pub use pool::Pool;
 pub use retrieval::Retrieval;
 pub use runtime::{OnnxEngine, SessionPlan};
 pub use sampling::{Sampling, sample};
+pub use tokens::TokenEngine;
 pub use track::{
     Generator, OVERLAP_FRAMES, PrimingMotion, RUN_WINDOWS, Track, WeightedConstraints,
 };

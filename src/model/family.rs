@@ -11,6 +11,8 @@ pub enum Family {
     Unet,
     /// A transformer that denoises the motion of several dancers, and a score of how well they fit together.
     Group,
+    /// A tokenizer: motion of one dancer becomes tokens, and a diffusion makes motion of them.
+    Tokens,
 }
 
 impl Family {
@@ -19,6 +21,7 @@ impl Family {
         match self {
             Self::Unet => "unet",
             Self::Group => "group",
+            Self::Tokens => "tokens",
         }
     }
 

@@ -216,6 +216,16 @@ pub trait Graph: Sized {
     /// Takes rows of a learned table, \[rows, channels\], by index.
     fn embedding(&mut self, table: ParameterId, index: &Self::Tensor) -> Result<Self::Tensor>;
 
+    /// argmin_k ‖x − c_k‖²: the number of the nearest row of a table, \[rows, channels\], of ties the first.
+    ///
+    /// A whole number has no gradient, so neither has the table. \[..., channels\] → \[...\]
+    fn nearest_row(&mut self, x: &Self::Tensor, table: ParameterId) -> Result<Self::Tensor>;
+
+    /// `value`, whose gradient goes to x: x + sg(value − x), where sg stops the gradient.
+    ///
+    /// van den Oord et al., "Neural Discrete Representation Learning", NIPS 2017, section 3.2.
+    fn straight_through(&mut self, x: &Self::Tensor, value: &Self::Tensor) -> Result<Self::Tensor>;
+
     /// In training sets each number to zero with the probability, and divides the rest by 1 − it.
     ///
     /// Srivastava et al., "Dropout", JMLR 15, 2014.
@@ -311,9 +321,9 @@ pub trait Graph: Sized {
     /// Puts `n` tokens, which count, before the frames of a mask: \[batch, frames\] → \[batch, n + frames\].
     fn token_mask(&mut self, mask: &Self::Tensor, n: usize) -> Result<Self::Tensor>;
 
-    /// (bias + s) x + h, a scale and a shift for each sample.
+    /// (bias + s) x + h, a scale and a shift for each sample, or for each of its frames.
     ///
-    /// `x`: \[batch, frames, channels\]; `film`: \[batch, 2 channels\], s then h. With bias 1 Perez et al., "FiLM",
+    /// `x`: \[batch, frames, channels\]; `film`: \[batch, 2 channels\] or \[batch, frames, 2 channels\], s then h. With bias 1 Perez et al., "FiLM",
     /// AAAI 2018; with bias 0 the affine part of AdaIN (Huang and Belongie, ICCV 2017, eq. 8).
     fn modulate(
         &mut self,

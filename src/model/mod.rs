@@ -2,8 +2,8 @@
 //!
 //! [`Graph`] is what an interpreter offers; [`UNet1D`] predicts noise from noisy motion, step and
 //! music; [`MotionDecoder`] turns what was sampled into the 25 channels; [`GroupDenoiser`] predicts the motion of a
-//! group, and [`GroupScore`] how well motion fits its group. This room knows shapes and
-//! names, not numbers: values are the interpreter's.
+//! group, and [`GroupScore`] how well motion fits its group; [`Tokenizer`] turns motion into tokens and back. This room
+//! knows shapes and names, not numbers: values are the interpreter's.
 
 mod condition;
 mod decoder;
@@ -13,6 +13,7 @@ mod group;
 mod layers;
 mod outline;
 mod parameter;
+mod tokens;
 mod unet;
 
 pub use condition::{ConditionConfig, condition, condition_scale};
@@ -29,4 +30,5 @@ pub use group::{
 pub use layers::{AttentionBlock, Conv1d, GroupNorm, LayerNorm, Linear, ResBlock};
 pub use outline::{ActivationCounts, Layer, Outline};
 pub use parameter::{Init, Parameter, ParameterId, ParameterList, Role, Scope};
+pub use tokens::{Quantized, Tokenizer, TokensConfig};
 pub use unet::{ConfigError, Preset, UNet1D, UNetConfig, UNetInputs};

@@ -257,6 +257,23 @@ impl Graph for Outline<'_> {
         Ok(self.result(shape))
     }
 
+    fn nearest_row(&mut self, x: &Vec<usize>, table: ParameterId) -> Result<Vec<usize>> {
+        let rows = self.outputs("nearest_row", x, table)?;
+        let (channels, shape) = x.split_last().expect("invariant: it has channels");
+        // A difference, its square and their sum.
+        let flops = 3 * (shape.iter().product::<usize>() * rows * channels) as u64;
+        self.layer("nearest_row", &[], shape, flops);
+        Ok(shape.to_vec())
+    }
+
+    fn straight_through(&mut self, x: &Vec<usize>, value: &Vec<usize>) -> Result<Vec<usize>> {
+        if x != value {
+            let problem = format!("value has shape {value:?}, input {x:?}");
+            return Err(GraphError::shape("straight_through", problem));
+        }
+        Ok(value.clone())
+    }
+
     fn dropout(&mut self, x: &Vec<usize>, probability: f64) -> Result<Vec<usize>> {
         Ok(if probability > 0.0 { self.result(x.clone()) } else { x.clone() })
     }

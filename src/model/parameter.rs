@@ -38,6 +38,9 @@ pub enum Role {
     Table,
     /// Biases, scales of norms, single vectors; does not decay.
     Vector,
+    /// Rows that a nearest one is chosen from, \[rows, channels\]; learned by averages, not by gradients, and left alone
+    /// by the optimizer.
+    Code,
 }
 
 /// A parameter: its name in files, its shape as PyTorch has it, how it begins.

@@ -284,6 +284,11 @@ impl<'p> Builder<'p> {
         self.value(axes, channels, Names { last: Some(name), first: None })
     }
 
+    /// Whole numbers.
+    pub(super) fn new_index(&mut self, axes: Axes, name: String) -> Value {
+        Value { integer: true, ..self.new_last(axes, 0, name) }
+    }
+
     /// A value of frames whose tensor has channels before frames.
     pub(super) fn new_first(&mut self, channels: usize, name: String) -> Value {
         self.value(Axes::Frames, channels, Names { last: None, first: Some(name) })

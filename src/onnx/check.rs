@@ -13,8 +13,9 @@ use super::proto::{AttributeType, DataType, Graph, Model, Node, Tensor};
 /// The operators that are written: name, fewest and most inputs, attributes.
 ///
 /// Versions: the newest of each up to opset 21 (<https://onnx.ai/onnx/operators>).
-const OPERATORS: [(&str, usize, usize, &[&str]); 44] = [
+const OPERATORS: [(&str, usize, usize, &[&str]); 45] = [
     ("Add", 2, 2, &[]),
+    ("ArgMax", 1, 1, &["axis", "keepdims"]),
     ("Cast", 1, 1, &["to"]),
     ("Concat", 1, usize::MAX, &["axis"]),
     ("Conv", 2, 3, &["kernel_shape", "strides", "dilations", "pads", "group"]),

@@ -253,6 +253,36 @@ impl Graph for Builder<'_> {
         self.rows(&table, *index, channels)
     }
 
+    /// argmin ‖x − c‖² = argmax x · c − ‖c‖² / 2.
+    fn nearest_row(&mut self, x: &Value, table: ParameterId) -> Result<Value> {
+        self.begin("nearest_row", Some(table));
+        self.outputs("nearest_row", *x, table)?;
+        let axes = match x.axes {
+            Axes::Frames => Axes::Mask,
+            Axes::Samples => Axes::Batch,
+            axes => {
+                let problem = format!("input has axes {axes:?}, expected Frames or Samples");
+                return Err(GraphError::shape("nearest_row", problem));
+            }
+        };
+        let name = self.last(*x)?;
+        let columns = self.weight(table, Use::Transposed);
+        let products = self.node("MatMul", &[&name, &columns], vec![]);
+        let squares = self.node("Mul", &[&columns, &columns], vec![]);
+        let first = self.integers(&[0]);
+        let squares = self.node("ReduceSum", &[&squares, &first], vec![integer("keepdims", 0)]);
+        let half = self.number(0.5);
+        let squares = self.node("Mul", &[&squares, &half], vec![]);
+        let nearness = self.node("Sub", &[&products, &squares], vec![]);
+        let last = vec![integer("axis", -1), integer("keepdims", 0)];
+        let y = self.node("ArgMax", &[&nearness], last);
+        Ok(self.new_index(axes, y))
+    }
+
+    fn straight_through(&mut self, _x: &Value, value: &Value) -> Result<Value> {
+        Ok(*value)
+    }
+
     fn dropout(&mut self, x: &Value, _probability: f64) -> Result<Value> {
         Ok(*x)
     }
@@ -416,10 +446,15 @@ impl Graph for Builder<'_> {
 
     fn modulate(&mut self, x: &Value, film: &Value, bias: f64) -> Result<Value> {
         self.begin("modulate", None);
-        expect("modulate", *film, Axes::Samples)?;
-        let (name, film) = (self.last(*x)?, self.last(*film)?);
-        let axes = self.integers(&[1]);
-        let film = self.node("Unsqueeze", &[&film, &axes], vec![]);
+        let is_of_frames = film.axes == Axes::Frames;
+        if !is_of_frames {
+            expect("modulate", *film, Axes::Samples)?;
+        }
+        let (name, mut film) = (self.last(*x)?, self.last(*film)?);
+        if !is_of_frames {
+            let axes = self.integers(&[1]);
+            film = self.node("Unsqueeze", &[&film, &axes], vec![]);
+        }
         let halves = vec![integer("axis", -1), integer("num_outputs", 2)];
         let halves = self.nodes_of("Split", &[&film], halves, 2);
         let mut scale = halves[0].clone();

@@ -57,6 +57,8 @@ kinds! {
     Name = "name",
     /// A song without enough beats to dance to.
     NoBeats = "no_beats",
+    /// A phrase whose motion is not in the table.
+    NoMotion = "no_motion",
     /// A phrase with nothing to dance to.
     NoMusic = "no_music",
     /// A capture that nothing can be danced of.

@@ -27,6 +27,7 @@ pub mod query;
 mod retrieval;
 mod seen;
 pub mod status;
+pub mod tokenize;
 pub mod train;
 mod trained;
 pub mod vacuum;

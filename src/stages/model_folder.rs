@@ -190,7 +190,7 @@ impl ModelFolder {
     ) -> Result<Self, CardError> {
         let family = family_of(&card_bytes, &card_place)?;
         let entries = match family {
-            Family::Unet => ModelCard::read(&card_bytes, &card_place)?.files,
+            Family::Unet | Family::Tokens => ModelCard::read(&card_bytes, &card_place)?.files,
             Family::Group => GroupCard::read(&card_bytes, &card_place)?.files,
         };
         Ok(Self { family, card_bytes, card_place, entries, source, place, is_verified: false })

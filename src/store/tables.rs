@@ -127,7 +127,7 @@ rows! {
     {
         segment: String, "", "The stretch of the log, from one checkpoint to the next: `run/stage/` and the steps done before it.";
         run: String, "", "Name of the run.";
-        stage: String, "", "`diffusion` (the UNet), `decoder`, `finetune` (both, end to end) or `group` (denoiser and score of groups).";
+        stage: String, "", "`diffusion` (the UNet), `decoder`, `finetune` (both, end to end), `group` (denoiser and score of groups) or `tokens` (a tokenizer).";
         kind: String, "", "`step`, `epoch` (means over its steps) or `validation`.";
         epoch: i32, "epochs", "Epoch, from 1.";
         step: i64, "steps", "Steps done, this one included.";
@@ -135,7 +135,7 @@ rows! {
         lr_decoder: Option<f64>, "", "Learning rate of the decoder in finetune.";
         loss: Option<f64>, "", "What is minimised; of a validation, with the weights that would be used (the average, in diffusion and decoder). None where it was not finite.";
         loss_live: Option<f64>, "", "Of a validation: the loss of the weights themselves rather than their average.";
-        diffusion: Option<f64>, "", "Mean loss of the UNet's prediction.";
+        diffusion: Option<f64>, "", "Mean loss of the prediction of the UNet, or of another family's denoiser.";
         reconstruction: Option<f64>, "", "Mean squared error of decoded motion over all channels, in units of their spread.";
         decoder_position: Option<f64>, "m²", "Mean squared error of decoded positions.";
         decoder_quaternion: Option<f64>, "", "Mean squared error of decoded quaternions, of the nearer sign.";
@@ -152,6 +152,8 @@ rows! {
         markers: Option<f64>, "m²", "Of a model of groups: mean squared error of points fixed to each body. This and `contrast` are none in rows of version 1.";
         contrast: Option<f64>, "", "Of a model of groups: cross-entropy of telling a group from mixed ones.";
         sampled_distance: Option<f64>, "", "Of a validation in diffusion: root mean square of the logarithms of how motion sampled for validation windows moves, over how real motion moves: locking to the bar, speed along each axis, jerk, turning and changes of turning; 0 is alike. The checkpoint with the least is kept. None in rows before version 3.";
+        commitment: Option<f64>, "", "Of a tokenizer: mean squared distance of latents from their codes. This and `perplexity` are none in rows of versions before 3.";
+        perplexity: Option<f64>, "codes", "Of a tokenizer: how many codes are in use, were all used alike: exp(−Σ p ln p) over the tokens of the batch, or of all validation windows.";
         gradient_norm: Option<f64>, "", "Norm of the gradient before it was clipped.";
         skipped: bool, "", "Whether the step was skipped because something was not finite.";
         samples_per_s: Option<f64>, "1/s", "Windows learned from per second.";
@@ -227,6 +229,38 @@ impl GenerationRow {
     /// Returns how many dancers the motion has, 1 where the row is older than groups.
     pub fn count_dancers(&self) -> usize {
         usize::try_from(self.n_dancers.unwrap_or(1)).unwrap_or(1)
+    }
+}
+
+rows! {
+    "One row per token of a dancer's motion."
+    TokenRow in "tokens" version 1 sorted by [tokenization, dancer, position]
+    {
+        tokenization: String, "", "The tokens of a phrase: `RUN/PHRASE`, as in `tokenizations`.";
+        run: String, "", "The run of train whose tokenizer wrote it.";
+        phrase_id: String, "", "The phrase, as in `phrases`.";
+        dancer: i32, "", "Number of the dancer, as in `motion`.";
+        position: i32, "tokens", "Number of the token, from 0: it stands for `frames_per_token` frames, and in each window of training's length the last for those that are left.";
+        token: i32, "", "Number of the code, from 0 to below `n_codes`.";
+    }
+}
+
+rows! {
+    "One row per dancer of a phrase that tokenize wrote as tokens, with what holds for all of them."
+    TokenizationRow in "tokenizations" version 1 sorted by [tokenization, dancer]
+    {
+        tokenization: String, "", "The tokens of a phrase: `RUN/PHRASE`.";
+        run: String, "", "The run of train whose tokenizer wrote them.";
+        phrase_id: String, "", "The phrase, as in `phrases`.";
+        dancer: i32, "", "Number of the dancer, as in `motion`.";
+        weights: String, "SHA-256", "Digest of the tokenizer's weights, codebook included.";
+        n_codes: i32, "codes", "K, rows of the codebook.";
+        frames_per_token: i32, "frames", "ρ, frames that a token stands for.";
+        n_frames: i64, "frames", "Frames of the motion.";
+        n_tokens: i64, "tokens", "Tokens that stand for them.";
+        position_error_m: Option<f64>, "m", "Mean distance of positions from those of motion that was made of the tokens again; none without --reconstruct.";
+        orientation_error_deg: Option<f64>, "°", "Mean angle of orientations to those of that motion; none without --reconstruct.";
+        content_hash: String, "BLAKE3", "`content_hash` of the phrase as it was then; where `phrases` has another, the tokens are of motion that was replaced.";
     }
 }
 
@@ -441,6 +475,8 @@ pub fn all() -> Vec<TableSchema> {
         GenerationRow::schema(),
         generated(),
         decoded(),
+        TokenRow::schema(),
+        TokenizationRow::schema(),
         SanityCheckRow::schema(),
         MetricRow::schema(),
         VerdictRow::schema(),

@@ -44,6 +44,11 @@ impl NetworkState {
         &self.parameters
     }
 
+    /// Returns the weights themselves for writing; the caller keeps gaps and padding zero.
+    pub fn live_mut(&mut self) -> &mut Parameters<f32> {
+        &mut self.parameters
+    }
+
     /// Returns the weights to use.
     pub fn average(&self) -> &Parameters<f32> {
         self.ema.average()

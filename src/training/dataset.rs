@@ -114,9 +114,9 @@ impl Ensemble {
     /// Returns why so many dancers are not learned from, to go on from "has".
     fn refusal(self, n_dancers: usize) -> Option<String> {
         match self {
-            Self::Soloists if n_dancers > 1 => Some(format!(
-                "{n_dancers} dancers; a model of the family unet learns from soloists"
-            )),
+            Self::Soloists if n_dancers > 1 => {
+                Some(format!("{n_dancers} dancers; a model of one dancer learns from soloists"))
+            }
             Self::Groups { most } if n_dancers > most => Some(format!(
                 "{n_dancers} dancers, more than the {most} of the largest group that is learned from"
             )),
@@ -161,7 +161,7 @@ pub enum DatasetError {
     Empty { store: String },
     #[error(
         "store {store} has {n_groups} phrases with both motion and features, all of groups of dancers; a model of \
-         the family unet learns from soloists"
+         one dancer learns from soloists"
     )]
     GroupsAlone { store: String, n_groups: usize },
     #[error(

@@ -174,6 +174,8 @@ impl<'a> Journal<'a> {
             markers: part("markers"),
             contrast: part("contrast"),
             sampled_distance: part("sampled_distance"),
+            commitment: part("commitment"),
+            perplexity: part("perplexity"),
             gradient_norm: entry.taken.and_then(|taken| finite(taken.gradient_norm)),
             skipped: entry.is_skipped,
             samples_per_s: entry.samples_per_s,

@@ -26,6 +26,7 @@ mod pairs;
 mod pipeline;
 mod sampling;
 mod temporal;
+mod tokens;
 mod window;
 
 pub use batch::{Batch, Chances, PAIR};
@@ -54,4 +55,8 @@ pub use loader::Loader;
 pub use objective::{ChannelWeights, Objective, Reconstruction, reconstruction};
 pub use sampling::{Condition, Denoiser};
 pub use temporal::{TemporalConfig, TemporalLosses, temporal_losses};
+pub use tokens::{
+    Codebook, CodebookConfig, TOKENS, TokensLearner, TokensNetworkConfig, TokensTrainConfig,
+    TokensTraining, perplexity,
+};
 pub use window::{Augmentation, Scales, Windows, fit_scales};

@@ -27,6 +27,8 @@ fn a_dry_run_of_any_stage_changes_not_one_byte() {
     let store = modelled(&dir);
     let done = ["--model=m", "--engine=eager", "--steps=3", "--run=done", "--overlap=7"];
     succeed(&mut stage("generate", &store, &done));
+    let tokens = ["--family=tokens", "--preset=tiny", "--window-frames=24", "--steps=2"];
+    succeed(&mut stage("train", &store, &[&tokens[..], &["--run=tok", "--batch-size=3"]].concat()));
     add_late_phrase(&dir, &store);
     let at = |path: &str| dir.at(path).display().to_string();
     let song = dir.write("song.wav", wav(1.3)).display().to_string();
@@ -49,6 +51,8 @@ fn a_dry_run_of_any_stage_changes_not_one_byte() {
         [&["train", "--store", &s, "--run=new", "--max-failed=1"][..], &small].concat(),
         [&["train", "--store", &s, "--run=run", "--force", "--max-failed=1"][..], &small].concat(),
         vec!["finetune", "--store", &s, "--run=run", "--max-failed=1"],
+        [&["train", "--store", &s, "--run=new", "--max-failed=1"][..], &tokens].concat(),
+        vec!["tokenize", "--store", &s, "--run=tok", "--reconstruct"],
         vec!["export", "--store", &s, "--run=run", "--model=other", "--max-failed=1"],
         [&generate[..], &["--run=new", "--overlap=7"]].concat(),
         [&files[..], &["--output", &out, "--stream", &stream]].concat(),

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::Duration;
 
-use motiongen::store::tables::{GenerationRow, MetricRow};
+use motiongen::store::tables::{GenerationRow, MetricRow, TokenRow};
 use motiongen::store::{ClientOptions, Lease, Location};
 
 use crate::generate::modelled;
@@ -50,6 +50,14 @@ fn a_run_that_another_process_generates_or_evaluates_is_refused_until_it_ends() 
     drop(lease);
     succeed(&mut stage("generate", &store, &GENERATE));
     assert_eq!(rows::<GenerationRow>(&store).len(), 2 * n_other);
+
+    let tokens = ["--family=tokens", "--preset=tiny", "--window-frames=24", "--steps=2"];
+    succeed(&mut stage("train", &store, &[&tokens[..], &["--run=tok", "--batch-size=3"]].concat()));
+    let lease = hold(&store, "tokenize/tok/0-of-1");
+    refused("tokenize", &["--run=tok"], "tokenize/tok/0-of-1");
+    assert_eq!(rows::<TokenRow>(&store).len(), 0);
+    drop(lease);
+    succeed(&mut stage("tokenize", &store, &["--run=tok"]));
 
     let lease = hold(&store, "evaluate/m");
     refused("evaluate", &["--run=m"], "evaluate/m");

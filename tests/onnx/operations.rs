@@ -46,6 +46,9 @@ enum Call {
     FilterFramesOfConvolution,
     HeldMask,
     StridedMask,
+    NearestRows,
+    NearestRowsOfSamples,
+    Modulate { bias: f64, of_frames: bool },
 }
 
 /// Sizes: odd, and all different.
@@ -76,6 +79,7 @@ struct Ids {
     gain: ParameterId,
     shift: ParameterId,
     table: ParameterId,
+    codes: ParameterId,
 }
 
 fn parameters() -> (ParameterList, Ids) {
@@ -91,6 +95,7 @@ fn parameters() -> (ParameterList, Ids) {
         gain: add("norm.weight", &[WIDTH], Role::Vector),
         shift: add("norm.bias", &[WIDTH], Role::Vector),
         table: add("embed.weight", &[ROWS, WIDTH], Role::Table),
+        codes: add("codes", &[ROWS + 8, WIDTH], Role::Code),
     };
     (list, ids)
 }
@@ -206,6 +211,21 @@ fn run<G: Graph>(call: Call, g: &mut G, x: &Given<G::Tensor>, ids: &Ids) -> Resu
         Call::StridedMask => {
             let mask = g.frame_mask(&x.x, Some(&x.mask), 4)?;
             g.stride_mask(&mask, 2)
+        }
+        Call::NearestRows => {
+            let h = convolved(g)?;
+            let index = g.nearest_row(&h, ids.codes)?;
+            let rows = g.embedding(ids.codes, &index)?;
+            g.straight_through(&h, &rows)
+        }
+        Call::NearestRowsOfSamples => {
+            let index = g.nearest_row(&x.samples, ids.codes)?;
+            g.embedding(ids.codes, &index)
+        }
+        Call::Modulate { bias, of_frames } => {
+            let h = convolved(g)?;
+            let film = if of_frames { g.concat(&[&x.other, &h])? } else { x.film.clone() };
+            g.modulate(&h, &film, bias)
         }
     }
 }
@@ -338,6 +358,11 @@ fn every_operation_gives_what_the_interpreter_gives() {
         Call::FilterFrames { taps: 4 * FRAMES + 3, mirror: Mirror::Odd },
         Call::HeldMask,
         Call::StridedMask,
+        Call::NearestRows,
+        Call::NearestRowsOfSamples,
+        Call::Modulate { bias: 1.0, of_frames: false },
+        Call::Modulate { bias: 0.0, of_frames: false },
+        Call::Modulate { bias: 1.0, of_frames: true },
     ];
     calls.extend(
         [

@@ -1,11 +1,13 @@
-//! Rows of a table by index: fixed tables, learned ones, and the nearest row of a codebook.
+//! Rows of a table by index: fixed tables, learned ones, and the number of the nearest row.
 
 use std::sync::Arc;
 
 use ndarray::Array2;
+use rayon::prelude::*;
 
 use super::binary::add_assign;
 use crate::autodiff::element::Element;
+use crate::autodiff::kernel::vectorized;
 use crate::autodiff::operation::{Backward, Operation, Run, expect_size};
 use crate::autodiff::tensor::Tensor;
 use crate::model::{GraphError, ParameterId, Result};
@@ -105,58 +107,100 @@ impl<E: Element> Operation<E> for Embed {
     }
 }
 
-/// The nearest row of a codebook in place of each row: vector quantisation.
+/// The number of the nearest row of a table for each row: vector quantisation.
 ///
-/// y = c_k, k = argmin ‖x − c_k‖², ties to the first. The gradient passes straight through to x
-/// (van den Oord et al., "Neural Discrete Representation Learning", NIPS 2017, sec. 3.2); the codebook
-/// itself is learned by averages, not by gradients.
+/// y = argmin_k ‖x − c_k‖², ties to the first. Numbers have no gradient.
 ///
 /// # Shapes
-/// x: \[..., channels\]; codebook: \[rows, channels\] → \[..., channels\]
-pub struct Quantize;
+/// x \[..., channels\]; table \[rows, channels\] → \[...\]
+pub struct NearestRow(pub ParameterId);
 
-/// Returns the nearest row of the codebook for each row.
-pub fn nearest_rows<E: Element>(x: &Tensor<E>, codebook: &Tensor<E>) -> Vec<usize> {
-    let channels = codebook.channels().max(1);
-    let distance = |a: &[E], b: &[E]| a.iter().zip(b).map(|(&a, &b)| (a - b) * (a - b)).sum::<E>();
-    let nearest = |row: &[E]| {
-        let mut best = (0, None);
-        for (k, code) in codebook.data().chunks_exact(channels).enumerate() {
-            let d = distance(row, code);
-            if best.1.is_none_or(|least| d < least) {
-                best = (k, Some(d));
+/// Numbers that are summed side by side.
+const LANES: usize = 16;
+
+vectorized! {
+    /// Returns the row of a table, one behind the other, that is nearest to x.
+    fn nearest<E: Element>(x: &[E], table: &[E]) -> usize {
+        let (mut best, mut least) = (0, E::from_f64(f64::INFINITY));
+        for (k, row) in table.chunks_exact(x.len()).enumerate() {
+            let mut lanes = [E::ZERO; LANES];
+            let (a, b) = (x.chunks_exact(LANES), row.chunks_exact(LANES));
+            let rest = a.remainder().iter().zip(b.remainder());
+            for (a, b) in a.zip(b) {
+                for (lane, (&a, &b)) in lanes.iter_mut().zip(a.iter().zip(b)) {
+                    *lane += (a - b) * (a - b);
+                }
+            }
+            for (lane, (&a, &b)) in lanes.iter_mut().zip(rest) {
+                *lane += (a - b) * (a - b);
+            }
+            let distance = lanes.iter().copied().sum::<E>();
+            if distance < least {
+                (best, least) = (k, distance);
             }
         }
-        best.0
-    };
-    x.data().chunks_exact(channels).map(nearest).collect()
+        best
+    }
 }
 
-impl<E: Element> Operation<E> for Quantize {
+impl<E: Element> Operation<E> for NearestRow {
     fn name(&self) -> &'static str {
-        "quantize"
+        "nearest_row"
+    }
+
+    fn parameter(&self) -> Option<ParameterId> {
+        Some(self.0)
     }
 
     fn forward(&mut self, x: &[&Tensor<E>], run: &Run<E>) -> Result<Tensor<E>> {
-        let [x, codebook] = [x[0], x[1]];
-        expect_size(
-            "quantize",
-            "input",
-            "channels",
-            x.channels(),
-            "codebook",
-            codebook.channels(),
-        )?;
-        if codebook.is_empty() {
-            return Err(GraphError::shape("quantize", "the codebook has no rows"));
+        let x = x[0];
+        let parameter = run.parameters.list().get(self.0);
+        let &[rows, channels] = parameter.shape.as_slice() else {
+            let problem = format!(
+                "{} has shape {:?}, expected [rows, channels]",
+                parameter.name, parameter.shape
+            );
+            return Err(GraphError::shape("nearest_row", problem));
+        };
+        expect_size("nearest_row", "input", "channels", x.channels(), &parameter.name, channels)?;
+        if rows == 0 || channels == 0 {
+            let problem = format!("{} has no numbers", parameter.name);
+            return Err(GraphError::shape("nearest_row", problem));
         }
-        let channels = x.channels();
-        let index = nearest_rows(x, codebook);
-        Ok(run.tensor(x.shape(), |y| {
-            for (y, k) in y.chunks_exact_mut(channels).zip(index) {
-                y.copy_from_slice(&codebook.data()[k * channels..][..channels]);
-            }
+        let table = run.parameters.get(self.0);
+        let shape = x.shape().split_last().map(|(_, leading)| leading).unwrap_or_default();
+        Ok(run.tensor(shape, |y| {
+            y.par_iter_mut()
+                .zip(x.data().par_chunks_exact(channels))
+                .for_each(|(y, x)| *y = E::from_f64(nearest(x, table) as f64));
         }))
+    }
+
+    fn backward(&mut self, _: Tensor<E>, _: &mut Backward<E>) -> Vec<Option<Tensor<E>>> {
+        vec![None]
+    }
+}
+
+/// A value in place of x that passes its gradient to x: x + sg(value − x).
+///
+/// van den Oord et al., "Neural Discrete Representation Learning", NIPS 2017, section 3.2.
+///
+/// # Shapes
+/// x, value \[...\] → the same
+pub struct StraightThrough;
+
+impl<E: Element> Operation<E> for StraightThrough {
+    fn name(&self) -> &'static str {
+        "straight_through"
+    }
+
+    fn forward(&mut self, x: &[&Tensor<E>], run: &Run<E>) -> Result<Tensor<E>> {
+        let [x, value] = [x[0], x[1]];
+        if x.shape() != value.shape() {
+            let problem = format!("value has shape {:?}, input {:?}", value.shape(), x.shape());
+            return Err(GraphError::shape("straight_through", problem));
+        }
+        Ok(run.tensor(value.shape(), |y| y.copy_from_slice(value.data())))
     }
 
     fn backward(&mut self, dy: Tensor<E>, at: &mut Backward<E>) -> Vec<Option<Tensor<E>>> {

@@ -15,14 +15,20 @@ fn check_mask<E: Element>(operation: &'static str, x: &Tensor<E>, mask: &Tensor<
     Err(GraphError::shape(operation, problem))
 }
 
-/// y\[b, t\] = (bias + s\[b\]) x\[b, t\] + h\[b\]: with bias 1 Perez et al., "FiLM", AAAI 2018; with bias 0 the affine
-/// part of Huang and Belongie, "Arbitrary Style Transfer" (AdaIN), ICCV 2017, eq. 8.
+/// y\[b, t\] = (bias + s\[b\]) x\[b, t\] + h\[b\], or with s\[b, t\] and h\[b, t\]: with bias 1 Perez et al., "FiLM", AAAI
+/// 2018; with bias 0 the affine part of Huang and Belongie, "Arbitrary Style Transfer" (AdaIN), ICCV 2017, eq. 8.
 ///
 /// # Shapes
-/// x \[batch, frames, channels\], film \[batch, 2 channels\], s then h → as x
+/// x \[batch, frames, channels\], film \[batch, 2 channels\] or \[batch, frames, 2 channels\], s then h → as x
 pub struct Modulate<E: Element> {
     bias: f64,
     kept: Option<[Tensor<E>; 2]>,
+}
+
+/// Returns how many numbers of `x` one scale and shift is for: those of a frame, or of a whole sample.
+fn modulated_at_once<E: Element>(x: &Tensor<E>, film: &Tensor<E>) -> usize {
+    let frames = if film.shape().len() == 3 { 1 } else { x.shape()[1] };
+    (frames * x.channels()).max(1)
 }
 
 impl<E: Element> Modulate<E> {
@@ -40,8 +46,9 @@ impl<E: Element> Operation<E> for Modulate<E> {
     fn forward(&mut self, x: &[&Tensor<E>], run: &Run<E>) -> Result<Tensor<E>> {
         let [x, film] = [x[0], x[1]];
         expect_axes("modulate", "input", x, 3, "[batch, frames, channels]")?;
-        let (batch, channels) = (x.shape()[0], x.channels());
-        if film.shape() != [batch, 2 * channels] {
+        let (batch, frames, channels) = (x.shape()[0], x.shape()[1], x.channels());
+        let is_of_frames = film.shape() == [batch, frames, 2 * channels];
+        if !is_of_frames && film.shape() != [batch, 2 * channels] {
             let wanted = [batch, 2 * channels];
             let problem =
                 format!("scale and shift have shape {:?}, input expects {wanted:?}", film.shape());
@@ -50,7 +57,7 @@ impl<E: Element> Operation<E> for Modulate<E> {
         if run.recording {
             self.kept = Some([x.clone(), film.clone()]);
         }
-        let (bias, sample) = (E::from_f64(self.bias), (x.len() / batch.max(1)).max(1));
+        let (bias, sample) = (E::from_f64(self.bias), modulated_at_once(x, film));
         Ok(run.tensor(x.shape(), |y| {
             let samples = y.chunks_exact_mut(sample).zip(x.data().chunks_exact(sample));
             for ((y, x), film) in samples.zip(film.data().chunks_exact(2 * channels)) {
@@ -68,7 +75,7 @@ impl<E: Element> Operation<E> for Modulate<E> {
     fn backward(&mut self, mut dy: Tensor<E>, at: &mut Backward<E>) -> Vec<Option<Tensor<E>>> {
         let [x, film] = self.kept.take().expect("kept by the forward");
         let channels = x.channels();
-        let sample = (x.len() / x.shape()[0].max(1)).max(1);
+        let sample = modulated_at_once(&x, &film);
         let d_film = at.needs[1].then(|| {
             at.tensor(film.shape(), |d| {
                 d.fill(E::ZERO);

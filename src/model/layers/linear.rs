@@ -13,7 +13,15 @@ pub struct Linear {
 impl Linear {
     /// Makes `weight` \[outputs, inputs\] and `bias` \[outputs\].
     pub fn new(scope: &mut Scope, inputs: usize, outputs: usize) -> Self {
-        let init = Init::fan_in(inputs);
+        Self::with(scope, inputs, outputs, Init::fan_in(inputs))
+    }
+
+    /// Makes a layer that begins at zero, so that its result is zero until it has learned.
+    pub fn zeros(scope: &mut Scope, inputs: usize, outputs: usize) -> Self {
+        Self::with(scope, inputs, outputs, Init::Zeros)
+    }
+
+    fn with(scope: &mut Scope, inputs: usize, outputs: usize, init: Init) -> Self {
         Self {
             weight: scope.parameter("weight", &[outputs, inputs], init, Role::Weight),
             bias: scope.parameter("bias", &[outputs], init, Role::Vector),
@@ -45,14 +53,23 @@ impl Conv1d {
         stride: usize,
     ) -> Self {
         let convolution = Convolution { taps, stride, padding: taps / 2, dilation: 1 };
-        let init = Init::fan_in(inputs * taps);
-        Self::with(scope, inputs, outputs, convolution, init)
+        Self::stepping(scope, inputs, outputs, convolution)
     }
 
     /// Makes a convolution that begins at zero, so that a fresh network's output is zero.
     pub fn zeros(scope: &mut Scope, inputs: usize, outputs: usize, taps: usize) -> Self {
         let convolution = Convolution { taps, stride: 1, padding: taps / 2, dilation: 1 };
         Self::with(scope, inputs, outputs, convolution, Init::Zeros)
+    }
+
+    /// Makes a convolution that steps over frames in a way of its own.
+    pub fn stepping(
+        scope: &mut Scope,
+        inputs: usize,
+        outputs: usize,
+        convolution: Convolution,
+    ) -> Self {
+        Self::with(scope, inputs, outputs, convolution, Init::fan_in(inputs * convolution.taps))
     }
 
     fn with(

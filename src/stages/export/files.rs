@@ -194,7 +194,7 @@ impl ExportedFiles {
 }
 
 /// Returns the SHA-256 of a network's weights: f32, little-endian, in the order of its layers.
-pub(super) fn weights_sha256(parameters: &Parameters<f32>) -> String {
+pub(in crate::stages) fn weights_sha256(parameters: &Parameters<f32>) -> String {
     let bytes =
         |id| -> Vec<u8> { parameters.unpacked(id).iter().flat_map(|x| x.to_le_bytes()).collect() };
     sha256_of(parameters.list().iter().map(|(id, _)| bytes(id)))

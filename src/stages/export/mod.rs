@@ -13,11 +13,12 @@ use bytes::Bytes;
 
 use self::checks::{CheckResults, ExportChecks, eager};
 use self::files::ExportedFiles;
+pub(in crate::stages) use self::files::weights_sha256;
 use self::report::{ExportDryRun, ExportSummary};
 use super::learned;
 use super::model_files::{POINTER, current_folder, folder_of, is_model_name, pointer_to, sha256};
 use super::train::session::{MachineParams, ProgressWatch, check_run_name, read_phrases};
-use super::trained::{TrainedRun, WeightsChoice};
+use super::trained::{TrainedRun, TrainedTokenizer, WeightsChoice};
 use super::{ClientParams, Contract, Progress, RARE, Stage, Summary, lease};
 use crate::generation::{ModelFileName, file_names};
 use crate::model::Family;
@@ -95,6 +96,12 @@ impl Stage for Export {
         if group::is_of_group(&store, &params.run)? {
             return group::run(&params, &store, progress);
         }
+        ensure!(
+            !TrainedTokenizer::is_of(&store, &params.run)?,
+            "run {} has a tokenizer, and models of the family tokens are not exported; motiongen tokenize reads it \
+             from the store",
+            params.run
+        );
         let mut trained = TrainedRun::read(&store, &params.run, params.weights)?;
         let machine = &params.machine;
         let watch = ProgressWatch(progress);

@@ -7,6 +7,7 @@ mod params;
 pub mod session;
 mod summary;
 pub(in crate::stages) mod survey;
+mod tokens;
 
 use std::sync::Arc;
 
@@ -23,8 +24,8 @@ use crate::motion::Normalizer;
 use crate::store::{Lease, Location};
 use crate::training::{
     Augmentation, CheckpointKind, Checkpoints, DecoderLearner, Denoiser, DiffusionLearner, Drive,
-    GroupLearner, Journal, Learner, Loader, State, TrainConfig, TrainingEnd, TrainingError,
-    Windows,
+    GroupLearner, Journal, Learner, Loader, State, TokensLearner, TrainConfig, TrainingEnd,
+    TrainingError, Windows,
 };
 use budget::{BudgetParams, StageBudget};
 use judge::ValidationJudge;
@@ -33,6 +34,10 @@ use session::{
     read_phrases, scales,
 };
 pub use summary::{StageSummary, TrainDryRun, TrainSummary};
+
+/// What this command trains, of any family.
+const STAGES: [&str; 4] =
+    [DiffusionLearner::STAGE, DecoderLearner::STAGE, GroupLearner::STAGE, TokensLearner::STAGE];
 
 /// The stage.
 pub struct Train;
@@ -79,8 +84,10 @@ impl Stage for Train {
 
     fn run(params: Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
         check_run_name(&params.run)?;
-        if params.config.network.family == Family::Group {
-            return group::run(&params, progress);
+        match params.config.network.family {
+            Family::Unet => {}
+            Family::Group => return group::run(&params, progress),
+            Family::Tokens => return tokens::run(&params, progress),
         }
         let config = params.config.config(params.seed);
         config.network.check()?;
@@ -189,14 +196,11 @@ impl<'a> Run<'a> {
 
     /// Removes what the run has left, so that it can begin anew.
     fn clear(&mut self) -> anyhow::Result<()> {
-        for stage in
-            [DiffusionLearner::STAGE, DecoderLearner::STAGE, GroupLearner::STAGE, "finetune"]
-        {
+        for stage in STAGES {
             self.checkpoints(stage).clear()?;
-        }
-        for stage in [DiffusionLearner::STAGE, DecoderLearner::STAGE, GroupLearner::STAGE] {
             self.journal(stage)?.clear()?;
         }
+        self.checkpoints("finetune").clear()?;
         Journal::open(self.store, "finetune", &self.params.run, "finetune")?.clear()?;
         for command in [Train::NAME, "finetune"] {
             self.store.remove(&claim_path(&self.params.run, command))?;

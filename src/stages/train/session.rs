@@ -148,7 +148,7 @@ pub fn read_phrases(
         patience: machine.patience(),
         max_train_phrases,
         ensemble: match family {
-            Family::Unet => Ensemble::Soloists,
+            Family::Unet | Family::Tokens => Ensemble::Soloists,
             Family::Group => Ensemble::Groups { most: MAX_DANCERS },
         },
     };

@@ -2,7 +2,7 @@
 """Makes the golden files for training and fine-tuning.
 
     pip install -r benches/requirements-engine.txt
-    python tests/golden/training/make.py
+    python tests/golden/training/make.py [codebook]
 
 PyTorch runs the networks of tests/golden/engine in float64 and without dropout, on the losses and the
 sampler of losses.py and diffusion.py; README.md says what is in the files. Before a file is written,
@@ -17,6 +17,7 @@ HERE = pathlib.Path(__file__).resolve().parent
 # Before this folder, so that `make` is the engine's.
 sys.path.insert(0, str(HERE.parent / "engine"))
 
+import codebook
 import finetune
 import given
 import losses
@@ -76,6 +77,9 @@ def save(name: str, arrays: dict[str, np.ndarray], parameters: list[str] | None 
 def main() -> None:
     # The order of sums, and with it the last bits, would depend on the number of threads.
     torch.set_num_threads(1)
+    save("codebook", codebook.transcript())
+    if sys.argv[1:] == ["codebook"]:
+        return
     save("decoded_losses", decoded_losses())
     save("step_small", *step.small())
     for case in finetune.CASES:

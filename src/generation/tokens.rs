@@ -1,0 +1,278 @@
+//! Motion to tokens, and tokens to motion, by the interpreter that trains.
+
+use std::num::NonZeroUsize;
+
+use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, concatenate, s};
+
+use super::engine::EngineError;
+use super::pool::Pool;
+use crate::autodiff::{Arena, Eager, Interpreter as _, Parameters, Stream, Tensor, Threads};
+use crate::diffusion::{SamplerConfig, Schedule, sample};
+use crate::model::{Tokenizer, TokensConfig};
+use crate::motion::{MOTION_DIM, Normalizer, Placement};
+
+/// Windows that are done at once, which bounds memory whatever the length of a motion.
+const WINDOWS_AT_ONCE: usize = 16;
+
+/// Runs a tokenizer.
+///
+/// A motion is cut into windows of the frames that training saw, the last as long as is left; each is put over the
+/// origin, facing +Z, by its own first frame, as in training. So a token means the same wherever a phrase is danced,
+/// and tokens know nothing of what is beyond their window.
+pub struct TokenEngine {
+    config: TokensConfig,
+    tokenizer: Tokenizer,
+    parameters: Parameters<f32>,
+    normalizer: Normalizer,
+    window_frames: usize,
+    workers: Pool<TokenWorker>,
+}
+
+struct TokenWorker {
+    threads: Threads,
+    arena: Arena<f32>,
+}
+
+impl TokenEngine {
+    /// Makes an engine of so many workers, of one thread each; `parameters` are those of [`Tokenizer`].
+    ///
+    /// # Errors
+    /// When the system gives no threads.
+    pub fn new(
+        config: &TokensConfig,
+        parameters: Parameters<f32>,
+        normalizer: &Normalizer,
+        window_frames: usize,
+        n_workers: NonZeroUsize,
+    ) -> std::io::Result<Self> {
+        let worker = |_| {
+            let threads = Threads::start(NonZeroUsize::MIN)?;
+            Ok(TokenWorker { threads, arena: Arena::default() })
+        };
+        let workers = (0..n_workers.get()).map(worker).collect::<std::io::Result<Vec<_>>>()?;
+        Ok(Self {
+            config: config.clone(),
+            tokenizer: Tokenizer::new(config).0,
+            parameters,
+            normalizer: normalizer.clone(),
+            window_frames,
+            workers: Pool::new(workers),
+        })
+    }
+
+    /// Returns the windows of a motion, each over the origin and facing +Z in its first frame.
+    ///
+    /// \[T, 25\] → windows of \[n, 25\], n at most the frames of a window
+    pub fn windows(&self, motion: ArrayView2<f32>) -> Vec<Array2<f32>> {
+        motion
+            .axis_chunks_iter(Axis(0), self.window_frames)
+            .map(|window| {
+                let mut window = window.to_owned();
+                if let Some(placement) = Placement::of_first(window.view()) {
+                    placement.remove(&mut window);
+                }
+                window
+            })
+            .collect()
+    }
+
+    /// Returns the tokens of windows, in order: one for every ρ frames of a window, the last of a window for what is
+    /// left.
+    ///
+    /// # Errors
+    /// Shapes that do not fit.
+    pub fn tokens(&self, windows: &[Array2<f32>]) -> Result<Vec<u32>, EngineError> {
+        let mut tokens = Vec::new();
+        for group in alike(windows) {
+            let motion = self.normalized(group);
+            self.workers.with(|TokenWorker { threads, arena }| {
+                threads.run(|| {
+                    let mut g = Eager::new(&self.parameters, arena);
+                    let motion = constant(&mut g, motion.view());
+                    let found = self.tokenizer.quantize(&mut g, &motion)?;
+                    tokens.extend(found.tokens.data().iter().map(|&token| token as u32));
+                    Ok::<_, EngineError>(())
+                })
+            })?;
+        }
+        Ok(tokens)
+    }
+
+    /// Makes motion of the tokens of windows of so many frames: \[n, 25\] each, over the origin.
+    ///
+    /// Same tokens and seed, same motion.
+    ///
+    /// # Errors
+    /// A token that the codebook does not have, and what the sampler refuses.
+    ///
+    /// # Panics
+    /// When there are fewer tokens than the windows have.
+    pub fn motion(
+        &self,
+        tokens: &[u32],
+        n_frames: &[usize],
+        (sampler, schedule): (&SamplerConfig, &Schedule),
+        seed: u64,
+    ) -> Result<Vec<Array2<f32>>, EngineError> {
+        let (mut found, mut first) = (Vec::new(), 0);
+        for (number, group) in runs(n_frames).enumerate() {
+            let (n, frames) = (group.len(), group[0]);
+            let n_tokens = self.config.n_tokens(frames);
+            let own: Vec<f32> =
+                tokens[first..][..n * n_tokens].iter().map(|&token| token as f32).collect();
+            first += n * n_tokens;
+            let shape = [n, frames, MOTION_DIM];
+            let signal = self.workers.with(|TokenWorker { threads, arena }| {
+                threads.run(|| {
+                    let mut g = Eager::new(&self.parameters, arena);
+                    let like = g.constant(&shape, &vec![0.0; n * frames * MOTION_DIM]);
+                    let own = g.constant(&[n, n_tokens], &own);
+                    let q = self.tokenizer.codes(&mut g, &own)?;
+                    let s = self.tokenizer.signal(&mut g, &q, &like)?;
+                    Ok::<_, EngineError>(array(&s))
+                })
+            })?;
+            // Every group of windows has draws of its own; the first is where sampling begins.
+            let noise = |draw: usize, z: &mut [f32]| {
+                Stream::new(seed, ((number as u64) << 32) + draw as u64 + 1).normal(0, z);
+            };
+            let mut x = Array3::zeros(shape);
+            Stream::new(seed, (number as u64) << 32)
+                .normal(0, x.as_slice_mut().expect("new arrays lie in order"));
+            let denoise = |x: ArrayView3<f32>, t: usize| self.denoise(x, t, signal.view());
+            let sampled = sample(sampler, schedule, x, denoise, noise, None)?;
+            for window in sampled.axis_iter(Axis(0)) {
+                let mut window = window.to_owned();
+                self.normalizer.denormalize(window.view_mut());
+                found.push(window);
+            }
+        }
+        Ok(found)
+    }
+
+    fn denoise(
+        &self,
+        x: ArrayView3<f32>,
+        t: usize,
+        signal: ArrayView3<f32>,
+    ) -> Result<Array3<f32>, EngineError> {
+        self.workers.with(|TokenWorker { threads, arena }| {
+            threads.run(|| {
+                let mut g = Eager::new(&self.parameters, arena);
+                let t = g.constant(&[x.len_of(Axis(0))], &vec![t as f32; x.len_of(Axis(0))]);
+                let (x, s) = (constant(&mut g, x), constant(&mut g, signal));
+                let x0 = self.tokenizer.denoise(&mut g, &x, &t, &s)?;
+                Ok(array(&x0))
+            })
+        })
+    }
+
+    /// Returns windows of as many frames in units of spread, \[windows, n, 25\].
+    fn normalized(&self, windows: &[Array2<f32>]) -> Array3<f32> {
+        let views: Vec<_> =
+            windows.iter().map(|window| window.view().insert_axis(Axis(0))).collect();
+        let mut motion = concatenate(Axis(0), &views).expect("invariant: windows are alike");
+        for mut window in motion.axis_iter_mut(Axis(0)) {
+            self.normalizer.normalize(window.slice_mut(s![.., ..]));
+        }
+        motion
+    }
+}
+
+/// Splits windows into runs of as many frames, none of too many windows.
+fn alike(windows: &[Array2<f32>]) -> impl Iterator<Item = &[Array2<f32>]> {
+    windows.chunk_by(|a, b| a.nrows() == b.nrows()).flat_map(|alike| alike.chunks(WINDOWS_AT_ONCE))
+}
+
+/// Splits lengths in the same way.
+fn runs(n_frames: &[usize]) -> impl Iterator<Item = &[usize]> {
+    n_frames.chunk_by(|a, b| a == b).flat_map(|alike| alike.chunks(WINDOWS_AT_ONCE))
+}
+
+fn constant(g: &mut Eager<f32>, x: ArrayView3<f32>) -> Tensor<f32> {
+    let x = x.as_standard_layout();
+    g.constant(x.shape(), x.as_slice().expect("in order"))
+}
+
+fn array(x: &Tensor<f32>) -> Array3<f32> {
+    let shape = <[usize; 3]>::try_from(x.shape()).expect("invariant: [batch, frames, channels]");
+    Array3::from_shape_vec(shape, x.data().to_vec()).expect("invariant: as many as its shape says")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::diffusion::{DiffusionConfig, Prediction};
+    use crate::generation::walk::walk;
+    use crate::model::Preset;
+    use crate::motion::Channel;
+
+    const WINDOW_FRAMES: usize = 24;
+
+    fn engine(n_workers: usize) -> TokenEngine {
+        let config = TokensConfig::of(Preset::Tiny).expect("a preset of the family");
+        let (_, list) = Tokenizer::new(&config);
+        // Layers that begin at zero would say the same of all tokens.
+        let parameters = Parameters::new(list.without_zero_layers(), 3);
+        let n_workers = NonZeroUsize::new(n_workers).expect("not 0");
+        let normalizer = Normalizer::identity();
+        TokenEngine::new(&config, parameters, &normalizer, WINDOW_FRAMES, n_workers)
+            .expect("threads")
+    }
+
+    fn schedule() -> Schedule {
+        let config = DiffusionConfig { prediction: Prediction::Sample, ..Default::default() };
+        Schedule::new(&config).expect("a schedule")
+    }
+
+    #[test]
+    fn tokens_are_counted_by_window_and_know_nothing_of_where_a_phrase_is_danced() {
+        let engine = engine(1);
+        let here = walk(2 * WINDOW_FRAMES + 9);
+        let windows = engine.windows(here.view());
+        let n_frames: Vec<usize> = windows.iter().map(Array2::nrows).collect();
+        assert_eq!(n_frames, [24, 24, 9]);
+        for window in &windows {
+            let first = window.row(0);
+            assert!(first[0].abs() < 1e-6 && first[2].abs() < 1e-6, "{first:?}");
+        }
+        let tokens = engine.tokens(&windows).expect("shapes fit");
+        assert_eq!(tokens.len(), 6 + 6 + 3);
+        assert!(tokens.iter().any(|&token| token != tokens[0]), "{tokens:?}");
+        let mut elsewhere = here;
+        Placement { x_m: 2.0, z_m: -1.5, yaw_rad: 1.25 }.restore(&mut elsewhere);
+        let windows = engine.windows(elsewhere.view());
+        assert_eq!(engine.tokens(&windows).expect("shapes fit"), tokens);
+        // A window alone has the tokens that it has among others.
+        assert_eq!(engine.tokens(&windows[1..2]).expect("shapes fit"), tokens[6..12]);
+    }
+
+    #[test]
+    fn the_same_tokens_and_seed_make_the_same_motion_by_any_number_of_workers() {
+        let n_frames = [24, 24, 9];
+        let tokens: Vec<u32> = (0..15).map(|i| i * 7 % 32).collect();
+        let (sampler, schedule) = (SamplerConfig::fast27(), schedule());
+        let of = |engine: &TokenEngine, seed| {
+            let how = (&sampler, &schedule);
+            engine.motion(&tokens, &n_frames, how, seed).expect("a motion")
+        };
+        let (one, three) = (engine(1), engine(3));
+        let found = of(&one, 5);
+        assert_eq!(found.iter().map(Array2::nrows).collect::<Vec<_>>(), n_frames);
+        assert!(found.iter().all(|window| window.iter().all(|x| x.is_finite())));
+        assert_eq!(found, of(&three, 5));
+        assert_ne!(found, of(&one, 6));
+        let first = Channel::Position.range().start;
+        assert_ne!(found[0][[3, first]], found[1][[3, first]], "windows have noise of their own");
+    }
+
+    #[test]
+    fn a_token_that_the_codebook_does_not_have_is_refused() {
+        let how = (&SamplerConfig::fast27(), &schedule());
+        let error = engine(1).motion(&[0, 32, 1], &[9], how, 0).expect_err("no such token");
+        assert_eq!(
+            error.to_string(),
+            "embedding: index 32 is not a whole number below 32, the rows of the table"
+        );
+    }
+}

@@ -1,0 +1,103 @@
+//! A tokenizer of motion: frames to tokens, and tokens back to frames by diffusion (MoTok).
+//!
+//! Gu et al., arXiv 2603.19227, 2026, section 3.1. An encoder E makes a latent of every ρ frames; a codebook replaces it
+//! by the nearest of K rows, whose number is the token; a decoder D makes a signal for each frame of the rows; a
+//! denoiser f predicts clean motion from noisy motion and that signal. Tokens keep what is danced, and the diffusion
+//! the fine detail.
+
+mod coder;
+mod config;
+mod denoiser;
+
+pub use self::coder::{Encoder, SignalDecoder};
+pub use self::config::TokensConfig;
+pub use self::denoiser::SignalDenoiser;
+use super::graph::{Graph, Result};
+use super::parameter::{Init, ParameterId, ParameterList, Role, Scope};
+
+/// The networks and the codebook; see the module.
+#[derive(Clone, Debug)]
+pub struct Tokenizer {
+    encoder: Encoder,
+    codebook: ParameterId,
+    decoder: SignalDecoder,
+    denoiser: SignalDenoiser,
+}
+
+/// What a tokenizer says of motion.
+pub struct Quantized<T> {
+    /// h, \[batch, N, d\].
+    pub latents: T,
+    /// z, the tokens, whole numbers in 0..K, \[batch, N\].
+    pub tokens: T,
+    /// q, the rows of the codebook, without a gradient, \[batch, N, d\].
+    pub codes: T,
+}
+
+impl Tokenizer {
+    /// Makes the networks and the list of their parameters.
+    pub fn new(config: &TokensConfig) -> (Self, ParameterList) {
+        let mut list = ParameterList::default();
+        let mut root = Scope::root(&mut list);
+        let deviation = 1.0 / (config.width as f64).sqrt();
+        let tokenizer = Self {
+            encoder: Encoder::within(&mut root.at("encoder"), config),
+            // Training begins with latents of its first batch instead.
+            codebook: root.parameter(
+                "codebook",
+                &[config.codes, config.width],
+                Init::Normal { deviation },
+                Role::Code,
+            ),
+            decoder: SignalDecoder::within(&mut root.at("decoder"), config),
+            denoiser: SignalDenoiser::within(&mut root.at("denoiser"), config),
+        };
+        (tokenizer, list)
+    }
+
+    /// Returns the codebook, \[K, d\].
+    pub fn codebook(&self) -> ParameterId {
+        self.codebook
+    }
+
+    /// h = E(x), z_n = argmin_k ‖h_n − c_k‖², q_n = c_{z_n}.
+    ///
+    /// `x`: clean motion, normalised, \[batch, T, motion_dim\]; N = ⌈T / ρ⌉
+    pub fn quantize<G: Graph>(&self, g: &mut G, x: &G::Tensor) -> Result<Quantized<G::Tensor>> {
+        let latents = self.encoder.forward(g, x)?;
+        let tokens = g.nearest_row(&latents, self.codebook)?;
+        let codes = self.codes(g, &tokens)?;
+        Ok(Quantized { latents, tokens, codes })
+    }
+
+    /// Returns the rows of the codebook that tokens name: \[batch, N\] → \[batch, N, d\].
+    pub fn codes<G: Graph>(&self, g: &mut G, tokens: &G::Tensor) -> Result<G::Tensor> {
+        g.embedding(self.codebook, tokens)
+    }
+
+    /// s = D(q), a signal for each frame of `like`.
+    ///
+    /// \[batch, N, d\], like \[batch, T, …\] → \[batch, T, d\]
+    pub fn signal<G: Graph>(
+        &self,
+        g: &mut G,
+        q: &G::Tensor,
+        like: &G::Tensor,
+    ) -> Result<G::Tensor> {
+        self.decoder.forward(g, q, like)
+    }
+
+    /// x̂0 = f(x_t, t, s); see [`SignalDenoiser::forward`].
+    pub fn denoise<G: Graph>(
+        &self,
+        g: &mut G,
+        x: &G::Tensor,
+        t: &G::Tensor,
+        s: &G::Tensor,
+    ) -> Result<G::Tensor> {
+        self.denoiser.forward(g, x, t, s)
+    }
+}
+
+#[cfg(test)]
+mod tests;

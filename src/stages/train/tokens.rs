@@ -1,0 +1,138 @@
+//! `train --family tokens`: a tokenizer learns to write motion as tokens, and to make motion of them.
+
+use std::sync::Arc;
+
+use anyhow::{Context as _, ensure};
+
+use super::session::{ProgressWatch, claim, lease_of, read_phrases, scales};
+use super::{Params, Run, StageBudget, TrainDryRun, TrainSummary, resume_command};
+use crate::model::{Family, Tokenizer};
+use crate::motion::Normalizer;
+use crate::stages::train::Train;
+use crate::stages::{Progress, Stage as _, Summary};
+use crate::store::Location;
+use crate::training::{
+    Augmentation, CheckpointKind, Learner as _, TokensLearner, TokensTrainConfig, TrainingEnd,
+    Windows,
+};
+
+/// Runs the stage.
+///
+/// # Errors
+/// Settings of which no network can be made, and what the store says.
+pub fn run(params: &Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
+    let config = params.config.tokens_config(params.seed).with_context(|| {
+        format!(
+            "--preset {} is none of the family tokens; give tiny, small or base",
+            params.config.network.preset.name()
+        )
+    })?;
+    config.network.check()?;
+    check_numbers(&config)?;
+    let store = Location::open(&params.store, &params.client.options())?;
+    let watch = ProgressWatch(progress);
+    let lease = match params.dry_run {
+        true => None,
+        false => Some(lease_of(&store, &params.run, &watch)?),
+    };
+    let mut run = Run { params, store: &store, watch: &watch, lease: lease.as_ref() };
+    ensure!(
+        !params.resume
+            || !run.checkpoints(TokensLearner::STAGE).steps(CheckpointKind::Step)?.is_empty(),
+        "run {} has no checkpoint to resume from in {store}; leave --resume out to start it",
+        params.run
+    );
+    if params.dry_run {
+        return run.dry_run_of_tokens(&config, progress);
+    }
+    store.sweep();
+    run.train_tokens(&config, progress)
+}
+
+fn check_numbers(config: &TokensTrainConfig) -> anyhow::Result<()> {
+    let training = &config.tokens;
+    let codebook = &training.codebook;
+    for (flag, x) in
+        [("--time-stretch", training.augmentation.stretch), ("--codebook-decay", codebook.decay)]
+    {
+        ensure!((0.0..1.0).contains(&x), "{flag} {x} is no share; give a number from 0 to below 1");
+    }
+    let weight = training.commitment;
+    ensure!(
+        weight.is_finite() && weight >= 0.0,
+        "--commitment-loss {weight} is no weight; give 0 or more"
+    );
+    for (flag, x) in
+        [("--learning-rate", training.learning_rate.peak), ("--least-usage", codebook.least_usage)]
+    {
+        ensure!(x > 0.0 && x.is_finite(), "{flag} {x} is not above 0; give a positive number");
+    }
+    Ok(())
+}
+
+impl Run<'_> {
+    fn dry_run_of_tokens(
+        &self,
+        config: &TokensTrainConfig,
+        progress: &dyn Progress,
+    ) -> anyhow::Result<Box<dyn Summary>> {
+        let machine = (&self.params.machine, Family::Tokens);
+        let phrases =
+            read_phrases(self.store, Train::NAME, machine, None, progress, self.watch, true)?;
+        let windows = Windows::new(
+            phrases.dataset,
+            Normalizer::identity(),
+            Augmentation::default(),
+            config.network.window_frames,
+            0,
+        );
+        let n_elements = Tokenizer::new(&config.network.tokens).1.n_elements();
+        Ok(Box::new(TrainDryRun {
+            run: self.params.run.clone(),
+            what: format!(
+                "train a tokenizer of {} codes, {n_elements} parameters",
+                config.network.tokens.codes
+            ),
+            n_train: windows.n_train(),
+            n_validation: windows.n_validation(),
+            n_left_out: phrases.left_out.len(),
+            steps_per_epoch: windows.n_train().div_ceil(config.tokens.batch_size),
+        }))
+    }
+
+    fn train_tokens(
+        &mut self,
+        config: &TokensTrainConfig,
+        progress: &dyn Progress,
+    ) -> anyhow::Result<Box<dyn Summary>> {
+        let params = self.params;
+        let machine = &params.machine;
+        let (family, watch) = ((machine, Family::Tokens), self.watch);
+        let phrases = read_phrases(self.store, Train::NAME, family, None, progress, watch, false)?;
+        let threads = Arc::new(machine.start_threads()?);
+        let n_frames = config.network.window_frames;
+        let scales = scales(&phrases.dataset, n_frames, watch)?;
+        let windows = Arc::new(Windows::new(
+            Arc::clone(&phrases.dataset),
+            scales,
+            config.tokens.augmentation.clone(),
+            n_frames,
+            params.seed,
+        ));
+        let mut account = TrainSummary::new(&params.run, self.store, phrases.left_out.clone());
+        let mut learner =
+            TokensLearner::new(&config.network, &config.tokens, &windows, params.seed)?
+                .on(&threads);
+        // Only now is it certain that there is something to train and to train on.
+        if params.force {
+            self.clear()?;
+        }
+        claim(self.store, &params.run, Train::NAME, config, machine.patience(), watch)?;
+        let steps = StageBudget { share: 1.0, ..self.steps_of_diffusion(config.tokens.batch_size) };
+        let end = self.stage(config, steps, &mut learner, &windows, &mut account)?;
+        if end == TrainingEnd::Interrupted {
+            return Ok(Box::new(account.interrupted(&resume_command(params))));
+        }
+        Ok(Box::new(account))
+    }
+}
