@@ -5,12 +5,13 @@ use std::collections::BTreeSet;
 use crate::support::{Dir, finish, motiongen, run};
 
 /// Stages, and kinds of stages that take flags of their own.
-const COMMANDS: [&[&str]; 17] = [
+const COMMANDS: [&[&str]; 19] = [
     &["ingest"],
     &["extract"],
     &["library"],
     &["train"],
     &["finetune"],
+    &["tokenize"],
     &["export"],
     &["generate"],
     &["evaluate"],
@@ -21,6 +22,7 @@ const COMMANDS: [&[&str]; 17] = [
     &["plot", "motion"],
     &["view"],
     &["query"],
+    &["status"],
     &["compact"],
     &["vacuum"],
 ];
@@ -114,14 +116,15 @@ fn the_program_and_its_commands_for_the_shell_have_help_of_both_kinds() {
 #[test]
 fn the_rare_flags_of_train_are_grouped_and_named_in_the_short_help() {
     let (short, long) = (help(&["train"], "--help"), help(&["train"], "--help-all"));
-    let more = "More flags with --help-all: Budget, Networks, Diffusion, Groups, Augmentation, Optimizer, Decoder, \
-                Machine, Remote storage.";
+    let more = "More flags with --help-all: Budget, Networks, Diffusion, Groups, Tokens, Augmentation, Optimizer, \
+                Decoder, Machine, Remote storage.";
     assert!(short.replace('\n', " ").contains(more), "{short}");
     for (flag, heading) in [
         ("--save-every", "Budget"),
         ("--widths", "Networks"),
         ("--beta-start", "Diffusion"),
         ("--negatives", "Groups"),
+        ("--least-usage", "Tokens"),
         ("--no-mirror", "Augmentation"),
         ("--ema-decay", "Optimizer"),
         ("--decoder-noised-to", "Decoder"),

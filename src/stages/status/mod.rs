@@ -11,7 +11,7 @@ use anyhow::{bail, ensure};
 
 use super::generate::Tracks;
 use super::ingest::Layout;
-use super::{ClientParams, Contract, LinkParams, Progress, Stage, Summary};
+use super::{ClientParams, Contract, LinkParams, Progress, RARE, Stage, Summary};
 use crate::store::{Location, StoreSnapshot};
 
 use summary::StatusSummary;
@@ -107,23 +107,23 @@ pub struct Params {
     #[arg(long, value_name = "NAME")]
     pub run: Option<String>,
     /// Only this source of ingest, begun or not [default: all that were begun]
-    #[arg(long, value_name = "URL", help_heading = "As the stages were told")]
+    #[arg(long, value_name = "URL", help_heading = "As the stages were told", hide_short_help = RARE)]
     pub source: Option<String>,
     /// How the source is organised.
     #[arg(long, value_enum, value_name = "LAYOUT", default_value_t = Layout::Auto,
-          help_heading = "As the stages were told")]
+          help_heading = "As the stages were told", hide_short_help = RARE)]
     pub layout: Layout,
     /// Captures of library [default: those of the store]
-    #[arg(long, value_name = "DIR", help_heading = "As the stages were told")]
+    #[arg(long, value_name = "DIR", help_heading = "As the stages were told", hide_short_help = RARE)]
     pub captures: Option<String>,
     /// Phrases of generate [default: songs, or what the run has]
-    #[arg(long, value_enum, value_name = "TRACKS", help_heading = "As the stages were told")]
+    #[arg(long, value_enum, value_name = "TRACKS", help_heading = "As the stages were told", hide_short_help = RARE)]
     pub tracks: Option<Tracks>,
     /// Split of generate's phrases [default: all]
-    #[arg(long, value_name = "SPLIT", help_heading = "As the stages were told")]
+    #[arg(long, value_name = "SPLIT", help_heading = "As the stages were told", hide_short_help = RARE)]
     pub split: Option<String>,
     /// Motions of generate for each phrase [default: as many as the run has]
-    #[arg(long, value_name = "N", help_heading = "As the stages were told")]
+    #[arg(long, value_name = "N", help_heading = "As the stages were told", hide_short_help = RARE)]
     pub samples: Option<NonZeroUsize>,
     #[command(flatten)]
     pub links: LinkParams,

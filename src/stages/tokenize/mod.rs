@@ -10,7 +10,7 @@ use anyhow::Context as _;
 
 use super::train::session::check_run_name;
 use super::trained::TrainedTokenizer;
-use super::{ClientParams, Contract, Progress, Stage, Summary, all_threads};
+use super::{ClientParams, Contract, Progress, RARE, Stage, Summary, all_threads};
 use crate::diffusion::{SamplerConfig, Schedule};
 use crate::generation::TokenEngine;
 use crate::store::{Location, Shard, digest};
@@ -37,13 +37,13 @@ pub struct Params {
     #[arg(long)]
     pub reconstruct: bool,
     /// Seed of the noise that motion is made of again.
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", default_value_t = 0, hide_short_help = RARE)]
     pub seed: u64,
     /// Only phrases of this split: train, validation or test.
     #[arg(long, value_name = "NAME", help_heading = "Phrases")]
     pub split: Option<String>,
     /// Only these phrases.
-    #[arg(long, value_name = "NAME", num_args = 1.., help_heading = "Phrases")]
+    #[arg(long, value_name = "NAME", num_args = 1.., help_heading = "Phrases", hide_short_help = RARE)]
     pub phrase: Vec<String>,
     /// Part of the job that this process does: i/n, or auto inside an array job.
     #[arg(long, value_name = "I/N", default_value_t = Shard::WHOLE.to_string(), help_heading = "Phrases")]

@@ -15,9 +15,9 @@ use crate::diffusion::{SamplerConfig, Schedule};
 use crate::evaluation::{ReconstructionError, reconstruction_error};
 use crate::generation::{EngineError, TokenEngine};
 use crate::model::TokensConfig;
-use crate::stages::extract::pool::{self, lock};
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::generate::seed_of;
+use crate::stages::pool::{self, lock};
 use crate::stages::{Progress, Stage as _, lease};
 use crate::store::tables::{self, FailureRow, PhraseRow, TokenRow, TokenizationRow};
 use crate::store::{

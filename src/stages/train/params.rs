@@ -185,22 +185,22 @@ pub struct GroupParams {
 #[derive(Clone, Debug, clap::Args)]
 pub struct TokensParams {
     /// Frames that a token stands for: 1, 2, 4, 8 or 16.
-    #[arg(long, value_name = "N", default_value_t = 4, help_heading = "Tokens")]
+    #[arg(long, value_name = "N", default_value_t = 4, help_heading = "Tokens", hide_short_help = RARE)]
     pub frames_per_token: usize,
     /// Rows of the codebook, so many tokens there are [default: the preset's]
-    #[arg(long, value_name = "K", help_heading = "Tokens")]
+    #[arg(long, value_name = "K", help_heading = "Tokens", hide_short_help = RARE)]
     pub codes: Option<usize>,
     /// Weight of the distance of latents from their codes.
-    #[arg(long, value_name = "X", default_value_t = TokensTraining::COMMITMENT, help_heading = "Tokens")]
+    #[arg(long, value_name = "X", default_value_t = TokensTraining::COMMITMENT, help_heading = "Tokens", hide_short_help = RARE)]
     pub commitment_loss: f64,
     /// Share of a code's averages that stays at a step.
     #[arg(long, value_name = "X", default_value_t = CodebookConfig::default().decay,
-          help_heading = "Tokens")]
+          help_heading = "Tokens", hide_short_help = RARE)]
     pub codebook_decay: f64,
     /// Latents of a batch that a code has to stand for, on average, or it is put in the place of another latent; a
     /// batch has --batch-size × --window-frames / --frames-per-token of them.
     #[arg(long, value_name = "X", default_value_t = CodebookConfig::default().least_usage,
-          help_heading = "Tokens")]
+          help_heading = "Tokens", hide_short_help = RARE)]
     pub least_usage: f64,
 }
 

@@ -4,8 +4,9 @@ use std::sync::Arc;
 
 use anyhow::{Context as _, ensure};
 
-use super::session::{ProgressWatch, claim, lease_of, read_phrases, scales};
-use super::{Params, Run, StageBudget, TrainDryRun, TrainSummary, resume_command};
+use super::budget::StageBudget;
+use super::session::{ProgressWatch, claim, lease_of, scales};
+use super::{Params, Run, TrainDryRun, TrainSummary, resume_command};
 use crate::model::{Family, Tokenizer};
 use crate::motion::Normalizer;
 use crate::stages::train::Train;
@@ -76,9 +77,7 @@ impl Run<'_> {
         config: &TokensTrainConfig,
         progress: &dyn Progress,
     ) -> anyhow::Result<Box<dyn Summary>> {
-        let machine = (&self.params.machine, Family::Tokens);
-        let phrases =
-            read_phrases(self.store, Train::NAME, machine, None, progress, self.watch, true)?;
+        let phrases = self.phrases(Family::Tokens, progress)?;
         let windows = Windows::new(
             phrases.dataset,
             Normalizer::identity(),
@@ -107,11 +106,10 @@ impl Run<'_> {
     ) -> anyhow::Result<Box<dyn Summary>> {
         let params = self.params;
         let machine = &params.machine;
-        let (family, watch) = ((machine, Family::Tokens), self.watch);
-        let phrases = read_phrases(self.store, Train::NAME, family, None, progress, watch, false)?;
+        let phrases = self.phrases(Family::Tokens, progress)?;
         let threads = Arc::new(machine.start_threads()?);
         let n_frames = config.network.window_frames;
-        let scales = scales(&phrases.dataset, n_frames, watch)?;
+        let scales = scales(&phrases.dataset, n_frames, self.watch)?;
         let windows = Arc::new(Windows::new(
             Arc::clone(&phrases.dataset),
             scales,
@@ -127,8 +125,9 @@ impl Run<'_> {
         if params.force {
             self.clear()?;
         }
-        claim(self.store, &params.run, Train::NAME, config, machine.patience(), watch)?;
-        let steps = StageBudget { share: 1.0, ..self.steps_of_diffusion(config.tokens.batch_size) };
+        claim(self.store, &params.run, Train::NAME, config, machine.patience(), self.watch)?;
+        let steps =
+            StageBudget { share: 1.0, ..params.budget.of_denoiser(config.tokens.batch_size) };
         let end = self.stage(config, steps, &mut learner, &windows, &mut account)?;
         if end == TrainingEnd::Interrupted {
             return Ok(Box::new(account.interrupted(&resume_command(params))));
