@@ -175,7 +175,11 @@ fn runs_of_training_generation_and_evaluation_are_told() {
     assert_eq!(counts(&store, "extract", None), [16, 0, 0, 0]);
     assert_eq!(status(&store, &[]).code, 0);
 
-    // A run that was not begun is left as a whole, where it is asked for.
+    // What was not begun is left as a whole, where it is asked for.
+    for (stage, run) in [("library", "library"), ("train", "night"), ("evaluate", "night")] {
+        let told = status(&store, &["--stage", stage, "--missing", "--run=night"]);
+        assert_eq!((told.code, told.stdout), (75, format!("{stage}\tmissing\t{run}\n")));
+    }
     let asked = ["--stage=generate", "--run=m", "--missing=4"];
     assert_eq!(numbers(&status(&store, &asked).stdout), BTreeSet::from([0, 1, 2, 3]));
     let flags = ["--model=m", "--engine=eager", "--steps=3", "--overlap=7", "--quiet"];
@@ -271,6 +275,7 @@ fn songs_of_a_library_are_told() {
     let bytes = std::fs::read(data.join("mocapbank/motion.bvh")).expect("a capture");
     dir.write("c/motion/bank/motion.bvh", bytes);
     dir.write("s/four.wav", clicks(100.0, 9.0));
+    dir.write("s/four.beats.txt", beat_list(100.0, 9.0, 4));
     for folder in ["s", "c"] {
         assert_eq!(ingest(&dir.at(folder), &store, &[]).code, 0);
     }

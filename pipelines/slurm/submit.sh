@@ -87,12 +87,17 @@ command_of() {
     [ -z "${!flags:-}" ] || eval "command+=(${!flags})"
 }
 
-# left STAGE: prints the shards that have work left, as an array; status ends with 0, 1 (failed items) or 75 (work left).
+# left STAGE: prints what is left of a stage, as an array of shards or item by item; nothing where nothing is.
 left() {
-    local code=0 asked=(--store "$STORE" --stage "$1" --missing "$SHARDS")
-    [ "$1" != ingest ] || asked+=(--source "$SOURCE")
-    [ "$1" != generate ] || asked+=(--run "$MODEL")
+    local code=0 asked=(--store "$STORE" --stage "$1" --missing)
+    ! is_bulk "$1" || asked+=("$SHARDS")
+    case $1 in
+    ingest) asked+=(--source "$SOURCE") ;;
+    train) asked+=(--run "$RUN") ;;
+    generate | evaluate) asked+=(--run "$MODEL") ;;
+    esac
     "$MOTIONGEN" status "${asked[@]}" || code=$?
+    # 1 says that items failed, 75 that work is left.
     case $code in 0 | 1 | 75) ;; *) exit "$code" ;; esac
 }
 
@@ -123,19 +128,20 @@ submit() {
     printf '%-9s job %s%s\n' "$stage" "$after" "${array:+, tasks $array of $SHARDS shards}"
 }
 
-submitted=0
+has_work=0
 for stage in $STAGES; do
     array=
     ! is_bulk "$stage" || array=0-$((SHARDS - 1))
-    # What comes behind a stage that has work left has work left, too, in any shard.
-    if [ -n "$AGAIN" ] && [ "$submitted" = 0 ] && is_bulk "$stage"; then
-        array=$(left "$stage")
-        if [ -z "$array" ]; then
+    # What comes behind a stage that has work left may have work in any shard. export sees for itself in a moment.
+    if [ -n "$AGAIN" ] && [ "$has_work" = 0 ] && [ "$stage" != export ]; then
+        found=$(left "$stage")
+        if [ -z "$found" ]; then
             echo "# $stage: nothing is left"
             continue
         fi
+        ! is_bulk "$stage" || array=$found
+        has_work=1
     fi
     submit "$stage" "$array"
-    submitted=1
 done
 [ -n "$DRY_RUN" ] || echo "watch   squeue --me; then: $MOTIONGEN status --store $STORE"

@@ -217,7 +217,7 @@ fn the_chain_is_printed_as_a_script_that_submits_it() {
     let dir = Dir::new();
     let motiongen = fake(&dir);
     let place = dir.path().display();
-    let settings = [
+    let settings: [&str; 11] = [
         &format!("SOURCE={place}/my music"),
         &format!("STORE={place}/tables"),
         "RUN=night",
@@ -339,8 +339,18 @@ fn only_what_is_left_is_submitted_again() {
             format!("status --store {place}/tables --stage extract --missing 8")
         ]
     );
-    let nothing = again("ingest generate");
-    assert_eq!(nothing.stdout, "# ingest: nothing is left\n# generate: nothing is left\n");
+    let nothing = again("ingest library generate evaluate");
+    let none = ["ingest", "library", "generate", "evaluate"];
+    let none = none.map(|stage| format!("# {stage}: nothing is left\n")).concat();
+    assert_eq!(nothing.stdout, none);
+    assert_eq!(
+        calls(&dir)[3..],
+        [
+            format!("status --store {place}/tables --stage library --missing"),
+            format!("status --store {place}/tables --stage generate --missing 8 --run pretrained"),
+            format!("status --store {place}/tables --stage evaluate --missing --run pretrained")
+        ]
+    );
 }
 
 #[test]

@@ -132,7 +132,13 @@ impl Surveyor<'_> {
                 ..StageSurvey::new(SurveyedStage::Library, songs.states.into_iter().map(item))
             }
         };
-        Ok(found.into_iter().map(survey).collect())
+        let found: Vec<StageSurvey> = found.into_iter().map(survey).collect();
+        Ok(match self.params.stage {
+            Some(SurveyedStage::Library) if found.is_empty() => {
+                vec![not_begun(SurveyedStage::Library, "library")]
+            }
+            _ => found,
+        })
     }
 
     /// Returns the runs to look at: the one that is asked for, or all that were begun.
@@ -149,6 +155,10 @@ impl Surveyor<'_> {
         for run in self.runs(begun) {
             let networks = train::survey::survey(self.store(), &run)?;
             if networks.is_empty() {
+                if self.params.stage == Some(SurveyedStage::Train) {
+                    let survey = not_begun(SurveyedStage::Train, &run);
+                    found.push(StageSurvey { run: Some(run), ..survey });
+                }
                 continue;
             }
             let note = |trained: &train::survey::TrainedNetwork| {
@@ -215,6 +225,12 @@ impl Surveyor<'_> {
         }
         Ok(found)
     }
+}
+
+/// Returns what is left of a stage that was not begun and whose items nobody knows yet.
+fn not_begun(stage: SurveyedStage, name: &str) -> StageSurvey {
+    let item = SurveyedItem { name: name.to_owned(), phrase: None, state: ItemState::Missing };
+    StageSurvey::new(stage, [item])
 }
 
 /// Returns a note where a stage last ran with other parameters than without flags, or in another version.
