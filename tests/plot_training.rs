@@ -54,6 +54,8 @@ fn row(run: &str, stage: &str, kind: RowKind, epoch: i32, step: i64) -> Training
         markers: None,
         contrast: None,
         sampled_distance: None,
+        commitment: None,
+        perplexity: None,
         gradient_norm: None,
         skipped: false,
         samples_per_s: None,

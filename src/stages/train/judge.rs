@@ -58,13 +58,13 @@ impl ValidationJudge {
             couplings: couplings(dataset)?,
             sampler: usual_sampler(&Schedule::new(&network.diffusion)?),
             heard,
-            moments: mean_moments(&real),
+            moments: mean_moments(&fused(&real, FusionVariances::default())),
             windows,
         }))
     }
 
     /// `D = √⟨ln²(m̂ / m)⟩` with m the amplitude locked to the bar, the root mean square velocity along x, y and z, the mean
-    /// jerk, the mean turn rate and its mean change, m̂ those of the motions, poses fused as post-processing does.
+    /// jerk, the mean turn rate and its mean change, m̂ those of the motions; poses of both are fused, as post-processing does.
     ///
     /// The share of vertical velocity that the bar explains goes as the square of the locked amplitude over the vertical
     /// speed, so that D is 0 only where both are right. A moment of real motion that is 0, or a song without bars, tells
@@ -170,8 +170,8 @@ mod tests {
         let judge = judge(&network());
         let distance = |motion: Array2<f32>| judge.distance(motion.insert_axis(Axis(0)).view());
         let itself = distance(motion(1.0, 0.0)).expect("finite");
-        // Fusion moves even real motion, by what single precision leaves between positions and velocities.
-        assert!(itself < 0.01, "{itself}");
+        // But for the locked amplitude, which is of real motion as it is: fusion leaves a hundredth of it.
+        assert!(itself < 0.02, "{itself}");
         let half = distance(motion(0.5, 0.0)).expect("finite");
         // Every moment is half of what it was, but for the turns, which fusion shrinks a little more.
         assert!((half - 2.0_f64.ln()).abs() < 0.05, "{half}");
