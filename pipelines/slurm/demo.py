@@ -5,7 +5,7 @@
     pipelines/slurm/demo.py --bin target/debug         with executables that are there already
 
 Starts munged, slurmctld and two slurmd on loopback, with a configuration, keys and folders of their own. The chain of
-submit.sh runs on them; while a task of extract runs on node c2, that node is killed whole. Slurm queues its tasks again,
+submit.sh runs on them; while a task of generate is at work on node c2, that node is killed whole. Slurm queues its tasks again,
 node c1 takes them over, and the tables have to be those of the same stages run on one machine, to the last bit.
 
 Whatever happens, everything that was started is ended, by its process number. Exit code 0: the tables are equal; 1: they
@@ -30,6 +30,8 @@ PACKAGES = {"slurmctld": "slurmctld", "slurmd": "slurmd", "sbatch": "slurm-clien
 STAGES = ["ingest", "extract", "generate"]
 NODES = ["c1", "c2"]
 KILLED = "c2"
+# The stage that is under way then: its tasks are the longest, and hold a lease each.
+KILLED_DURING = "generate"
 # What the stages write; columns of clock times and places are left out by diff-tables.
 TABLES = "phrases,beats,features,extractions,generated,decoded,generations,failures"
 # Longest wait for what must happen, in seconds, and the pause between two looks.
@@ -289,19 +291,19 @@ def one_machine(motiongen, store):
 def two_nodes(cluster, arguments, motiongen, store, logs):
     """Runs the chain on the cluster, kills a node on the way, and returns how many tasks were taken over."""
     chain = submit(arguments, motiongen, store, logs)
-    extract = chain["extract"]
+    job = chain[KILLED_DURING]
 
     def under_way():
-        on_it = [task for task, node, state in jobs("%i|%N|%t", ["-j", extract]) if node == KILLED and state == "R"]
-        if not jobs("%i", ["-j", extract]):
-            raise WentWrong("extract ended before a task of it was seen on the node that is to be killed")
+        on_it = [task for task, node, state in jobs("%i|%N|%t", ["-j", job]) if node == KILLED and state == "R"]
+        if not jobs("%i", ["-j", job]):
+            raise WentWrong(f"{KILLED_DURING} ended before a task of it was seen on {KILLED}, which is to be killed")
         names = [Path(f"/proc/{pid}/comm") for pid in cluster.processes(KILLED)]
         is_at_work = any(path.exists() and path.read_text().startswith("motiongen") for path in names)
         return on_it if is_at_work else None
 
-    lost = wait_until(f"a task of extract on {KILLED}", under_way)
+    lost = wait_until(f"a task of {KILLED_DURING} on {KILLED}", under_way)
     cluster.kill(KILLED)
-    say(f"node {KILLED} killed, with its slurmd and the tasks {', '.join(lost)} of extract")
+    say(f"node {KILLED} killed, with its slurmd and the tasks {', '.join(lost)} of {KILLED_DURING}")
     is_down = lambda: run(["sinfo", "-h", "-n", KILLED, "-o", "%T"]).strip().startswith("down")
     wait_until(f"{KILLED} to be down", is_down)
     say(f"Slurm has found out: {KILLED} is down")

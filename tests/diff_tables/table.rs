@@ -82,10 +82,11 @@ pub struct Table {
 
 /// Returns whether a column tells of the run rather than of its results: when and how fast it went, and where files lay.
 pub fn is_of_the_run(column: &Column) -> bool {
-    const OF_THE_RUN: [&str; 6] = [
+    const OF_THE_RUN: [&str; 7] = [
         "elapsed_s",
         "samples_per_s",
         "data_wait_s",
+        "generate_s",
         "resident_bytes",
         "real_time_factor",
         "took_s",
