@@ -29,16 +29,17 @@ const COMMANDS: [&[&str]; 19] = [
 /// More flags than this are no first look.
 const MAX_SHOWN: usize = 15;
 
-/// Returns the flags at the beginnings of lines of a help text.
+/// Returns the flags of a help text, whose entries stand in the seventh column, or in the third where they are short,
+/// too; what is said of them stands further right.
 fn flags(text: &str) -> Vec<String> {
-    let is_entry = |line: &&str| line.starts_with("--") || line.get(2..6) == Some(", --");
-    let entries = text.lines().map(str::trim_start).filter(is_entry);
-    let long = |line: &str| {
-        let start = line.find("--")?;
-        let end = line[start + 2..].find(|c: char| !c.is_alphanumeric() && c != '-');
-        Some(line[start..end.map_or(line.len(), |end| start + 2 + end)].to_owned())
+    let entry = |line: &str| {
+        let is_short_too = line.starts_with("  -") && line.get(4..8) == Some(", --");
+        let long = line.strip_prefix("      ").or(line.get(6..).filter(|_| is_short_too))?;
+        let name = long.strip_prefix("--")?;
+        let end = name.find(|c: char| !c.is_alphanumeric() && c != '-').unwrap_or(name.len());
+        Some(format!("--{}", &name[..end]))
     };
-    entries.filter_map(long).collect()
+    text.lines().filter_map(entry).collect()
 }
 
 /// Returns the flags that completions offer for a command: they know nothing of tiers.
