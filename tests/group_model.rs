@@ -18,7 +18,7 @@ const SMALL: [&str; 8] = [
     "--family=group",
     "--preset=tiny",
     "--window-frames=24",
-    "--batch-size=5",
+    "--batch-size=6",
     "--negatives=2",
     "--threads=2",
     "--steps=7",
@@ -231,6 +231,10 @@ fn mistakes_are_named() {
             .contains("--preset large is none of the family group; give tiny, small or base"),
         "{output:?}"
     );
+    let output = train(&store, "run", &["--batch-size=5"]);
+    assert_eq!(output.code, 2);
+    let odd = "--batch-size 5 is odd; groups are told from mixed ones in pairs to the same music, so give 4 or 6";
+    assert!(output.stderr.contains(odd), "{output:?}");
     assert_eq!(train(&store, "run", &[]).code, 0);
     assert_eq!(export(&store, "run", &[]).code, 0);
     let (audio, out) = (song(&dir), dir.at("out"));

@@ -130,11 +130,15 @@ fn the_stage_of_its_own_takes_the_arguments_of_the_front_door() {
         output.stdout.replace(name, "NAME")
     };
     // The front door answers --version for all its stages.
-    let version = "\n  -V, --version\n          Print version\n";
-    let own = help(finish(motiongen_ingest().arg("--help")), "motiongen-ingest");
-    assert!(own.contains(version), "{own}");
-    let of_front_door = help(run(["ingest", "--help"]), "motiongen ingest");
-    assert_eq!(own.replace(version, ""), of_front_door);
+    for (flag, version) in [
+        ("--help", "  -V, --version          Print version\n"),
+        ("--help-all", "\n  -V, --version\n          Print version\n"),
+    ] {
+        let own = help(finish(motiongen_ingest().arg(flag)), "motiongen-ingest");
+        assert!(own.contains(version), "{own}");
+        let of_front_door = help(run(["ingest", flag]), "motiongen ingest");
+        assert_eq!(own.replace(version, ""), of_front_door);
+    }
 
     let dir = Dir::new();
     let source = dir.at("source");
