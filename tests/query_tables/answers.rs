@@ -72,7 +72,7 @@ fn tables_and_columns_can_be_asked_for() {
     assert_eq!(lines.next(), Some("name,n_rows,n_bytes,n_parts,schema_version"));
     assert!(lines.next().is_some_and(|line| line.starts_with("phrases,5,")), "{text}");
     assert!(lines.next().is_some_and(|line| line.starts_with("motion,177,")), "{text}");
-    assert_eq!(lines.count(), 13);
+    assert_eq!(lines.count(), 15);
     let text = csv(&store, "describe failures");
     let mut lines = text.lines();
     assert_eq!(lines.next(), Some("name,type,nullable,unit,description"));

@@ -69,8 +69,8 @@ fn an_unknown_table_comes_with_the_nearest_and_all_others() {
         let start = format!("table \"{table}\" not found; nearest: {nearest}");
         assert!(sentence.starts_with(&start), "{sentence}");
         let all = "; a store has phrases, motion, features, extractions, beats, failures, \
-                   training_log, onnx_checks, generations, generated, decoded, sanity_checks, metrics, \
-                   verdicts, song_metrics";
+                   training_log, onnx_checks, generations, generated, decoded, tokens, tokenizations, \
+                   sanity_checks, metrics, verdicts, song_metrics";
         assert!(sentence.ends_with(all), "{sentence}");
     }
 }
