@@ -140,8 +140,19 @@ pub fn header_length(start: &[u8]) -> Option<u64> {
 /// # Errors
 /// If the bytes are not the start of a safetensors file.
 pub fn metadata(start: &[u8]) -> Result<BTreeMap<String, String>, WeightsError> {
-    let (_, header) = SafeTensors::read_metadata(start)?;
-    Ok(header.metadata().clone().unwrap_or_default().into_iter().collect())
+    /// The part of the header that tells of no tensor. The crate's own reader asks for all of the file.
+    #[derive(serde::Deserialize)]
+    struct Header {
+        #[serde(rename = "__metadata__", default)]
+        metadata: BTreeMap<String, String>,
+    }
+    let header = header_length(start)
+        .and_then(|n| N_LENGTH_BYTES.checked_add(n))
+        .and_then(|end| start.get(N_LENGTH_BYTES as usize..usize::try_from(end).ok()?))
+        .ok_or(SafeTensorError::InvalidHeaderLength)?;
+    let header: Header =
+        serde_json::from_slice(header).map_err(SafeTensorError::InvalidHeaderDeserialization)?;
+    Ok(header.metadata)
 }
 
 /// A safetensors file that was read.
