@@ -192,8 +192,6 @@ const CODE: [&str; 4] = ["src", "tests", "benches", "fuzz/fuzz_targets"];
 /// A file beyond this has a second subject, which goes into a file named after it.
 const MAX_LINES: usize = 500;
 const MAX_MEDIAN_LINES: usize = 165;
-/// A file that is being divided.
-const DIVIDED: [&str; 1] = ["src/training/window.rs"];
 
 #[test]
 fn no_file_has_more_than_500_lines_and_the_median_stays_small() {
@@ -207,7 +205,7 @@ fn no_file_has_more_than_500_lines_and_the_median_stays_small() {
         let path = path.strip_prefix(root).expect("in the folder").to_string_lossy().into_owned();
         let n_lines = text.lines().count();
         assert!(
-            n_lines <= MAX_LINES || DIVIDED.contains(&path.as_str()),
+            n_lines <= MAX_LINES,
             "{path} has {n_lines} lines: move its second subject to a file named after it"
         );
         sizes.push(n_lines);
