@@ -172,8 +172,9 @@ fn motion_of_soloists_and_groups_becomes_tokens_and_motion_again() {
     let errors = |store: &Path| -> BTreeMap<(String, i32), [u64; 2]> {
         let receipts: Vec<TokenizationRow> = rows(store);
         let error = |x: Option<f64>| {
+            // Bodies that never turn are made again without an error of orientation.
             let x = x.expect("an error");
-            assert!(x.is_finite() && x > 0.0, "{x}");
+            assert!(x.is_finite() && x >= 0.0, "{x}");
             x.to_bits()
         };
         let both =

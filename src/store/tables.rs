@@ -151,7 +151,7 @@ rows! {
         speed_ratio: Option<f64>, "", "Of a validation in finetune: mean speed of sampled motion, over that of the phrases; far below 1 where motion agrees with itself because it stands still.";
         markers: Option<f64>, "m²", "Of a model of groups: mean squared error of points fixed to each body. This and `contrast` are none in rows of version 1.";
         contrast: Option<f64>, "", "Of a model of groups: cross-entropy of telling a group from mixed ones.";
-        sampled_distance: Option<f64>, "", "Of a validation in diffusion: root mean square of the logarithms of how motion sampled for validation windows moves, over how real motion moves: locking to the bar, speed along each axis, jerk, turning and changes of turning; 0 is alike. The checkpoint with the least is kept. None in rows before version 3.";
+        sampled_distance: Option<f64>, "", "Of a validation in diffusion with --keep motion: root mean square of the logarithms of how motion sampled for validation windows moves, over how real motion moves: locking to the bar, speed along each axis, jerk, turning and changes of turning; 0 is alike. The checkpoint with the least is kept. None otherwise, and in rows before version 3.";
         commitment: Option<f64>, "", "Of a tokenizer: mean squared distance of latents from their codes. This and `perplexity` are none in rows of versions before 3.";
         perplexity: Option<f64>, "codes", "Of a tokenizer: how many codes are in use, were all used alike: exp(−Σ p ln p) over the tokens of the batch, or of all validation windows.";
         gradient_norm: Option<f64>, "", "Norm of the gradient before it was clipped.";

@@ -33,8 +33,23 @@ pub struct BudgetParams {
     #[arg(long, value_name = "N", default_value_t = 0, help_heading = "Budget",
           hide_short_help = RARE)]
     pub patience: u64,
+    /// Which checkpoint of a UNet is kept: the one of least validation loss, or the one whose motion, sampled for windows of
+    /// the validation songs, moves most as real motion does.
+    #[arg(long, value_enum, default_value_t, value_name = "WHICH", help_heading = "Budget",
+          hide_short_help = RARE)]
+    pub keep: KeptCheckpoint,
     #[command(flatten)]
     pub saving: SavingParams,
+}
+
+/// By what the checkpoint that is kept is chosen.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum KeptCheckpoint {
+    /// The loss of a validation.
+    #[default]
+    Loss,
+    /// How far sampled motion is from real motion.
+    Motion,
 }
 
 /// When checkpoints are written.

@@ -27,7 +27,7 @@ use crate::training::{
     GroupLearner, Journal, Learner, Loader, State, TokensLearner, TrainConfig, TrainingEnd,
     TrainingError, Windows,
 };
-use budget::{BudgetParams, StageBudget};
+use budget::{BudgetParams, KeptCheckpoint, StageBudget};
 use judge::ValidationJudge;
 use session::{
     MachineParams, ProgressWatch, TrainingPhrases, check_run_name, claim, claim_path, lease_of,
@@ -255,8 +255,9 @@ impl<'a> Run<'a> {
         let mut learner =
             DiffusionLearner::new(&config.network, &config.diffusion, &augmented, params.seed)?
                 .on(&threads);
-        if let Some(judge) =
-            ValidationJudge::new(&config.network, &phrases.dataset, &scales.features)?
+        if params.budget.keep == KeptCheckpoint::Motion
+            && let Some(judge) =
+                ValidationJudge::new(&config.network, &phrases.dataset, &scales.features)?
         {
             learner = learner.judged_by(judge);
         }
