@@ -6,8 +6,8 @@ use std::process::{Command, Stdio};
 use crate::support::run;
 
 const STAGES: [&str; 15] = [
-    "ingest", "extract", "library", "train", "finetune", "tokenize", "export", "generate", "evaluate", "model",
-    "plot", "view", "query", "compact", "vacuum",
+    "ingest", "extract", "library", "train", "finetune", "tokenize", "export", "generate",
+    "evaluate", "model", "plot", "view", "query", "compact", "vacuum",
 ];
 
 #[test]

@@ -176,9 +176,8 @@ fn motion_of_soloists_and_groups_becomes_tokens_and_motion_again() {
             assert!(x.is_finite() && x > 0.0, "{x}");
             x.to_bits()
         };
-        let both = |row: &TokenizationRow| {
-            [row.position_error_m, row.orientation_error_deg].map(error)
-        };
+        let both =
+            |row: &TokenizationRow| [row.position_error_m, row.orientation_error_deg].map(error);
         receipts.iter().map(|row| ((row.phrase_id.clone(), row.dancer), both(row))).collect()
     };
     let by_one = errors(&store);
@@ -319,8 +318,14 @@ fn mistakes_are_named() {
             &["--window-frames=26"],
             "a window has 26 frames; it must have a multiple of the 4 that a token stands for",
         ),
-        (&["--prediction=epsilon"], "a decoder of tokens predicts clean motion; leave --prediction x0"),
-        (&["--codebook-decay=1"], "--codebook-decay 1 is no share; give a number from 0 to below 1"),
+        (
+            &["--prediction=epsilon"],
+            "a decoder of tokens predicts clean motion; leave --prediction x0",
+        ),
+        (
+            &["--codebook-decay=1"],
+            "--codebook-decay 1 is no share; give a number from 0 to below 1",
+        ),
         (&["--least-usage=0"], "--least-usage 0 is not above 0; give a positive number"),
     ] {
         let output = train(&store, "run", flags);

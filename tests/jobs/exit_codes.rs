@@ -15,8 +15,8 @@ fn commits(store: &Path, stage: &str) -> usize {
 #[test]
 fn every_help_names_the_codes() {
     let stages = [
-        "ingest", "extract", "library", "train", "finetune", "tokenize", "export", "generate", "evaluate",
-        "model", "plot", "view", "query",
+        "ingest", "extract", "library", "train", "finetune", "tokenize", "export", "generate",
+        "evaluate", "model", "plot", "view", "query",
     ];
     for stage in stages {
         let help = run([stage, "--help"]).stdout.split_whitespace().collect::<Vec<_>>().join(" ");
