@@ -134,9 +134,9 @@ fn the_rare_flags_of_train_are_grouped_and_named_in_the_short_help() {
     ] {
         assert!(!flags(&short).iter().any(|f| f == flag), "{flag} is rare");
         let at = long.find(&format!("      {flag}")).unwrap_or_else(|| panic!("{flag}: {long}"));
-        let headings =
+        let mut headings =
             long[..at].lines().filter(|line| line.ends_with(':') && !line.starts_with(' '));
-        assert_eq!(headings.last(), Some(format!("{heading}:").as_str()), "{flag}");
+        assert_eq!(headings.next_back(), Some(format!("{heading}:").as_str()), "{flag}");
     }
 }
 
