@@ -87,7 +87,7 @@ impl Tokenizer {
         self.decoder.forward(g, q, like)
     }
 
-    /// x̂0 = f(x_t, t, s); see [`SignalDenoiser::forward`].
+    /// x̂0 = f(x_t, t, s); see `SignalDenoiser::forward`.
     pub fn denoise<G: Graph>(
         &self,
         g: &mut G,

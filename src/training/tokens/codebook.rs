@@ -69,7 +69,7 @@ impl<E: Element> Codebook<E> {
 
     /// c_k ← candidate k, N_k ← 1, m_k ← c_k.
     ///
-    /// - `codebook`: \[K, d\]; `candidates`: the same, as [`candidates`] draws them
+    /// - `codebook`: \[K, d\]; `candidates`: the same, as `candidates` draws them
     pub fn begin(&mut self, codebook: &mut [E], candidates: &[E]) {
         codebook.copy_from_slice(candidates);
         let [usage, sums] = self.averages();
