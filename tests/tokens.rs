@@ -120,10 +120,10 @@ fn motion_of_soloists_and_groups_becomes_tokens_and_motion_again() {
     assert_eq!(steps.len(), 7);
     for row in log.iter().filter(|row| row.kind != "epoch") {
         assert_eq!(row.stage, "tokens");
-        let of = |value: Option<f64>| value.expect("a number");
-        let [loss, simple, commitment] = [row.loss, row.diffusion, row.commitment].map(of);
+        let number = |value: Option<f64>| value.expect("a number");
+        let [loss, simple, commitment] = [row.loss, row.diffusion, row.commitment].map(number);
         assert!((loss - (simple + 0.02 * commitment)).abs() < 1e-5 * loss, "{row:?}");
-        assert!((1.0..=f64::from(CODES)).contains(&of(row.perplexity)), "{row:?}");
+        assert!((1.0..=f64::from(CODES)).contains(&number(row.perplexity)), "{row:?}");
     }
 
     let output = tokenize(&store, &["--summary", "json"]);
@@ -191,9 +191,6 @@ fn motion_of_soloists_and_groups_becomes_tokens_and_motion_again() {
     assert!(again.stdout.contains("nothing to do: 17 phrases are up to date"), "{again:?}");
     let other = tokenize(&store, &["--reconstruct", "--seed=1"]);
     assert!(other.stdout.contains("17 phrases tokenized"), "{other:?}");
-    // After seven steps of a rate that still rises, a decoder that begins at zero tells the mean whatever the noise; that
-    // seeds differ is a test of the engine.
-    assert_eq!(errors(&store).len(), by_one.len());
 }
 
 #[test]

@@ -36,8 +36,9 @@ fn more(command: &Command) -> String {
         .filter_map(Arg::get_help_heading)
         .filter(|heading| *heading != GENERAL && seen.insert(*heading))
         .collect();
-    let of = if headings.is_empty() { String::new() } else { format!(": {}", headings.join(", ")) };
-    format!("More flags with --{HELP_ALL}{of}.")
+    let groups =
+        if headings.is_empty() { String::new() } else { format!(": {}", headings.join(", ")) };
+    format!("More flags with --{HELP_ALL}{groups}.")
 }
 
 /// Returns a command all of whose flags are of the first tier, for a manual page.

@@ -252,16 +252,16 @@ mod tests {
         let n_frames = [24, 24, 9];
         let tokens: Vec<u32> = (0..15).map(|i| i * 7 % 32).collect();
         let (sampler, schedule) = (SamplerConfig::fast27(), schedule());
-        let of = |engine: &TokenEngine, seed| {
+        let motions = |engine: &TokenEngine, seed| {
             let how = (&sampler, &schedule);
             engine.motion(&tokens, &n_frames, how, seed).expect("a motion")
         };
         let (one, three) = (engine(1), engine(3));
-        let found = of(&one, 5);
+        let found = motions(&one, 5);
         assert_eq!(found.iter().map(Array2::nrows).collect::<Vec<_>>(), n_frames);
         assert!(found.iter().all(|window| window.iter().all(|x| x.is_finite())));
-        assert_eq!(found, of(&three, 5));
-        assert_ne!(found, of(&one, 6));
+        assert_eq!(found, motions(&three, 5));
+        assert_ne!(found, motions(&one, 6));
         let first = Channel::Position.range().start;
         assert_ne!(found[0][[3, first]], found[1][[3, first]], "windows have noise of their own");
     }

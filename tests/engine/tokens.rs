@@ -42,11 +42,11 @@ fn inputs<E: Element, I: Interpreter<Element = E>>(
     mut differentiated: impl FnMut(&mut I, &[usize], &[E]) -> Tensor<E>,
 ) -> Inputs<E> {
     let shape = [BATCH, FRAMES, 25];
-    let of = |name: &str| given::<E>(name, BATCH * FRAMES * 25);
+    let values = |name: &str| given::<E>(name, BATCH * FRAMES * 25);
     let t: Vec<E> = golden.values("input/t").iter().map(|&t| E::from_f64(t)).collect();
     Inputs {
-        motion: differentiated(g, &shape, &of("input.motion")),
-        x: differentiated(g, &shape, &of("input.x")),
+        motion: differentiated(g, &shape, &values("input.motion")),
+        x: differentiated(g, &shape, &values("input.x")),
         t: g.constant(&[BATCH], &t),
     }
 }

@@ -61,7 +61,7 @@ pub enum ConsistencyForm {
     /// Guidance by f^γ asks for E[x0 | x_t, f^γ] = x̂0 + γ (1−ᾱ)/√ᾱ ∇_{x_t} log f. By the chain rule
     /// ∇_{x_t} log f(x̂0) = Jᵀ ∇_{x̂0} log f, and J = ∂x̂0/∂x_t = √ᾱ/(1−ᾱ) Cov[x0 | x_t] (Tweedie's second order), so
     /// the move is γ Cov[x0 | x_t] ∇_{x̂0} log f. Of normalised motion, whose prior is near N(0, I), the covariance is
-    /// near (1−ᾱ) I. The move is bounded at every step, and nothing goes back through the denoiser.
+    /// near (1−ᾱ) I. k_t is at most 1, and nothing goes back through the denoiser.
     #[default]
     Estimate,
     /// ∇ is by x_t, k_t = (1−ᾱ_t)/√ᾱ_t.

@@ -150,9 +150,9 @@ mod tests {
 
     #[test]
     fn tokens_are_counted_and_the_last_may_stand_for_fewer_frames() {
-        let of = |frames_per_token| TokensConfig { frames_per_token, ..tiny() };
-        assert_eq!([1, 2, 4, 8, 16].map(|rho| of(rho).n_levels()), [0, 1, 2, 3, 4]);
-        assert_eq!([1, 4, 5, 120, 121].map(|n| of(4).n_tokens(n)), [1, 1, 2, 30, 31]);
+        let config = |frames_per_token| TokensConfig { frames_per_token, ..tiny() };
+        assert_eq!([1, 2, 4, 8, 16].map(|rho| config(rho).n_levels()), [0, 1, 2, 3, 4]);
+        assert_eq!([1, 4, 5, 120, 121].map(|n| config(4).n_tokens(n)), [1, 1, 2, 30, 31]);
         assert_eq!([1, 2, 4, 8, 16].map(TokensConfig::usual_taps), [7, 7, 5, 5, 5]);
     }
 

@@ -152,11 +152,11 @@ pub struct Params {
     pub dancers: Option<usize>,
     /// Guidance by the score of a model of the family group, from -1 (away from one group, meant for dancers who go
     /// each a way of their own) to 1 (towards one group, meant for unison); docs/groups.md has what it was seen to
-    /// do; other than 0 it takes three times as long [default: 0]
+    /// do; other than 0 it takes longer [default: 0]
     #[arg(long, value_name = "GAMMA", allow_hyphen_values = true, help_heading = "Groups",
           hide_short_help = RARE)]
     pub consistency: Option<f64>,
-    /// What --consistency moves at every step: the estimate, by its own gradient; or, three times as slow, the noise
+    /// What --consistency moves at every step: the estimate, by its own gradient; or, more slowly, the noise
     /// that is predicted (Dhariwal and Nichol) or the mean of the step (the paper), by the gradient through the network.
     #[arg(long, value_name = "FORM", value_enum, default_value_t, help_heading = "Groups",
           hide_short_help = RARE)]

@@ -206,7 +206,7 @@ impl Surveyor<'_> {
 
     fn evaluate(&self) -> anyhow::Result<Vec<StageSurvey>> {
         let begun = match self.params.stage {
-            // Whoever asks for it wants every run to be evaluated.
+            // With --stage evaluate, a run without an evaluation is one that is left.
             Some(SurveyedStage::Evaluate) => {
                 let mut runs = generate::runs(self.snapshot)?;
                 runs.extend(evaluate::runs(self.snapshot)?);

@@ -43,7 +43,7 @@ pub struct TokenizeTarget<'a> {
     /// How motion is made again; none where nobody asked.
     pub reconstruction: Option<Reconstruction<'a>>,
     pub params_hash: String,
-    /// That of the same tokens with their errors: whoever asks for tokens alone leaves these as they are.
+    /// That of the same tokens with their errors: a run without --reconstruct leaves these as they are.
     pub params_hash_with_errors: String,
     pub shard: Shard,
     pub split: Option<&'a str>,
