@@ -299,3 +299,6 @@ fn to_array(x: &Tensor<f32>) -> Array3<f32> {
     let [a, b, c] = x.shape() else { unreachable!("networks return three axes") };
     Array3::from_shape_vec((*a, *b, *c), x.data().to_vec()).expect("as many as its shape says")
 }
+
+#[cfg(test)]
+mod tests;

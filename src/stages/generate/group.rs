@@ -63,6 +63,8 @@ struct GroupSettings {
     consistency: f64,
     /// What γ moves.
     consistency_form: ConsistencyForm,
+    /// s, the factor of the gradient beside γ.
+    consistency_scale: f64,
     sampler: SamplerConfig,
     /// 1 follows the music, more exaggerates it, 0 ignores it.
     guidance: f64,
@@ -102,12 +104,18 @@ impl GroupSettings {
             "--consistency {consistency} is not from -1 to 1; give -1 for dancers who go each a way of their own, 1 \
              for unison"
         );
+        let consistency_scale = params.consistency_scale.unwrap_or(1.0);
+        ensure!(
+            consistency_scale.is_finite() && consistency_scale >= 0.0,
+            "--consistency-scale {consistency_scale} is no factor; give a number from 0 up"
+        );
         let SamplingSettings { sampler, guidance, overlap_frames } = params.sampling(card)?;
         Ok(Self {
             output_version: OUTPUT_VERSION,
             n_dancers,
             consistency,
             consistency_form: params.consistency_form.into(),
+            consistency_scale,
             sampler,
             guidance,
             overlap_frames,
@@ -158,7 +166,7 @@ pub fn run(
             sampler: &settings.sampler,
             schedule: &schedule,
             guidance: settings.guidance,
-            consistency: settings.consistency,
+            consistency: settings.consistency * settings.consistency_scale,
             form: settings.consistency_form,
             normalizer: &card.normalizer,
             window_frames: card.window_frames,

@@ -161,6 +161,9 @@ pub struct Params {
     #[arg(long, value_name = "FORM", value_enum, default_value_t, help_heading = "Groups",
           hide_short_help = RARE)]
     pub consistency_form: ConsistencyFormName,
+    /// How far --consistency 1 or -1 goes, as a factor of the gradient [default: what the model's card says, or 1].
+    #[arg(long, value_name = "S", help_heading = "Groups", hide_short_help = RARE)]
+    pub consistency_scale: Option<f64>,
     /// Let bodies touch where they were sampled so, instead of moving them apart.
     #[arg(long, help_heading = "Groups", hide_short_help = RARE)]
     pub no_separation: bool,

@@ -253,3 +253,6 @@ impl<'a> GroupBatch<'a> {
         moves
     }
 }
+
+#[cfg(test)]
+mod tests;
