@@ -295,6 +295,12 @@ proptest! {
         let x = || input(&[rows, frames, channels], 1);
         let like = || fixed(&[batch], vec![0.0; batch]);
         check(&[x(), like()], &none(), |g, x| g.rebatch(&x[0], &x[1]));
+        check(&[x(), like()], &none(), |g, x| g.mean_dancers(&x[0], &x[1], None));
+        check(&[input(&[batch, channels], 6)], &none(), |g, x| g.mean_channels(&x[0]));
+        let mut there = vec![1.0; rows];
+        (1..rows).step_by(3).for_each(|row| there[row] = 0.0);
+        let there = fixed(&[batch, n_dancers], there);
+        check(&[x(), like(), there], &none(), |g, x| g.mean_dancers(&x[0], &x[1], Some(&x[2])));
         check(&[input(&[batch, frames, channels], 2), x()], &none(), |g, x| {
             let repeated = g.repeat_batch(&x[0], &x[1])?;
             g.mul(&repeated, &x[1])
@@ -432,6 +438,23 @@ fn dancers_are_folded_without_moving_a_number_and_refused_where_they_do_not_fit(
     assert_eq!((y.shape(), y.data()), (&[2, 6, 1][..], &values[..]));
     let back = g.rebatch(&y, &x).expect("shapes fit");
     assert_eq!((back.shape(), back.data()), (&[6, 2, 1][..], &values[..]));
+    // Groups of 3: dancers 0 to 2 and 3 to 5, of whom 1 is not there, and nobody of a third mask.
+    let there = g.input(&[2, 3], &[1.0, 0.0, 1.0, 1.0, 1.0, 1.0]);
+    let mean = g.mean_dancers(&x, &two, Some(&there)).expect("shapes fit");
+    assert_eq!((mean.shape(), mean.data()), (&[2, 2, 1][..], &[2.0, 3.0, 8.0, 9.0][..]));
+    let mean = g.mean_dancers(&x, &two, None).expect("shapes fit");
+    assert_eq!(mean.data(), &[2.0, 3.0, 8.0, 9.0]);
+    let nobody = g.input(&[2, 3], &[0.0; 6]);
+    let mean = g.mean_dancers(&x, &two, Some(&nobody)).expect("shapes fit");
+    assert_eq!(mean.data(), &[0.0; 4]);
+    assert_eq!(
+        g.mean_dancers(&x, &four, None).expect_err("4 does not divide 6").to_string(),
+        "mean_dancers: 6 dancers cannot be split into 4 groups alike"
+    );
+    assert_eq!(
+        g.mean_dancers(&x, &two, Some(&four)).expect_err("another mask").to_string(),
+        "mean_dancers: mask has shape [4], input expects [2, 3]"
+    );
     let five = g.input(&[5], &[0.0; 5]);
     assert_eq!(
         g.rebatch(&x, &five).expect_err("5 does not divide 12").to_string(),

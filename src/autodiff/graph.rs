@@ -14,7 +14,7 @@ use super::op::attention::{Attend, InputChannels};
 use super::op::binary::{AddToFrames, Binary, Pair};
 use super::op::channels::{Concat, TakeChannels};
 use super::op::conv::Product;
-use super::op::dancers::{Rebatch, RepeatBatch};
+use super::op::dancers::{MeanDancers, Rebatch, RepeatBatch};
 use super::op::dropout::Dropout;
 use super::op::elementwise::{Function, Map};
 use super::op::filter::FilterFrames;
@@ -25,6 +25,7 @@ use super::op::lookup::{Embed, Gather, NearestRow, StraightThrough};
 use super::op::modulation::{MeanFrames, Modulate, NormalizeFrames};
 use super::op::normalize::Normalize;
 use super::op::parameter::Take;
+use super::op::reduce::{Over, Reduce};
 use super::op::rotary::Rotary;
 use super::op::select::Select;
 use super::op::tokens::{ConcatFrames, TokenMask};
@@ -234,6 +235,19 @@ impl<I: Interpreter> Graph for I {
 
     fn repeat_batch(&mut self, x: &Self::Tensor, like: &Self::Tensor) -> Result<Self::Tensor> {
         self.apply(RepeatBatch::default(), &[x, like])
+    }
+
+    fn mean_dancers(
+        &mut self,
+        x: &Self::Tensor,
+        like: &Self::Tensor,
+        mask: Option<&Self::Tensor>,
+    ) -> Result<Self::Tensor> {
+        self.apply(MeanDancers::default(), &with(&[x, like], mask))
+    }
+
+    fn mean_channels(&mut self, x: &Self::Tensor) -> Result<Self::Tensor> {
+        self.apply(Reduce::mean(Over::Axis(1)), &[x])
     }
 
     fn concat_frames(&mut self, parts: &[&Self::Tensor]) -> Result<Self::Tensor> {

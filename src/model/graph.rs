@@ -312,6 +312,20 @@ pub trait Graph: Sized {
     /// \[batch, …\], like \[rows, …\], rows a multiple of batch → \[rows, …\]
     fn repeat_batch(&mut self, x: &Self::Tensor, like: &Self::Tensor) -> Result<Self::Tensor>;
 
+    /// Mean over the dancers of a group that are there, frame by frame.
+    ///
+    /// `x`: \[batch · dancers, frames, channels\]; `like`: \[batch, …\]; `mask`: \[batch, dancers\], all where absent →
+    /// \[batch, frames, channels\]
+    fn mean_dancers(
+        &mut self,
+        x: &Self::Tensor,
+        like: &Self::Tensor,
+        mask: Option<&Self::Tensor>,
+    ) -> Result<Self::Tensor>;
+
+    /// Mean over the channels of each sample: \[batch, channels\] → \[batch, 1\].
+    fn mean_channels(&mut self, x: &Self::Tensor) -> Result<Self::Tensor>;
+
     /// Puts frames one after the other; a vector, \[batch, channels\], is one frame.
     fn concat_frames(&mut self, parts: &[&Self::Tensor]) -> Result<Self::Tensor>;
 

@@ -372,6 +372,20 @@ impl Graph for Outline<'_> {
         Ok(self.result(shape))
     }
 
+    fn mean_dancers(
+        &mut self,
+        x: &Vec<usize>,
+        like: &Vec<usize>,
+        _mask: Option<&Vec<usize>>,
+    ) -> Result<Vec<usize>> {
+        let [_, frames, channels] = three("mean_dancers", x)?;
+        Ok(self.result(vec![like[0], frames, channels]))
+    }
+
+    fn mean_channels(&mut self, x: &Vec<usize>) -> Result<Vec<usize>> {
+        Ok(self.result(vec![x[0], 1]))
+    }
+
     fn concat_frames(&mut self, parts: &[&Vec<usize>]) -> Result<Vec<usize>> {
         let frames = |x: &&Vec<usize>| if x.len() == 2 { 1 } else { x[1] };
         let Some(first) = parts.first() else {

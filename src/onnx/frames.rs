@@ -142,3 +142,45 @@ pub(super) fn concat(g: &mut Builder<'_>, parts: &[&Value]) -> Result<Value> {
     let y = g.node("Concat", &names, vec![integer("axis", 1)]);
     Ok(g.new_last(Axes::Frames, one.channels, y))
 }
+
+/// Averages every frame over the dancers of a group that are there.
+pub(super) fn mean_dancers(
+    g: &mut Builder<'_>,
+    x: Value,
+    like: Value,
+    mask: Option<Value>,
+) -> Result<Value> {
+    g.begin("mean_dancers", None);
+    expect("mean_dancers", x, Axes::Frames)?;
+    let (name, batch) = (g.last(x)?, g.batch_of(like)?);
+    let frames = g.node("Shape", &[&name], vec![integer("start", 1)]);
+    let dancers = g.integers(&[-1]);
+    // [batch · dancers, frames, channels] → [batch, dancers, frames, channels] → [batch, frames, channels]
+    let shape = g.node("Concat", &[&batch, &dancers, &frames], vec![integer("axis", 0)]);
+    let apart = g.node("Reshape", &[&name, &shape], vec![]);
+    let axes = g.integers(&[1]);
+    let drop = || vec![integer("keepdims", 0)];
+    let y = match mask {
+        None => g.node("ReduceMean", &[&apart, &axes], drop()),
+        Some(mask) => {
+            let (mask, last) = (g.last(mask)?, g.integers(&[2, 3]));
+            let mask = g.node("Unsqueeze", &[&mask, &last], vec![]);
+            let counted = g.node("Mul", &[&apart, &mask], vec![]);
+            let sum = g.node("ReduceSum", &[&counted, &axes], drop());
+            let n = g.node("ReduceSum", &[&mask, &axes], drop());
+            let one = g.number(1.0);
+            let n = g.node("Max", &[&n, &one], vec![]);
+            g.node("Div", &[&sum, &n], vec![])
+        }
+    };
+    Ok(g.new_last(Axes::Frames, x.channels, y))
+}
+
+/// Averages the channels of each sample.
+pub(super) fn mean_channels(g: &mut Builder<'_>, x: Value) -> Result<Value> {
+    g.begin("mean_channels", None);
+    expect("mean_channels", x, Axes::Samples)?;
+    let (name, axes) = (g.last(x)?, g.integers(&[1]));
+    let y = g.node("ReduceMean", &[&name, &axes], vec![integer("keepdims", 1)]);
+    Ok(g.new_last(Axes::Samples, 1, y))
+}

@@ -159,6 +159,7 @@ impl GroupScoreNames {
     pub const W: &'static str = "w";
     pub const NUMBER: &'static str = "number";
     pub const LOG_RATIO: &'static str = "log_ratio";
+    pub const AGREEMENT: &'static str = "agreement";
 }
 
 /// What the row of the number of dancers means.
@@ -258,12 +259,18 @@ pub fn group_score(
     g.name_axis(0, "dancers");
     let w = g.input(GroupScoreNames::W, Axes::Samples, config.width, "embedding of the group");
     let number = g.integer_input(GroupScoreNames::NUMBER, Axes::Batch, NUMBER);
-    let inputs = GroupScoreInputs { x0: &x0, t: &t, w: &w, number: &number, mask: None };
+    let inputs =
+        GroupScoreInputs { x0: &x0, t: &t, w: &w, number: &number, mask: None, there: None };
     let y = score.forward(&mut g, &inputs)?;
     g.output(
         GroupScoreNames::LOG_RATIO,
-        y,
+        y.log_ratio,
         "log of p(motion | group) / p(motion), up to a constant",
+    )?;
+    g.output(
+        GroupScoreNames::AGREEMENT,
+        y.agreement,
+        "the part of it that is the agreement of the dancers",
     )?;
     Ok(g.finish("score"))
 }

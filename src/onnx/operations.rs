@@ -420,6 +420,14 @@ impl Graph for Builder<'_> {
         Ok(self.new_last(x.axes, x.channels, y))
     }
 
+    fn mean_dancers(&mut self, x: &Value, like: &Value, mask: Option<&Value>) -> Result<Value> {
+        frames::mean_dancers(self, *x, *like, mask.copied())
+    }
+
+    fn mean_channels(&mut self, x: &Value) -> Result<Value> {
+        frames::mean_channels(self, *x)
+    }
+
     fn concat_frames(&mut self, parts: &[&Value]) -> Result<Value> {
         frames::concat(self, parts)
     }

@@ -109,11 +109,13 @@ fn forward<E: Element, I: Interpreter<Element = E>>(
         groups.iter().flat_map(|&b| given.present[b * N_DANCERS..][..N_DANCERS].to_vec()).collect();
     let mask: Vec<E> = for_frames(&present, patches);
     let mask = g.constant(&[groups.len(), N_DANCERS * patches], &mask);
+    let there = g.constant(&[groups.len(), N_DANCERS], &numbers(&present));
     let x0 = g.apply(TakeSamples::new(taken), &[&found.x0])?;
     let w = g.apply(TakeSamples::new(groups.clone()), &[&found.w])?;
     let number = g.apply(TakeSamples::new(groups), &[&given.number])?;
-    let inputs = GroupScoreInputs { x0: &x0, t: &t, w: &w, number: &number, mask: Some(&mask) };
-    let logits = score.forward(g, &inputs)?;
+    let (mask, there) = (Some(&mask), Some(&there));
+    let inputs = GroupScoreInputs { x0: &x0, t: &t, w: &w, number: &number, mask, there };
+    let logits = score.forward(g, &inputs)?.log_ratio;
     let logits = g.apply(Reshape::new(&[BATCH, 1 + k]), &[&logits])?;
     Ok([found.x0, found.w, logits])
 }

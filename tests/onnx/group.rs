@@ -118,13 +118,27 @@ fn a_score_of_groups_is_what_the_interpreter_says() {
             let t = g.constant(&[rows], &as_floats(&t));
             let w = g.constant(&[groups, config.width], &w);
             let number = g.constant(&[groups], &as_floats(&number));
-            let given = GroupScoreInputs { x0: &x0, t: &t, w: &w, number: &number, mask: None };
+            let given = GroupScoreInputs {
+                x0: &x0,
+                t: &t,
+                w: &w,
+                number: &number,
+                mask: None,
+                there: None,
+            };
             let wanted = score.forward(&mut g, &given).expect("shapes fit");
-            let (shape, found) =
-                session.run(&inputs, GroupScoreNames::LOG_RATIO).expect("an answer");
-            assert_eq!(shape, [groups, 1]);
-            let difference = max_difference(&found, wanted.data());
-            assert!(difference <= 1e-4, "{groups} × {dancers} × {frames}: {difference:e}");
+            for (name, wanted) in [
+                (GroupScoreNames::LOG_RATIO, wanted.log_ratio),
+                (GroupScoreNames::AGREEMENT, wanted.agreement),
+            ] {
+                let (shape, found) = session.run(&inputs, name).expect("an answer");
+                assert_eq!(shape, [groups, 1]);
+                let difference = max_difference(&found, wanted.data());
+                assert!(
+                    difference <= 1e-4,
+                    "{name}: {groups} × {dancers} × {frames}: {difference:e}"
+                );
+            }
         }
     }
 }

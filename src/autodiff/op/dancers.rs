@@ -97,6 +97,82 @@ impl<E: Element> Operation<E> for RepeatBatch {
     }
 }
 
+/// Σ_n m\[n\] x\[n\] / Σ m: the mean of each frame over the dancers of a group that are there; 0 where none is.
+///
+/// # Shapes
+/// x \[batch · dancers, frames, channels\], like \[batch, …\], mask \[batch, dancers\] if any → \[batch, frames, channels\]
+#[derive(Default)]
+pub struct MeanDancers {
+    from: Vec<usize>,
+    /// Share of every dancer in the mean of its group, \[batch · dancers\].
+    shares: Vec<f64>,
+}
+
+impl<E: Element> Operation<E> for MeanDancers {
+    fn name(&self) -> &'static str {
+        "mean_dancers"
+    }
+
+    fn forward(&mut self, x: &[&Tensor<E>], run: &Run<E>) -> Result<Tensor<E>> {
+        let (x, like, mask) = (x[0], x[1], x.get(2));
+        let (&[rows, frames, channels], Some(&batch)) = (x.shape(), like.shape().first()) else {
+            let problem =
+                format!("input has shape {:?}, expected [rows, frames, channels]", x.shape());
+            return Err(GraphError::shape("mean_dancers", problem));
+        };
+        if batch == 0 || !rows.is_multiple_of(batch) {
+            let problem = format!("{rows} dancers cannot be split into {batch} groups alike");
+            return Err(GraphError::shape("mean_dancers", problem));
+        }
+        let n_dancers = rows / batch;
+        if let Some(mask) = mask
+            && mask.shape() != [batch, n_dancers]
+        {
+            let problem = format!(
+                "mask has shape {:?}, input expects {:?}",
+                mask.shape(),
+                [batch, n_dancers]
+            );
+            return Err(GraphError::shape("mean_dancers", problem));
+        }
+        let is_there = |row: usize| mask.map_or(1.0, |mask| mask.data()[row].to_f64());
+        self.shares = (0..batch)
+            .flat_map(|b| {
+                let rows = b * n_dancers..(b + 1) * n_dancers;
+                let sum: f64 = rows.clone().map(is_there).sum();
+                rows.map(move |row| if sum > 0.0 { is_there(row) / sum } else { 0.0 })
+            })
+            .collect();
+        self.from = x.shape().to_vec();
+        let size = (frames * channels).max(1);
+        Ok(run.tensor(&[batch, frames, channels], |y| {
+            y.fill(E::ZERO);
+            for (i, (x, &share)) in x.data().chunks_exact(size).zip(&self.shares).enumerate() {
+                let share = E::from_f64(share);
+                let y = &mut y[i / n_dancers * size..][..size];
+                y.iter_mut().zip(x).for_each(|(y, &x)| *y = *y + share * x);
+            }
+        }))
+    }
+
+    fn backward(&mut self, dy: Tensor<E>, at: &mut Backward<E>) -> Vec<Option<Tensor<E>>> {
+        let size = self.from.iter().skip(1).product::<usize>().max(1);
+        let n_dancers = self.shares.len() / dy.shape()[0].max(1);
+        let dx = at.needs[0].then(|| {
+            at.tensor(&self.from, |dx| {
+                for (i, (dx, &share)) in dx.chunks_exact_mut(size).zip(&self.shares).enumerate() {
+                    let share = E::from_f64(share);
+                    let dy = &dy.data()[i / n_dancers * size..][..size];
+                    dx.iter_mut().zip(dy).for_each(|(dx, &dy)| *dx = share * dy);
+                }
+            })
+        });
+        let mut found = vec![dx];
+        found.resize_with(at.needs.len(), || None);
+        found
+    }
+}
+
 /// Samples by index: y\[i\] = x\[index\[i\]\]; the gradient of a sample is the sum over those that took it.
 ///
 /// # Shapes

@@ -12,8 +12,8 @@ use crate::diffusion::Schedule;
 use crate::generation::engine::EngineError;
 use crate::generation::pool::Pool;
 use crate::model::{
-    Graph, GroupConfig, GroupInputs, GroupNetworks, GroupScoreInputs, Result as GraphResult,
-    condition_scale,
+    Graph, GroupConfig, GroupInputs, GroupNetworks, GroupScoreInputs, GroupScores,
+    Result as GraphResult, condition_scale,
 };
 
 /// Runs a model of a group by the interpreter that trains it.
@@ -174,11 +174,11 @@ impl GroupEngine {
                     let x0 = tape.input(x0.shape(), x0.data());
                     (x0.clone(), tape.constant(w.shape(), w.data()), x0)
                 };
-                let log_f = self.log_ratio(&mut tape, &given, &x0, &w)?;
+                let guide = self.consistency(&mut tape, &given, &x0, &w)?;
                 let mut moved = to_array(&x0);
                 drop((x0, w));
                 let mut unused = Gradients::new(&self.parameters);
-                let found = tape.backward(log_f, &mut unused)?;
+                let found = tape.backward(guide, &mut unused)?;
                 if let Some(gradient) = found.of(&by) {
                     let factor = factor as f32;
                     moved.iter_mut().zip(gradient.data()).for_each(|(x, &g)| *x += factor * g);
@@ -197,11 +197,11 @@ impl GroupEngine {
         audio
     }
 
-    /// Returns log f of each group of clean motion at a step, for motion of one number of dancers.
+    /// Returns the scores of each group of clean motion at a step, for motion of one number of dancers.
     ///
     /// # Errors
     /// Shapes that do not fit.
-    pub fn score(&self, inputs: &GroupEngineInputs) -> Result<Vec<f32>, EngineError> {
+    pub fn score(&self, inputs: &GroupEngineInputs) -> Result<Vec<GroupScores<f32>>, EngineError> {
         let audio = self.scaled(inputs.audio);
         let x = inputs.x.as_standard_layout();
         self.workers.with(|GroupWorker { threads, arena }| {
@@ -211,7 +211,11 @@ impl GroupEngine {
                 let mut g = Eager::new(&self.parameters, arena);
                 let x = g.constant(inputs.x.shape(), given.x);
                 let (_, w) = self.estimate(&mut g, &given, &x)?;
-                Ok(self.logits(&mut g, &given, &x, &w)?.data().to_vec())
+                let GroupScores { log_ratio, agreement } = self.scores(&mut g, &given, &x, &w)?;
+                let both = log_ratio.data().iter().zip(agreement.data());
+                Ok(both
+                    .map(|(&log_ratio, &agreement)| GroupScores { log_ratio, agreement })
+                    .collect())
             })
         })
     }
@@ -253,29 +257,31 @@ impl GroupEngine {
         Ok((g.add(&with_x0, &without_x0)?, with.w))
     }
 
-    /// Returns Σ log f over all groups, a scalar.
-    fn log_ratio<I: Interpreter<Element = f32>>(
+    /// Returns Σ of what consistency moves along over all groups, a scalar: of groups the agreement of their dancers, of a
+    /// soloist, who agrees with himself, log f.
+    fn consistency<I: Interpreter<Element = f32>>(
         &self,
         g: &mut I,
         given: &ForwardInputs,
         x0: &Tensor<f32>,
         w: &Tensor<f32>,
     ) -> GraphResult<Tensor<f32>> {
-        let logits = self.logits(g, given, x0, w)?;
-        g.apply(Reduce::sum(Over::All), &[&logits])
+        let GroupScores { log_ratio, agreement } = self.scores(g, given, x0, w)?;
+        let each = if given.inputs.n_dancers > 1 { agreement } else { log_ratio };
+        g.apply(Reduce::sum(Over::All), &[&each])
     }
 
-    fn logits<I: Interpreter<Element = f32>>(
+    fn scores<I: Interpreter<Element = f32>>(
         &self,
         g: &mut I,
         given: &ForwardInputs,
         x0: &Tensor<f32>,
         w: &Tensor<f32>,
-    ) -> GraphResult<Tensor<f32>> {
+    ) -> GraphResult<GroupScores<Tensor<f32>>> {
         let rows = x0.shape()[0];
         let t = g.constant(&[rows], &vec![given.inputs.t as f32; rows]);
         let number = given.number(g, &self.config);
-        let inputs = GroupScoreInputs { x0, t: &t, w, number: &number, mask: None };
+        let inputs = GroupScoreInputs { x0, t: &t, w, number: &number, mask: None, there: None };
         self.networks.score.forward(g, &inputs)
     }
 }

@@ -6,11 +6,22 @@ use crate::model::graph::{Convolution, Graph, Result};
 use crate::model::layers::Linear;
 use crate::model::parameter::{Init, ParameterId, ParameterList, Role, Scope};
 
+/// κ: with N dancers log f spans (1 − 1/N) κ, enough to tell a group from eight mixed ones.
+const AGREEMENT_WEIGHT: f64 = 10.0;
+/// Least length of a vector that is normalised.
+const EPSILON: f64 = 1e-8;
+
 /// log f(x̂, w, t), f the ratio of the densities p(x | w) / p(x) up to a factor (paper, section 4.3).
 ///
 /// Each layer attends within every dancer, whose frames have a token of step and group before them, and then over
 /// all dancers, with the tokens of number and group. What is left is averaged over all frames and mapped to one
-/// number.
+/// number, the fit; log f is the fit and κ times the agreement of the dancers, ⟨‖⟨u_i⟩_i‖²⟩ over the frames, where
+/// u_i = v_i / ‖v_i‖ and v_i is linear in what the last layer made of dancer i alone: 1 where all do the same, and
+/// about 1/N where everybody does something else.
+///
+/// Deviation: the reference has no agreement. Attention alone has to find the frames of one time and to compare them
+/// before it can tell unison; what it learns first is how groups stand, and the gradient of that moves all dancers alike
+/// (docs/groups.md).
 #[derive(Clone, Debug)]
 pub struct GroupScore {
     /// A convolution whose stride is its taps: frames become tokens.
@@ -20,6 +31,9 @@ pub struct GroupScore {
     numbers: ParameterId,
     layers: Vec<(EncoderLayer, GlobalLayer)>,
     out: Linear,
+    /// To v.
+    agreement: Linear,
+    width: usize,
 }
 
 /// The inputs of a score: B groups of N dancers, T frames.
@@ -34,6 +48,17 @@ pub struct GroupScoreInputs<'a, T> {
     pub number: &'a T,
     /// Dancers who are there, \[B, N ⌈T / patch⌉\], 1 or 0; all where absent.
     pub mask: Option<&'a T>,
+    /// The same for each dancer, \[B, N\].
+    pub there: Option<&'a T>,
+}
+
+/// What a score says of B groups.
+#[derive(Clone, Debug, PartialEq)]
+pub struct GroupScores<T> {
+    /// log f, \[B, 1\].
+    pub log_ratio: T,
+    /// The part of it that is the agreement of the dancers, from 0 to κ, \[B, 1\].
+    pub agreement: T,
 }
 
 impl GroupScore {
@@ -74,10 +99,12 @@ impl GroupScore {
                 })
                 .collect(),
             out: Linear::new(&mut root.at("out"), d, 1),
+            agreement: Linear::new(&mut root.at("agreement"), d, d),
+            width: d,
         }
     }
 
-    /// Returns log f of each group, \[B, 1\].
+    /// Returns log f of each group, and the part of it that is the dancers' agreement.
     ///
     /// # Shapes
     /// See [`GroupScoreInputs`].
@@ -85,7 +112,7 @@ impl GroupScore {
         &self,
         g: &mut G,
         inputs: &GroupScoreInputs<G::Tensor>,
-    ) -> Result<G::Tensor> {
+    ) -> Result<GroupScores<G::Tensor>> {
         let (weight, bias, convolution) = self.patches;
         let x = g.hold_frames(inputs.x0, convolution.taps)?;
         let mut x = g.conv1d(&x, weight, Some(bias), convolution)?;
@@ -97,10 +124,12 @@ impl GroupScore {
         let e_n = g.embedding(self.numbers, inputs.number)?;
         let tokens = g.concat_frames(&[&group, &e_n])?;
         let mask = inputs.mask.map(|mask| g.token_mask(mask, 2)).transpose()?;
+        let mut alone = x.clone();
         for (local, global) in &self.layers {
             let with_token = g.concat_frames(&[&token, &x])?;
             let h = local.forward(g, &with_token)?;
             x = g.frames(&h, 1, None)?;
+            alone = x.clone();
             let folded = g.rebatch(&x, inputs.number)?;
             let all = global.forward(g, &tokens, &folded, &x, mask.as_ref())?;
             let folded = g.frames(&all, 2, None)?;
@@ -108,6 +137,24 @@ impl GroupScore {
         }
         let folded = g.rebatch(&x, inputs.number)?;
         let mean = g.mean_frames(&folded, inputs.mask)?;
-        self.out.forward(g, &mean)
+        let fit = self.out.forward(g, &mean)?;
+        let agreement = self.agreement(g, &alone, inputs)?;
+        Ok(GroupScores { log_ratio: g.add(&fit, &agreement)?, agreement })
+    }
+
+    /// Returns κ times how much the dancers of each group agree at the same frames. \[B N, P, d\] → \[B, 1\]
+    fn agreement<G: Graph>(
+        &self,
+        g: &mut G,
+        alone: &G::Tensor,
+        inputs: &GroupScoreInputs<G::Tensor>,
+    ) -> Result<G::Tensor> {
+        let v = self.agreement.forward(g, alone)?;
+        let u = g.normalize(&v, EPSILON)?;
+        let mean = g.mean_dancers(&u, inputs.number, inputs.there)?;
+        let squares = g.mul(&mean, &mean)?;
+        let squares = g.mean_frames(&squares, None)?;
+        let length = g.mean_channels(&squares)?;
+        g.scale(&length, AGREEMENT_WEIGHT * self.width as f64)
     }
 }

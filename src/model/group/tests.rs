@@ -48,8 +48,12 @@ fn shapes_are_followed_through_both_networks_and_every_parameter_is_met() {
     let of_each = g.input(&[batch * n_dancers]);
     let w = g.input(&[batch, config.width]);
     let mask = g.input(&[batch, n_dancers * 2]);
-    let inputs = GroupScoreInputs { x0: &x, t: &of_each, w: &w, number: &t, mask: Some(&mask) };
-    assert_eq!(score.forward(&mut g, &inputs), Ok(vec![batch, 1]));
+    let there = g.input(&[batch, n_dancers]);
+    let (mask, there) = (Some(&mask), Some(&there));
+    let inputs = GroupScoreInputs { x0: &x, t: &of_each, w: &w, number: &t, mask, there };
+    let of_each = vec![batch, 1];
+    let scores = GroupScores { log_ratio: of_each.clone(), agreement: of_each };
+    assert_eq!(score.forward(&mut g, &inputs), Ok(scores));
     assert_eq!(unique(&g, &list), list.n_elements());
 }
 

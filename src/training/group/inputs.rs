@@ -219,9 +219,17 @@ impl<'a> GroupBatch<'a> {
         let x0 = g.apply(TakeSamples::new(mixed.dancers), &[x0])?;
         let moves = g.constant(x0.shape(), &moves);
         let x0 = g.add(&x0, &moves)?;
-        let w = g.apply(TakeSamples::new(mixed.groups), &[w])?;
-        let inputs = GroupScoreInputs { x0: &x0, t: &t, w: &w, number: &number, mask: Some(&mask) };
-        let logits = networks.score.forward(g, &inputs)?;
+        let mixed_groups = mixed.groups;
+        let w = g.apply(TakeSamples::new(mixed_groups.clone()), &[w])?;
+        let is_there = |&b: &usize| {
+            let n_there = self.batch.n_dancers[b];
+            (0..slots).map(move |slot| f32::from(u8::from(slot < n_there)))
+        };
+        let there: Vec<f32> = mixed_groups.iter().flat_map(is_there).collect();
+        let there = g.constant(&[n_groups, slots], &there);
+        let (mask, there) = (Some(&mask), Some(&there));
+        let inputs = GroupScoreInputs { x0: &x0, t: &t, w: &w, number: &number, mask, there };
+        let logits = networks.score.forward(g, &inputs)?.log_ratio;
         let logits = g.apply(Reshape::new(&[n, 1 + n_negatives]), &[&logits])?;
         let labels = g.constant(&[n], &vec![0.0; n]);
         g.apply(CrossEntropy::default(), &[&logits, &labels]).map(Some)

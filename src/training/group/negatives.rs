@@ -5,10 +5,10 @@ use crate::autodiff::Stream;
 /// Who dances in mixed groups: for every group the group itself, and then its mixed ones.
 ///
 /// Half of the mixed groups have members swapped: each dancer, with probability 1/2 and at least one, but not all, is
-/// one of the group's partner, which dances to the same music at the same step of noise. Every other such group has its
-/// strangers where the partner has them, and may be known by its formation and by bodies that touch; in the others they
-/// dance in the places of those they replace, so that their steps alone tell. The other half are another group as a
-/// whole.
+/// one of the group's partner, which dances to the same music at the same step of noise. In the first of these the
+/// strangers are where the partner has them, and may be known by the formation and by bodies that touch; in the others
+/// they dance in the places of those they replace, so that their steps alone tell. The other half are another group as
+/// a whole.
 ///
 /// Deviation: the published code (`mixed_intra_inter`) swaps members of any group of the batch where they are, with steps
 /// of noise of their own, so that unequal steps, another tempo, another bar or touching bodies give mixed groups away; and
@@ -74,7 +74,7 @@ pub fn mixed(
                     whole * n_slots + place % n_dancers[whole]
                 };
                 found.dancers.push(dancer);
-                let takes_place = has_members_swapped && k % 2 == 1;
+                let takes_place = has_members_swapped && k > 0;
                 found.floor.push(if takes_place { own(place) } else { dancer });
             }
             found.groups.push(group);
@@ -112,7 +112,7 @@ mod tests {
         assert_eq!(found.groups.len(), 5 * 9);
         for (i, (&dancer, &floor)) in found.dancers.iter().zip(&found.floor).enumerate() {
             let (place, group, kind) = (i % n_slots, i / n_slots / 9, i / n_slots % 9);
-            let takes_place = kind == 2 || kind == 4;
+            let takes_place = (2..=4).contains(&kind);
             assert_eq!(floor, if takes_place { group * n_slots + place } else { dancer });
         }
         let (mut n_swapped, mut n_members) = (0, 0);

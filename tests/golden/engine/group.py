@@ -275,6 +275,7 @@ class GroupScore(nn.Module):
             for _ in range(config.score_layers)
         )
         self.out = nn.Linear(d, 1)
+        self.agreement = nn.Linear(d, d)
 
     def forward(self, x: Tensor, t: Tensor, w: Tensor, number: Tensor, present: Tensor) -> Tensor:
         """x [B, N, T, C], t [B, N], present [B, N]; returns [B]."""
@@ -290,11 +291,16 @@ class GroupScore(nn.Module):
         for layer in self.layers:
             rows = torch.cat([token[:, :, None], x], 2).flatten(0, 1)
             rows = layer["local"](rows, torch.arange(frames + 1))
-            x = rows[:, 1:].reshape(batch, n * frames, -1)
+            alone = rows[:, 1:].unflatten(0, (batch, n))
+            x = alone.flatten(1, 2)
             rows = torch.cat([group[:, None], self.numbers[number.long()][:, None], x], 1)
             x = layer["global"](rows, places, everyone)[:, TOKENS:].unflatten(1, (n, frames))
         weights = (counts.double() / counts.sum(1, keepdim=True))[..., None]
-        return self.out((weights * x.flatten(1, 2)).sum(1))[:, 0]
+        fit = self.out((weights * x.flatten(1, 2)).sum(1))[:, 0]
+        u = F.normalize(self.agreement(alone), dim=-1, eps=1e-8)
+        share = (present.double() / present.sum(1, keepdim=True))[..., None, None]
+        length = (share * u).sum(1).square().sum(-1)
+        return fit + 10 * length.mean(1)
 
 
 class Group(nn.Module):

@@ -130,7 +130,7 @@ fn the_estimate_moves_along_the_gradient_of_the_score_at_the_estimate() {
         // The group embedding does not hear the motion, so it is the same at every point.
         assert_is_gradient(&added, factor, &x0, |x0| {
             let scores = engine.score(&case.inputs(x0, (ConsistencyForm::Estimate, 0.0)));
-            scores.expect("shapes fit").iter().map(|&s| f64::from(s)).sum()
+            scores.expect("shapes fit").iter().map(|s| f64::from(s.agreement)).sum()
         });
     }
 }
@@ -146,7 +146,7 @@ fn the_other_forms_move_along_the_gradient_by_the_noisy_motion() {
         let moved = engine.predict(&case.inputs(&case.x, (form, 2.0))).expect("shapes fit");
         assert_is_gradient(&(moved - &x0), 2.0, &case.x, |x| {
             let scores = engine.score(&case.inputs(&plain(x), (form, 0.0)));
-            scores.expect("shapes fit").iter().map(|&s| f64::from(s)).sum()
+            scores.expect("shapes fit").iter().map(|s| f64::from(s.agreement)).sum()
         });
     }
 }

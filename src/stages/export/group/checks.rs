@@ -236,8 +236,9 @@ impl CheckInputs {
         let t = g.constant(&[t.len()], &t);
         let w = g.constant(&[n_groups, self.width], w);
         let number = g.constant(&[n_groups], &vec![self.number as f32; n_groups]);
-        let inputs = GroupScoreInputs { x0: &x0, t: &t, w: &w, number: &number, mask: None };
-        Ok(networks.score.forward(&mut g, &inputs)?.data().to_vec())
+        let inputs =
+            GroupScoreInputs { x0: &x0, t: &t, w: &w, number: &number, mask: None, there: None };
+        Ok(networks.score.forward(&mut g, &inputs)?.log_ratio.data().to_vec())
     }
 }
 
