@@ -338,7 +338,8 @@ impl<'a> DiffusionInputs<'a> {
     ) -> Result<Tensor<f32>, TrainingError> {
         let target = g.constant(prediction.shape(), &self.target);
         let mask = &self.batch.mask;
-        let loss = objective.loss(g, schedule, &self.t, [prediction, &target], mask)?;
+        let layout = normalizer.layout();
+        let loss = objective.loss(g, layout, schedule, &self.t, [prediction, &target], mask)?;
         let x_t = g.constant(prediction.shape(), &self.x_t);
         let estimate_loss = objective.estimate.loss(
             g,
