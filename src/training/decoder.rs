@@ -9,11 +9,9 @@ use crate::autodiff::{Arena, Eager, Gradients, Interpreter, Parameters, Stream, 
 use crate::diffusion::{Schedule, ddim_update};
 use crate::model::{DecoderConfig, MotionDecoder, ParameterList};
 use crate::motion::{ChannelLimits, ColumnRole, MOTION_DIM, Normalizer};
-use crate::weights::{Archive, Section};
 
-use super::averaged::NetworkState;
+use super::averaged::{NetworkState, keeps_network};
 use super::batch::Batch;
-use super::checkpoint::Progress;
 use super::config::DecoderTraining;
 use super::diffusion::tape_seed;
 use super::drive::{Learner, Losses, NoReduction, Reducer, StepResult, Validation};
@@ -274,26 +272,7 @@ impl Learner for DecoderLearner<'_> {
         Ok(Validation { losses, live: Some(live), distance: None })
     }
 
-    fn sections(&self) -> Vec<Section<'_, f32>> {
-        self.network.sections()
-    }
-
-    fn best(&self) -> Vec<Section<'_, f32>> {
-        self.network.best()
-    }
-
-    fn n_updates(&self) -> (u64, u64) {
-        self.network.n_updates()
-    }
-
-    fn restore(
-        &mut self,
-        archive: &Archive,
-        place: &str,
-        at: &Progress,
-    ) -> Result<(), TrainingError> {
-        self.network.restore(archive, place, at)
-    }
+    keeps_network!(network);
 }
 
 #[cfg(test)]
