@@ -255,17 +255,17 @@ mod tests {
         let (root, body) = (weights.weights(ROOT), weights.weights(BODY));
         // Two of 13 weigh 3; three of 25 do, and eight a half.
         let (of_root, of_body) = (17.0 / 13.0, 27.0 / 25.0);
-        for i in 0..13 {
+        for (i, found) in root.into_iter().enumerate() {
             let weight = if [1, 4].contains(&i) { 3.0 } else { 1.0 };
-            assert!((root[i] - weight / of_root).abs() < 1e-15, "{i}: {}", root[i]);
+            assert!((found - weight / of_root).abs() < 1e-15, "{i}: {found}");
         }
-        for i in 0..25 {
+        for (i, found) in body.into_iter().enumerate() {
             let weight = match i {
                 1 | 4 | 7 => 3.0,
                 17.. => 0.5,
                 _ => 1.0,
             };
-            assert!((body[i] - weight / of_body).abs() < 1e-15, "{i}: {}", body[i]);
+            assert!((found - weight / of_body).abs() < 1e-15, "{i}: {found}");
         }
     }
 
