@@ -77,7 +77,8 @@ impl Bench {
             num_phrases: None,
         };
         let dataset = Arc::new(Dataset::in_memory([])?);
-        let normalizer = Normalizer { centre: [0.0; MOTION_DIM], scale: [0.5; MOTION_DIM] };
+        let mut normalizer = Normalizer::identity();
+        normalizer.scale.fill(0.5);
         let windows =
             Arc::new(Windows::new(dataset, normalizer, Augmentation::default(), frames, 1));
         let n_threads = NonZeroUsize::new(number("threads")?).context("threads")?;

@@ -11,6 +11,7 @@ pub mod evaluation;
 mod excerpt;
 pub mod generation;
 mod instructions;
+mod markup;
 pub mod model;
 pub mod motion;
 pub mod music;

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Which rooms a room may use.
-const MAY_USE: [(&str, &[&str]); 21] = [
+const MAY_USE: [(&str, &[&str]); 22] = [
     ("units", &[]),
     ("audio", &["excerpt", "instructions", "units"]),
     ("autodiff", &["instructions", "model"]),
@@ -14,18 +14,19 @@ const MAY_USE: [(&str, &[&str]); 21] = [
     ("excerpt", &[]),
     ("generation", &["audio", "autodiff", "diffusion", "model", "motion", "onnx", "units"]),
     ("instructions", &[]),
+    ("markup", &[]),
     ("model", &["audio", "motion", "units"]),
     ("motion", &["chance", "excerpt", "units"]),
     ("music", &["audio", "chance"]),
     ("onnx", &["audio", "model", "motion"]),
     ("plot", &["motion", "units"]),
-    ("report", &[]),
+    ("report", &["markup"]),
     ("store", &["audio", "motion", "units"]),
     (
         "training",
         &["audio", "autodiff", "diffusion", "model", "motion", "store", "units", "weights"],
     ),
-    ("view", &["motion", "units"]),
+    ("view", &["markup", "motion", "units"]),
     ("weights", &["autodiff", "model"]),
     (
         "stages",

@@ -166,11 +166,11 @@ vectorized! {
 ///
 /// Tunings are cached: an estimate has only 100 possible values.
 pub fn kernels(tuning: Tuning) -> Arc<Vec<OctaveKernels>> {
-    type Made = (Tuning, Arc<Vec<OctaveKernels>>);
-    static MADE: Mutex<Vec<Made>> = Mutex::new(Vec::new());
+    type CachedKernels = (Tuning, Arc<Vec<OctaveKernels>>);
+    static MADE: Mutex<Vec<CachedKernels>> = Mutex::new(Vec::new());
     /// An estimated tuning is one of 100; more are kept of none that a user may give.
     const MAX_MADE: usize = 128;
-    let find = |made: &[Made]| {
+    let find = |made: &[CachedKernels]| {
         made.iter().find(|(of, _)| *of == tuning).map(|(_, kernels)| Arc::clone(kernels))
     };
     let lock = || MADE.lock().unwrap_or_else(PoisonError::into_inner);

@@ -116,7 +116,6 @@ impl FirstPass {
         Ok(SecondPass {
             chroma: ChromaPass::new(tuning),
             raw: RawFeatures::from_spectral(self.spectral.finish(), tuning, self.n_samples),
-            n_samples: 0,
         })
     }
 }
@@ -125,19 +124,12 @@ impl FirstPass {
 pub struct SecondPass {
     chroma: ChromaPass,
     raw: RawFeatures,
-    n_samples: u64,
 }
 
 impl SecondPass {
     /// Takes the next mono samples at 44.1 kHz.
     pub fn push(&mut self, samples: &[f32]) {
-        self.n_samples += samples.len() as u64;
         self.chroma.push(samples);
-    }
-
-    /// Returns whether this pass saw as many samples as the first.
-    pub fn is_complete(&self) -> bool {
-        self.n_samples == self.raw.n_samples
     }
 
     /// Ends the signal.
@@ -339,7 +331,6 @@ mod tests {
         y.chunks(1237).for_each(|samples| first.push(samples));
         let mut second = first.finish().expect("samples");
         y.chunks(4099).for_each(|samples| second.push(samples));
-        assert!(second.is_complete());
         assert_eq!(second.finish(), whole);
     }
 }

@@ -239,7 +239,7 @@ impl SlidingDft {
                 (&self.work.cosine_sums[sums.clone()], &self.work.sine_sums[sums]);
             turn(&mut self.spectrum, &self.plan.turns, cosines, sines);
             if self.n_zeros >= n_fft {
-                // Of silence nothing remains, not even rounding.
+                // A window of zeros has a spectrum of zeros: rounding errors of what came before end here.
                 self.spectrum = Spectrum::default();
             }
             if self.n_before > 1 {

@@ -1,23 +1,14 @@
 //! How far motion is from what was asked of it.
 //!
-//! As in OmniControl and GMD (`calculate_trajectory_error`), for one rigid body: positions in millimetres,
-//! orientations in degrees.
+//! As in OmniControl and GMD (`calculate_trajectory_error`), for one rigid body.
 
 use crate::motion::quaternion::{Quaternion, conj, mul, normalize};
-use crate::motion::vector::{Vector, minus, norm};
-use crate::units::FPS;
+use crate::motion::vector::norm;
 
 /// Misses of a position that count, mm; the second is the one that is reported.
 pub const POSITION_THRESHOLDS_MM: [f64; 2] = [200.0, 500.0];
 /// Misses of an orientation that count, degrees.
 pub const ROTATION_THRESHOLDS_DEG: [f64; 2] = [10.0, 30.0];
-
-const MM_PER_M: f64 = 1e3;
-
-/// Returns `|a - b|` in millimetres, of positions in metres.
-pub fn position_error_mm(a: Vector, b: Vector) -> f64 {
-    MM_PER_M * norm(minus(a, b))
-}
 
 /// Returns the angle of the turn between two orientations, `2 acos |a · b|`, 0 to π rad.
 ///
@@ -84,47 +75,6 @@ pub fn control_errors<S: AsRef<[f64]>>(samples: &[S], threshold: f64) -> Option<
     })
 }
 
-/// Returns how far repetitions of one task spread, the root mean square distance from their mean path, mm.
-///
-/// `√(mean over repetitions and frames of |p - p̄[t]|²)`, over the frames that all have. None for fewer than
-/// two repetitions, without frames, or where a position is not finite.
-pub fn spread_mm<P: AsRef<[Vector]>>(repetitions_m: &[P]) -> Option<f64> {
-    let paths: Vec<&[Vector]> = repetitions_m.iter().map(|path| path.as_ref()).collect();
-    let n_frames = paths.iter().map(|path| path.len()).min().unwrap_or(0);
-    if paths.len() < 2 || n_frames == 0 {
-        return None;
-    }
-    let n = paths.len() as f64;
-    let mut squares = 0.0;
-    for t in 0..n_frames {
-        let mean: Vector =
-            std::array::from_fn(|i| paths.iter().map(|path| path[t][i]).sum::<f64>() / n);
-        squares += paths.iter().map(|path| norm(minus(path[t], mean)).powi(2)).sum::<f64>();
-    }
-    let spread = MM_PER_M * (squares / (n * n_frames as f64)).sqrt();
-    spread.is_finite().then_some(spread)
-}
-
-/// Returns how early (below 0) or late a path comes nearest to a point that it should hit at a frame, s.
-///
-/// Looked for within `reach_frames` on either side; of two frames as near, that which is less off counts.
-/// None where none of them is on the path or all are not finite.
-pub fn timing_error_s(
-    path_m: &[Vector],
-    target_m: Vector,
-    at_frame: usize,
-    reach_frames: usize,
-) -> Option<f64> {
-    let frames =
-        at_frame.saturating_sub(reach_frames)..path_m.len().min(at_frame + reach_frames + 1);
-    let off = |t: usize| t as f64 - at_frame as f64;
-    frames
-        .map(|t| (norm(minus(path_m[t], target_m)), off(t)))
-        .filter(|(distance, _)| distance.is_finite())
-        .min_by(|a, b| a.0.total_cmp(&b.0).then(a.1.abs().total_cmp(&b.1.abs())))
-        .map(|(_, off)| off / FPS)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -142,7 +92,6 @@ mod tests {
         assert!(
             (rotation_error_deg(IDENTITY, from_axis_angle(axis, 4.0)) - 130.816_881).abs() < 1e-5
         );
-        assert_eq!(position_error_mm([1.0, 2.0, 3.0], [1.0, 2.0, 2.5]), 500.0);
     }
 
     #[test]
@@ -163,27 +112,5 @@ mod tests {
         assert_eq!((found.trajectory, found.mean, found.mean_by_sample), (0.5, None, None));
         assert!((found.location - 1.0 / 3.0).abs() < 1e-15);
         assert_eq!(control_errors(&[Vec::<f64>::new(), Vec::new()], 500.0), None);
-    }
-
-    #[test]
-    fn repetitions_spread_about_their_mean() {
-        let (a, b) = (vec![[0.0, 0.0, 0.0]; 5], vec![[0.2, 0.0, 0.0]; 7]);
-        // Each is 0.1 m from the mean.
-        assert!((spread_mm(&[a.clone(), b]).expect("frames") - 100.0).abs() < 1e-9);
-        assert_eq!(spread_mm(&[a.clone(), a.clone()]), Some(0.0));
-        assert_eq!(spread_mm(&[a]), None);
-        assert_eq!(spread_mm(&[Vec::<Vector>::new(), vec![[0.0; 3]]]), None);
-    }
-
-    #[test]
-    fn timing_is_that_of_the_nearest_frame() {
-        let path: Vec<Vector> = (0..41).map(|t| [0.1 * f64::from(t), 0.0, 0.0]).collect();
-        assert_eq!(timing_error_s(&path, [2.3, 1.0, 0.0], 20, 6), Some(0.1));
-        assert_eq!(timing_error_s(&path, [1.7, 1.0, 0.0], 20, 6), Some(-0.1));
-        // Out of reach: as far as was looked.
-        assert_eq!(timing_error_s(&path, [3.9, 0.0, 0.0], 20, 6), Some(0.2));
-        assert_eq!(timing_error_s(&path, [0.0; 3], 50, 6), None);
-        assert_eq!(timing_error_s(&[[f64::NAN; 3]; 5], [0.0; 3], 2, 6), None);
-        assert_eq!(timing_error_s(&[[1.0; 3]; 9], [0.0; 3], 4, 2), Some(0.0));
     }
 }

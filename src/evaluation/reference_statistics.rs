@@ -4,7 +4,7 @@
 //! the numbers of two models can be compared, and held-out real motion is measured as any other. The hash says
 //! which data they are of.
 
-use ndarray::{Array2, ArrayView2, Axis, concatenate};
+use ndarray::{Array2, ArrayView2, Axis};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -264,14 +264,6 @@ impl ReferenceStatistics {
     pub fn features(&self, set: FeatureSet, frames: ArrayView2<f32>) -> Option<Array2<f64>> {
         let features = set.stacked(&chunks_of(frames)?, &self.thresholds);
         Some(self.statistics(set).normalize(features.view()))
-    }
-
-    /// Returns kinetic and geometric features side by side, by which diversity is measured; `kinetic` is 8 or
-    /// 12 numbers wide.
-    pub fn joined(&self, kinetic: FeatureSet, frames: ArrayView2<f32>) -> Option<Array2<f64>> {
-        let (a, b) =
-            (self.features(kinetic, frames)?, self.features(FeatureSet::Geometric, frames)?);
-        concatenate(Axis(1), &[a.view(), b.view()]).ok()
     }
 }
 

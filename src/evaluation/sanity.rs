@@ -4,13 +4,15 @@
 //! pass with an error of 0.80 m/s. They keep their names, thresholds and messages; beside them stand checks
 //! that real capture passes and such noise does not.
 
+mod quantities;
+
 use ndarray::ArrayView2;
 
-use crate::motion::phase::WRAP_BARS;
 use crate::motion::postprocess::PostProcessConfig;
-use crate::motion::quaternion::{Quaternion, angular_velocity, dot, normalize};
-use crate::motion::{Channel, ChannelLimits};
-use crate::units::FPS;
+use crate::motion::{BODY, ChannelLimits, Layout};
+
+use quantities::CheckQuantities;
+pub use quantities::derivative_error;
 
 /// Which set a check is of; the two are never mixed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -53,12 +55,18 @@ mod strict {
     pub const MIN_QUATERNION_DOT: f64 = 0.95;
 }
 
-/// Checks a motion, `[T, 25]`; first the reference's five, then the strict ones.
+/// Checks a motion of [`BODY`], `[T, 25]`; see [`checks_in`].
+pub fn checks(frames: ArrayView2<f32>, limits: ChannelLimits) -> Vec<Check> {
+    checks_in(BODY, frames, limits)
+}
+
+/// Checks a motion, `[T, columns]`; first the reference's five, then the strict ones, without those of columns that
+/// the layout lacks.
 ///
 /// Differences are forward ones, as everywhere. A value that is not finite fails every check that it
 /// enters, and one of its own.
-pub fn checks(frames: ArrayView2<f32>, limits: ChannelLimits) -> Vec<Check> {
-    let m = CheckQuantities::of(frames, limits);
+pub fn checks_in(layout: Layout, frames: ArrayView2<f32>, limits: ChannelLimits) -> Vec<Check> {
+    let m = CheckQuantities::of(layout, frames, limits);
     let within = |x: f64, [low, high]: [f64; 2]| x >= low && x <= high;
     let check = |name, set, value: f64, threshold, passed, message: String| Check {
         name,
@@ -68,51 +76,38 @@ pub fn checks(frames: ArrayView2<f32>, limits: ChannelLimits) -> Vec<Check> {
         passed: passed && value.is_finite(),
         message,
     };
-    let [low, high] = m.phase;
     let reference = {
         use reference::*;
         let set = CheckSet::Reference;
         [
-            check(
+            Some(check(
                 "quaternion",
                 set,
                 m.norm,
                 1.0,
                 within(m.norm, QUATERNION_NORM),
                 format!("Mean quaternion norm: {:.4}", m.norm),
-            ),
-            check(
-                "phase",
-                set,
-                if low < PHASE[0] { low } else { high },
-                1.0,
-                low >= PHASE[0] && high <= PHASE[1],
-                format!("Phase range: [{low:.4}, {high:.4}]"),
-            ),
-            check(
-                "jerk",
-                set,
-                m.jerk,
-                MAX_JERK,
-                m.jerk < MAX_JERK,
-                format!("Mean jerk: {:.2} (threshold: {MAX_JERK:.1})", m.jerk),
-            ),
-            check(
-                "velocity_coherence",
-                set,
-                m.velocity_error,
-                MAX_VELOCITY_ERROR,
-                m.velocity_error < MAX_VELOCITY_ERROR,
-                format!("Velocity coherence error: {:.4}", m.velocity_error),
-            ),
-            check(
-                "accel_coherence",
-                set,
-                m.acceleration_error,
-                MAX_ACCELERATION_ERROR,
-                m.acceleration_error < MAX_ACCELERATION_ERROR,
-                format!("Acceleration coherence error: {:.4}", m.acceleration_error),
-            ),
+            )),
+            m.phase.map(|[low, high]| {
+                let value = if low < PHASE[0] { low } else { high };
+                let is_within = low >= PHASE[0] && high <= PHASE[1];
+                let message = format!("Phase range: [{low:.4}, {high:.4}]");
+                check("phase", set, value, 1.0, is_within, message)
+            }),
+            m.jerk.map(|jerk| {
+                let message = format!("Mean jerk: {jerk:.2} (threshold: {MAX_JERK:.1})");
+                check("jerk", set, jerk, MAX_JERK, jerk < MAX_JERK, message)
+            }),
+            m.velocity_error.map(|error| {
+                let (most, message) =
+                    (MAX_VELOCITY_ERROR, format!("Velocity coherence error: {error:.4}"));
+                check("velocity_coherence", set, error, most, error < most, message)
+            }),
+            m.acceleration_error.map(|error| {
+                let (most, message) =
+                    (MAX_ACCELERATION_ERROR, format!("Acceleration coherence error: {error:.4}"));
+                check("accel_coherence", set, error, most, error < most, message)
+            }),
         ]
     };
     let strict = {
@@ -126,31 +121,21 @@ pub fn checks(frames: ArrayView2<f32>, limits: ChannelLimits) -> Vec<Check> {
             check(name, CheckSet::Strict, value as f64, 0.0, value == 0, message)
         };
         [
-            count("finite", "values that are not finite", m.n_not_finite),
-            count("ranges", "values outside their channel's limits", m.n_outside),
-            count("phase_monotonic", "falls of the phase within a bar", m.n_falls),
-            below(
-                "velocity",
-                "velocity against position",
-                "m/s",
-                m.velocity_error,
-                MAX_VELOCITY_ERROR,
-            ),
-            below(
-                "acceleration",
-                "acceleration against velocity",
-                "m/s²",
-                m.acceleration_error,
-                MAX_ACCELERATION_ERROR,
-            ),
-            below(
-                "angular_velocity",
-                "angular velocity against orientation",
-                "rad/s",
-                m.turn_error,
-                MAX_TURN_ERROR,
-            ),
-            check(
+            Some(count("finite", "values that are not finite", m.n_not_finite)),
+            Some(count("ranges", "values outside their channel's limits", m.n_outside)),
+            m.n_falls.map(|n| count("phase_monotonic", "falls of the phase within a bar", n)),
+            m.velocity_error.map(|error| {
+                below("velocity", "velocity against position", "m/s", error, MAX_VELOCITY_ERROR)
+            }),
+            m.acceleration_error.map(|error| {
+                let (what, most) = ("acceleration against velocity", MAX_ACCELERATION_ERROR);
+                below("acceleration", what, "m/s²", error, most)
+            }),
+            m.turn_error.map(|error| {
+                let (what, most) = ("angular velocity against orientation", MAX_TURN_ERROR);
+                below("angular_velocity", what, "rad/s", error, most)
+            }),
+            Some(check(
                 "quaternion_continuity",
                 CheckSet::Strict,
                 m.least_dot,
@@ -160,21 +145,16 @@ pub fn checks(frames: ArrayView2<f32>, limits: ChannelLimits) -> Vec<Check> {
                     "least q · q' of two frames: {:.4}, at least {MIN_QUATERNION_DOT}",
                     m.least_dot
                 ),
-            ),
-            check(
-                "jerk_of_capture",
-                CheckSet::Strict,
-                m.jerk,
-                JERK[1],
-                within(m.jerk, JERK),
-                format!(
-                    "mean jerk: {:.1} m/s³, that of captures is {} to {}",
-                    m.jerk, JERK[0], JERK[1]
-                ),
-            ),
+            )),
+            m.jerk.map(|jerk| {
+                let [least, most] = JERK;
+                let message =
+                    format!("mean jerk: {jerk:.1} m/s³, that of captures is {least} to {most}");
+                check("jerk_of_capture", CheckSet::Strict, jerk, most, within(jerk, JERK), message)
+            }),
         ]
     };
-    reference.into_iter().chain(strict).collect()
+    reference.into_iter().chain(strict).flatten().collect()
 }
 
 /// Returns whether a check holds of every motion whose velocities are derived from its poses.
@@ -202,97 +182,14 @@ pub fn holds_by_construction(check: &str, config: &PostProcessConfig, has_phase:
     }
 }
 
-/// Returns the mean `|d[t] - 30 (x[t+1] - x[t])|` over frames and axes, of a channel x and the one that says
-/// it is its derivative; 0 where there are no two frames.
-pub fn derivative_error(frames: ArrayView2<f32>, of: Channel, derivative: Channel) -> f64 {
-    let at = |t: usize, i: usize| f64::from(frames[[t, i]]);
-    let (x, d) = (of.range().start, derivative.range().start);
-    let pairs = frames.nrows().saturating_sub(1);
-    let off = |t: usize| -> f64 {
-        (0..3).map(|i| (at(t, d + i) - FPS * (at(t + 1, x + i) - at(t, x + i))).abs()).sum()
-    };
-    (0..pairs).map(off).sum::<f64>() / (3 * pairs.max(1)) as f64
-}
-
-/// The quantities of a motion that the checks compare with thresholds.
-struct CheckQuantities {
-    norm: f64,
-    phase: [f64; 2],
-    jerk: f64,
-    velocity_error: f64,
-    acceleration_error: f64,
-    turn_error: f64,
-    least_dot: f64,
-    n_not_finite: usize,
-    n_outside: usize,
-    n_falls: usize,
-}
-
-impl CheckQuantities {
-    fn of(frames: ArrayView2<f32>, limits: ChannelLimits) -> Self {
-        let n = frames.nrows();
-        let vector = |channel: Channel, t: usize| -> [f64; 3] {
-            let first = channel.range().start;
-            std::array::from_fn(|i| f64::from(frames[[t, first + i]]))
-        };
-        let quaternion = |t: usize| -> Quaternion {
-            let first = Channel::Quaternion.range().start;
-            std::array::from_fn(|i| f64::from(frames[[t, first + i]]))
-        };
-        let phase = |t: usize| f64::from(frames[[t, Channel::Phase.range().start]]);
-        let pairs = n.saturating_sub(1);
-        // Where there is nothing to measure there is no error.
-        let mean = |sum: f64, n: usize| if n == 0 { 0.0 } else { sum / n as f64 };
-        let length = |v: [f64; 3]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
-        let jerk = |t: usize| {
-            let (a, b) = (vector(Channel::Acceleration, t), vector(Channel::Acceleration, t + 1));
-            FPS * length(std::array::from_fn(|i| b[i] - a[i]))
-        };
-        let turn = |t: usize| {
-            let derived =
-                angular_velocity(normalize(quaternion(t)), normalize(quaternion(t + 1)), FPS);
-            let own = vector(Channel::AngularVelocity, t);
-            (0..3).map(|i| (own[i] - derived[i]).abs()).sum::<f64>()
-        };
-        // `f64::min` would pass over NaN.
-        let least = |a: f64, b: f64| if b < a || b.is_nan() { b } else { a };
-        let most = |a: f64, b: f64| if b > a || b.is_nan() { b } else { a };
-        let outside = Channel::ALL.into_iter().map(|channel| {
-            let (low, high) = limits.bounds(channel);
-            let columns = frames.slice(ndarray::s![.., channel.range()]);
-            columns.iter().filter(|x| !(low..=high).contains(*x)).count()
-        });
-        Self {
-            norm: mean((0..n).map(|t| dot(quaternion(t), quaternion(t)).sqrt()).sum(), n),
-            phase: [
-                (0..n).map(phase).fold(f64::INFINITY, least),
-                (0..n).map(phase).fold(f64::NEG_INFINITY, most),
-            ],
-            jerk: mean((0..pairs).map(jerk).sum(), pairs),
-            velocity_error: derivative_error(frames, Channel::Position, Channel::Velocity),
-            acceleration_error: derivative_error(frames, Channel::Velocity, Channel::Acceleration),
-            turn_error: mean((0..pairs).map(turn).sum(), 3 * pairs),
-            least_dot: (0..pairs)
-                .map(|t| dot(normalize(quaternion(t)), normalize(quaternion(t + 1))))
-                .fold(1.0, least),
-            n_not_finite: frames.iter().filter(|x| !x.is_finite()).count(),
-            n_outside: outside.sum(),
-            n_falls: (0..pairs)
-                .filter(|&t| {
-                    let change = phase(t + 1) - phase(t);
-                    (-WRAP_BARS..-1e-6).contains(&change)
-                })
-                .count(),
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::motion::kinematics::{Poses, frames_of};
+    use crate::motion::layout::tests::ROOT;
     use crate::motion::quaternion::from_axis_angle;
-    use ndarray::Array2;
+    use crate::units::FPS;
+    use ndarray::{Array2, Axis};
 
     /// A walk along a circle of 1 m that bobs twice a second.
     fn walk(n: usize) -> Array2<f32> {
@@ -374,6 +271,31 @@ mod tests {
         let nothing = PostProcessConfig::nothing();
         let all = checks(walk(31).view(), ChannelLimits::Wide);
         assert!(all.iter().all(|check| !holds_by_construction(check.name, &nothing, true)));
+    }
+
+    #[test]
+    fn the_root_alone_has_the_checks_of_its_columns() {
+        let columns: Vec<usize> = (0..6).chain(9..16).collect();
+        let mut body = walk(61);
+        body.column_mut(4).mapv_inplace(|v| v + 0.3);
+        body[[7, 14]] = 21.0;
+        let root = body.select(Axis(1), &columns);
+        let found = checks_in(ROOT, root.view(), ChannelLimits::Wide);
+        let names: Vec<_> = found.iter().map(|check| check.name).collect();
+        let wanted = [
+            "quaternion",
+            "velocity_coherence",
+            "finite",
+            "ranges",
+            "velocity",
+            "angular_velocity",
+            "quaternion_continuity",
+        ];
+        assert_eq!(names, wanted);
+        let of_body = checks(body.view(), ChannelLimits::Wide);
+        for check in found {
+            assert!(of_body.contains(&check), "{check:?}");
+        }
     }
 
     #[test]

@@ -7,7 +7,7 @@ use crate::motion::quaternion::{
     Quaternion, angular_velocity, dot, from_axis_angle, from_rotation_vector, make_sign_continuous,
     mul, normalize,
 };
-use crate::motion::{CHANNEL_NAMES, Channel, ChannelLimits, MOTION_DIM, Placement, channel_unit};
+use crate::motion::{BODY, CHANNEL_NAMES, Channel, ChannelLimits, MOTION_DIM, Placement};
 use crate::units::frames_to_s;
 
 /// Frames over which a correction fades out on either side of what asked for it: half a second.
@@ -109,9 +109,9 @@ impl Constraints {
             }
             let wanted = match wanted {
                 WantedValue::Value { channel, value } => {
-                    let unit = channel_unit(channel).unwrap_or_default();
-                    let group = Channel::ALL.into_iter().find(|c| c.range().contains(&channel));
-                    let (low, high) = group.map_or((0.0, 0.0), |group| limits.bounds(group));
+                    let group = BODY.group_of(channel).map(|columns| columns.group);
+                    let unit = group.map_or("", |group| group.unit);
+                    let (low, high) = group.map_or((0.0, 0.0), |group| limits.of(group));
                     if !(f64::from(low)..=f64::from(high)).contains(&value) {
                         let what = what();
                         return Err(ControlError::Limit { what, frame, value, low, high, unit });

@@ -7,66 +7,68 @@
 use ndarray::{Array2, ArrayView2, s};
 
 use crate::motion::blend::{align_signs, blend};
-use crate::motion::{MOTION_DIM, Placement};
+use crate::motion::{Layout, Placement};
 
-/// Makes a window and the next agree on what they share; both in metres, `[T, 25]`.
+/// Makes a window and the next agree on what they share; both in metres, `[T, columns]`.
 ///
 /// The shared frames become a blend that begins as the earlier window and ends as the later one, seen from
 /// the later window in it and from the earlier one in that. `shift` frames of the earlier window come
 /// before the later one's first.
-pub fn agree(earlier: &mut Array2<f32>, later: &mut Array2<f32>, shift: usize) {
-    let (shared, placement) = blended(earlier.view(), later.view(), shift);
+pub fn agree(layout: Layout, earlier: &mut Array2<f32>, later: &mut Array2<f32>, shift: usize) {
+    let (shared, placement) = blended(layout, earlier.view(), later.view(), shift);
     later.slice_mut(s![..shared.nrows(), ..]).assign(&shared);
     let mut back = shared;
-    placement.restore(&mut back);
+    placement.restore_in(layout, &mut back);
     let sign_of = earlier.slice(s![shift..shift + 1, ..]).to_owned();
-    align_signs(sign_of.view(), &mut back.view_mut());
+    align_signs(layout, sign_of.view(), &mut back.view_mut());
     earlier.slice_mut(s![shift.., ..]).assign(&back);
 }
 
 /// Brings the beginning of a window to the end of one that does not change any more.
-pub fn follow(earlier: ArrayView2<f32>, later: &mut Array2<f32>, shift: usize) {
-    let (shared, _) = blended(earlier, later.view(), shift);
+pub fn follow(layout: Layout, earlier: ArrayView2<f32>, later: &mut Array2<f32>, shift: usize) {
+    let (shared, _) = blended(layout, earlier, later.view(), shift);
     later.slice_mut(s![..shared.nrows(), ..]).assign(&shared);
 }
 
 /// Returns the frames that two windows share, placed as the later one is, and where the earlier one has
 /// the first of them.
 fn blended(
+    layout: Layout,
     earlier: ArrayView2<f32>,
     later: ArrayView2<f32>,
     shift: usize,
 ) -> (Array2<f32>, Placement) {
     let mut a = earlier.slice(s![shift.., ..]).to_owned();
-    let placement = Placement::of_first(a.view()).unwrap_or_default();
-    placement.remove(&mut a);
+    let placement = Placement::of_first_in(layout, a.view()).unwrap_or_default();
+    placement.remove_in(layout, &mut a);
     let n = a.nrows().min(later.nrows());
-    (cross_fade(a.slice(s![..n, ..]), later.slice(s![..n, ..])), placement)
+    (cross_fade(layout, a.slice(s![..n, ..]), later.slice(s![..n, ..])), placement)
 }
 
-/// Fades one motion into another, `[T, 25]` each: all of the first at the first frame, all of the second
+/// Fades one motion into another, `[T, columns]` each: all of the first at the first frame, all of the second
 /// behind the last.
 ///
 /// The weight is 3u² − 2u³, u = t / T, so that both ends join smoothly.
-pub fn cross_fade(a: ArrayView2<f32>, b: ArrayView2<f32>) -> Array2<f32> {
+pub fn cross_fade(layout: Layout, a: ArrayView2<f32>, b: ArrayView2<f32>) -> Array2<f32> {
     let n = a.nrows();
-    blend(a, b, |t| {
+    blend(layout, a, b, |t| {
         let u = t as f64 / n.max(1) as f64;
         u * u * (3.0 - 2.0 * u)
     })
 }
 
 /// Puts the windows of a track one after another, as they are finished.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Joiner {
+    layout: Layout,
     /// The frames of the latest window where it lies in the world; those before are given out.
     latest: Option<Array2<f32>>,
 }
 
 impl Joiner {
     /// Begins with a track that stands at the origin and faces +Z.
-    pub fn new() -> Self {
-        Self::default()
+    pub fn new(layout: Layout) -> Self {
+        Self { layout, latest: None }
     }
 
     /// Takes the next window, `shift` frames behind the one before; returns the frames that no later window
@@ -74,15 +76,17 @@ impl Joiner {
     pub fn push(&mut self, mut window: Array2<f32>, shift: usize) -> Array2<f32> {
         let Some(before) = self.latest.take() else {
             self.latest = Some(window);
-            return Array2::zeros((0, MOTION_DIM));
+            return Array2::zeros((0, self.layout.width()));
         };
+        let layout = self.layout;
         let shared = before.slice(s![shift.., ..]);
-        let own = Placement::of_first(window.view()).unwrap_or_default();
-        own.remove(&mut window);
-        Placement::of_first(shared).unwrap_or_default().restore(&mut window);
-        align_signs(shared, &mut window.view_mut());
+        let own = Placement::of_first_in(layout, window.view()).unwrap_or_default();
+        own.remove_in(layout, &mut window);
+        let place = Placement::of_first_in(layout, shared).unwrap_or_default();
+        place.restore_in(layout, &mut window);
+        align_signs(layout, shared, &mut window.view_mut());
         let n = shared.nrows().min(window.nrows());
-        let blend = cross_fade(shared.slice(s![..n, ..]), window.slice(s![..n, ..]));
+        let blend = cross_fade(layout, shared.slice(s![..n, ..]), window.slice(s![..n, ..]));
         window.slice_mut(s![..n, ..]).assign(&blend);
         self.latest = Some(window);
         before.slice(s![..shift, ..]).to_owned()
@@ -90,7 +94,7 @@ impl Joiner {
 
     /// Returns the frames of the last window.
     pub fn finish(self) -> Array2<f32> {
-        self.latest.unwrap_or_else(|| Array2::zeros((0, MOTION_DIM)))
+        self.latest.unwrap_or_else(|| Array2::zeros((0, self.layout.width())))
     }
 }
 
@@ -99,7 +103,8 @@ mod tests {
     use super::*;
     use crate::generation::walk::walk;
     use crate::generation::windows::Windows;
-    use crate::motion::Channel;
+    use crate::motion::layout::tests::ROOT;
+    use crate::motion::{BODY, Channel, MOTION_DIM};
     use ndarray::{Axis, concatenate};
 
     fn windows_of(track: &Array2<f32>, windows: &Windows) -> Vec<Array2<f32>> {
@@ -127,7 +132,7 @@ mod tests {
         let track = walk(431);
         for (length, overlap) in [(120, 30), (97, 1), (64, 40)] {
             let windows = Windows::new(431, length, overlap);
-            let mut joiner = Joiner::new();
+            let mut joiner = Joiner::new(BODY);
             let mut parts: Vec<Array2<f32>> = Vec::new();
             for (i, window) in windows_of(&track, &windows).into_iter().enumerate() {
                 parts.push(joiner.push(window, windows.shift(i)));
@@ -147,11 +152,11 @@ mod tests {
         let windows = Windows::new(200, 120, 30);
         let cut = windows_of(&track, &windows);
         let (mut a, mut b) = (cut[0].clone(), cut[1].clone());
-        agree(&mut a, &mut b, windows.shift(1));
+        agree(BODY, &mut a, &mut b, windows.shift(1));
         // Rounding of numbers up to 5, turned there and back.
         same(&a, &cut[0], 1e-5);
         same(&b, &cut[1], 1e-5);
-        follow(a.view(), &mut b, windows.shift(1));
+        follow(BODY, a.view(), &mut b, windows.shift(1));
         same(&b, &cut[1], 1e-5);
     }
 
@@ -164,7 +169,7 @@ mod tests {
         let (mut a, mut b) = (cut[0].clone(), cut[1].clone());
         b.column_mut(1).mapv_inplace(|y| y + 0.3);
         b.column_mut(16).mapv_inplace(|x| (x + 0.9).fract());
-        agree(&mut a, &mut b, shift);
+        agree(BODY, &mut a, &mut b, shift);
         let n = 120 - shift;
         assert_eq!(
             a[[shift, 1]],
@@ -193,9 +198,32 @@ mod tests {
     }
 
     #[test]
+    fn windows_of_the_root_alone_are_joined_as_within_a_body() {
+        let columns: Vec<usize> = (0..6).chain(9..16).collect();
+        let root_of = |frames: &Array2<f32>| frames.select(Axis(1), &columns);
+        let track = walk(300);
+        let windows = Windows::new(300, 120, 30);
+        let mut both = [Joiner::new(BODY), Joiner::new(ROOT)];
+        for (i, window) in windows_of(&track, &windows).into_iter().enumerate() {
+            let root = both[1].push(root_of(&window), windows.shift(i));
+            assert_eq!(root, root_of(&both[0].push(window, windows.shift(i))));
+        }
+        let [body, root] = both.map(Joiner::finish);
+        assert_eq!(root, root_of(&body));
+        let cut = windows_of(&track, &windows);
+        let (mut a, mut b) = (root_of(&cut[0]), root_of(&cut[1]));
+        agree(ROOT, &mut a, &mut b, windows.shift(1));
+        let off = |x: &Array2<f32>, y: Array2<f32>| {
+            x.iter().zip(&y).map(|(x, y)| (x - y).abs()).fold(0.0, f32::max)
+        };
+        // Rounding of numbers up to 5, turned there and back.
+        assert!(off(&a, root_of(&cut[0])) < 1e-5 && off(&b, root_of(&cut[1])) < 1e-5);
+    }
+
+    #[test]
     fn estimates_without_a_length_are_blended_as_numbers() {
         let (a, b) = (Array2::zeros((3, MOTION_DIM)), Array2::from_elem((3, MOTION_DIM), 0.5));
-        let blend = cross_fade(a.view(), b.view());
+        let blend = cross_fade(BODY, a.view(), b.view());
         assert!(blend.iter().all(|x| x.is_finite()));
         assert_eq!((blend[[0, 9]], blend[[0, 3]]), (0.0, 0.0));
     }

@@ -108,7 +108,7 @@ impl Generator<'_> {
             n_given += frames.nrows();
             emit(frames)
         };
-        let mut joiner = Joiner::new();
+        let mut joiner = Joiner::new(self.normalizer.layout());
         let mut before: Option<Window> = None;
         for run in windows.runs(RUN_WINDOWS) {
             let first = match &before {
@@ -165,12 +165,13 @@ impl Generator<'_> {
     fn refine(&self, track: &Track, run: &Run, x0: &mut Array3<f32>) {
         let estimated = self.motions(x0);
         let mut motions = estimated.clone();
+        let layout = self.normalizer.layout();
         if let Some(before) = run.before {
-            follow(before.motion.view(), &mut motions[0], run.shift(0));
+            follow(layout, before.motion.view(), &mut motions[0], run.shift(0));
         }
         for i in 1..motions.len() {
             let (earlier, later) = motions.split_at_mut(i);
-            agree(&mut earlier[i - 1], &mut later[0], run.shift(i));
+            agree(layout, &mut earlier[i - 1], &mut later[0], run.shift(i));
         }
         if let Some(WeightedConstraints { constraints, strength }) = track.constraints {
             let places = run.places(&motions);

@@ -1,11 +1,11 @@
-//! The decoder from a sampled latent to the 25 channels of motion.
+//! The decoder from a sampled latent to the columns of motion.
 
 mod fusion;
 
 use serde::{Deserialize, Serialize};
 
 use crate::motion::postprocess::FusionVariances;
-use crate::motion::{Channel, ChannelLimits, MOTION_DIM};
+use crate::motion::{BODY, ChannelLimits, ColumnRole, Columns, Layout, MOTION_DIM};
 
 use super::graph::{Activation, Graph, Result};
 use super::layers::{LayerNorm, Linear};
@@ -87,7 +87,8 @@ const MAX_EXPANSION: usize = 16;
 pub struct MotionDecoder {
     input_proj: Linear,
     blocks: Vec<Block>,
-    heads: Vec<(Channel, Linear)>,
+    layout: Layout,
+    heads: Vec<(Columns, Linear)>,
     limits: ChannelLimits,
     fusion: Option<PoseFusion>,
 }
@@ -134,67 +135,88 @@ impl MotionDecoder {
 
     /// Makes the decoder as a part of another network.
     pub fn within(root: &mut Scope, config: &DecoderConfig) -> Self {
+        Self::of_layout(root, config, BODY)
+    }
+
+    /// Makes the decoder of any layout, a head for each of its groups.
+    ///
+    /// # Panics
+    /// When poses are to be fused and the layout lacks one of their derivatives.
+    pub fn of_layout(root: &mut Scope, config: &DecoderConfig, layout: Layout) -> Self {
         let input_proj =
             Linear::new(&mut root.at("input_proj"), config.input_dim, config.hidden_dim);
         let blocks = (0..config.n_blocks)
             .map(|i| Block::new(&mut root.at(format!("blocks.{i}")), config))
             .collect();
-        let heads = Channel::ALL.map(|channel| {
-            let mut scope = root.at(format!("{}_head", channel.name()));
-            (channel, Linear::new(&mut scope, config.hidden_dim, channel.width()))
+        let heads = layout.groups().map(|columns| {
+            let mut scope = root.at(format!("{}_head", columns.group.name));
+            (columns, Linear::new(&mut scope, config.hidden_dim, columns.width()))
         });
+        let heads = heads.collect();
         let fusion = config.fusion.as_ref().map(PoseFusion::new);
-        Self { input_proj, blocks, heads: heads.into(), limits: config.limits, fusion }
+        let is_whole = layout.body().derived().count() == 3;
+        assert!(is_whole || fusion.is_none(), "fusion needs every derivative of the poses");
+        Self { input_proj, blocks, layout, heads, limits: config.limits, fusion }
     }
 
     /// Decodes a latent.
     ///
-    /// Velocity, acceleration and angular velocity are limit · tanh, the quaternion has unit norm,
-    /// the phase is a sigmoid; position and style are free. With fusion, velocity, acceleration and angular velocity
+    /// Vectors (velocity, acceleration, angular velocity) are limit · tanh, turns have unit norm, phases are
+    /// sigmoids; places and free columns are as they come. With fusion, velocity, acceleration and angular velocity
     /// are then those of the fused poses, which no tanh holds.
     ///
     /// # Shapes
-    /// `latent`: \[batch, frames, input_dim\] → \[batch, frames, 25\]
+    /// `latent`: \[batch, frames, input_dim\] → \[batch, frames, columns\]
     pub fn forward<G: Graph>(&self, g: &mut G, latent: &G::Tensor) -> Result<G::Tensor> {
         let mut h = self.input_proj.forward(g, latent)?;
         for block in &self.blocks {
             h = block.forward(g, &h)?;
         }
         let mut parts = Vec::with_capacity(self.heads.len());
-        for (channel, head) in &self.heads {
+        for (columns, head) in &self.heads {
             let x = head.forward(g, &h)?;
-            parts.push(match channel {
-                Channel::Position | Channel::Style => x,
-                Channel::Velocity | Channel::Acceleration | Channel::AngularVelocity => {
-                    let (_, limit) = self.limits.bounds(*channel);
+            parts.push(match columns.group.role {
+                ColumnRole::Place | ColumnRole::Free => x,
+                ColumnRole::Vector => {
+                    let (_, limit) = self.limits.of(columns.group);
                     let bounded = g.activation(&x, Activation::Tanh)?;
                     g.scale(&bounded, f64::from(limit))?
                 }
-                Channel::Quaternion => g.normalize(&x, QUATERNION_EPSILON)?,
-                Channel::Phase => g.activation(&x, Activation::Sigmoid)?,
+                ColumnRole::Turn => g.normalize(&x, QUATERNION_EPSILON)?,
+                ColumnRole::Phase => g.activation(&x, Activation::Sigmoid)?,
             });
         }
         if let Some(fusion) = &self.fusion {
-            let [position, velocity, acceleration, quaternion, angular_velocity, ..] =
-                parts.as_slice()
-            else {
-                unreachable!("invariant: a head for each channel of Channel::ALL, in its order")
-            };
-            let fused = fusion.forward(
-                g,
-                &Kinematics {
-                    position: position.clone(),
-                    velocity: velocity.clone(),
-                    acceleration: acceleration.clone(),
-                    quaternion: quaternion.clone(),
-                    angular_velocity: angular_velocity.clone(),
-                },
-            )?;
+            let places = self.kinematic_heads();
+            let [position, velocity, acceleration, quaternion, angular_velocity] =
+                places.map(|i| parts[i].clone());
+            let decoded =
+                Kinematics { position, velocity, acceleration, quaternion, angular_velocity };
+            let fused = fusion.forward(g, &decoded)?;
             let Kinematics { position, velocity, acceleration, quaternion, angular_velocity } =
                 fused;
-            parts.splice(..5, [position, velocity, acceleration, quaternion, angular_velocity]);
+            let fused = [position, velocity, acceleration, quaternion, angular_velocity];
+            for (i, fused) in places.into_iter().zip(fused) {
+                parts[i] = fused;
+            }
         }
         let parts: Vec<_> = parts.iter().collect();
         g.concat(&parts)
+    }
+
+    /// Returns which heads say position, velocity, acceleration, orientation and angular velocity.
+    fn kinematic_heads(&self) -> [usize; 5] {
+        let body = self.layout.body();
+        let groups = [
+            Some(body.position),
+            body.velocity,
+            body.acceleration,
+            Some(body.orientation),
+            body.angular_velocity,
+        ];
+        groups.map(|wanted| {
+            let is_wanted = |(columns, _): &(Columns, Linear)| Some(*columns) == wanted;
+            self.heads.iter().position(is_wanted).expect("invariant: fusion has every derivative")
+        })
     }
 }

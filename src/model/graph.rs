@@ -89,7 +89,8 @@ pub struct Channels<'a, T> {
 
 /// Scaled dot-product attention over several heads.
 ///
-/// softmax(Q Kᵀ / √d + mask) V, head by head, d the channels of a head
+/// softmax(Q Kᵀ / √d + mask) V, head by head, d the channels of a head. A query none of whose keys counts gets zeros, and
+/// gives no gradient.
 ///
 /// # Shapes
 /// - `query`: \[batch, queries, …\]; `key`, `value`: \[batch, keys, …\], `width` channels of each

@@ -6,24 +6,16 @@ use ndarray::{Array2, ArrayView2, ArrayViewMut2};
 
 use crate::units::FPS;
 
-use super::channels::Channel;
-use super::kinematics::{Poses, frames_of};
+use super::kinematics::{Poses, frames_in};
+use super::layout::{ColumnRole, Layout};
 use super::phase::unwrapped;
 use super::placement::Placement;
 use super::quaternion::{Quaternion, make_sign_continuous, normalize};
 use super::spline::{CubicSpline, SplineError};
 
-/// Mirrors motion in the plane x = 0, in place, `[n_frames, 25]`.
-///
-/// A reflection M = diag(-1, 1, 1) turns vectors into M v, rotations R into M R M, which is (w, x, -y, -z),
-/// and angular velocity, an axial vector, into -M ω.
-pub fn mirror_x(mut frames: ArrayViewMut2<f32>) {
-    let (x, q) = (0, Channel::Quaternion.range().start);
-    let omega = Channel::AngularVelocity.range().start;
-    let mut flipped = vec![q + 2, q + 3, omega + 1, omega + 2];
-    for channel in [Channel::Position, Channel::Velocity, Channel::Acceleration] {
-        flipped.push(channel.range().start + x);
-    }
+/// Mirrors motion in the plane x = 0, in place, `[n_frames, columns]`; see [`Layout::mirrored_in_x`].
+pub fn mirror_x(layout: Layout, mut frames: ArrayViewMut2<f32>) {
+    let flipped = layout.mirrored_in_x();
     for mut row in frames.rows_mut() {
         for &i in &flipped {
             row[i] = -row[i];
@@ -31,9 +23,9 @@ pub fn mirror_x(mut frames: ArrayViewMut2<f32>) {
     }
 }
 
-/// Turns motion about the vertical axis through the origin, in place, `[n_frames, 25]`.
-pub fn rotate_yaw(frames: &mut Array2<f32>, yaw_rad: f64) {
-    Placement { x_m: 0.0, z_m: 0.0, yaw_rad }.restore(frames);
+/// Turns motion about the vertical axis through the origin, in place, `[n_frames, columns]`.
+pub fn rotate_yaw(layout: Layout, frames: &mut Array2<f32>, yaw_rad: f64) {
+    Placement { x_m: 0.0, z_m: 0.0, yaw_rad }.restore_in(layout, frames);
 }
 
 /// Returns how many frames `n_frames` become at `rate` times the speed.
@@ -43,12 +35,16 @@ pub fn stretched_frames(n_frames: usize, rate: f64) -> usize {
 }
 
 /// Returns motion at `rate` times its speed: position and orientation at the times t · rate, everything
-/// that follows from them anew. `[n_frames, 25]` becomes `[stretched_frames - 2, 25]` (at least one
-/// frame): two are used up by the differences.
+/// that follows from them anew, phases along the bar and free columns linearly. `[n_frames, columns]` becomes
+/// `[stretched_frames - 2, columns]` (at least one frame): two are used up by the differences.
 ///
 /// # Errors
 /// [`SplineError`] when there are too few frames for a spline.
-pub fn stretch_motion(frames: ArrayView2<f32>, rate: f64) -> Result<Array2<f32>, SplineError> {
+pub fn stretch_motion(
+    layout: Layout,
+    frames: ArrayView2<f32>,
+    rate: f64,
+) -> Result<Array2<f32>, SplineError> {
     let n_frames = frames.nrows();
     let times_s: Vec<f64> = (0..n_frames).map(|t| t as f64 / FPS).collect();
     let n_poses = stretched_frames(n_frames, rate);
@@ -58,7 +54,8 @@ pub fn stretch_motion(frames: ArrayView2<f32>, rate: f64) -> Result<Array2<f32>,
         let signal: Vec<f64> = frames.column(i).iter().map(|&x| f64::from(x)).collect();
         Ok(CubicSpline::fit(&times_s, &signal)?.evaluate(&grid_s))
     };
-    let (p, q) = (Channel::Position.range().start, Channel::Quaternion.range().start);
+    let body = layout.body();
+    let (p, q) = (body.position.first, body.orientation.first);
     let position = [resample(p)?, resample(p + 1)?, resample(p + 2)?];
     let turn = [resample(q)?, resample(q + 1)?, resample(q + 2)?, resample(q + 3)?];
     let mut orientation: Vec<Quaternion> =
@@ -66,24 +63,29 @@ pub fn stretch_motion(frames: ArrayView2<f32>, rate: f64) -> Result<Array2<f32>,
     make_sign_continuous(&mut orientation);
     let position_m = (0..n_poses).map(|t| std::array::from_fn(|axis| position[axis][t])).collect();
     let n_kept = n_poses.saturating_sub(2).max(1);
-    let mut stretched = frames_of(&Poses { position_m, orientation }, n_kept);
-
-    let phase = Channel::Phase.range().start;
-    let in_bar: Vec<f64> = frames.column(phase).iter().map(|&x| f64::from(x)).collect();
-    let bars = unwrapped(&in_bar);
-    let style = Channel::Style.range();
-    for (t, mut row) in stretched.rows_mut().into_iter().enumerate() {
+    let mut stretched = frames_in(layout, &Poses { position_m, orientation }, n_kept);
+    let between = |t: usize| {
         let (before, share) = place(t, rate, n_frames);
-        let after = (before + 1).min(n_frames - 1);
-        let bar = bars[before] + share * (bars[after] - bars[before]);
-        // A phase that rounds to 1 in single precision is the downbeat it is about to reach.
-        row[phase] = match bar.rem_euclid(1.0) as f32 {
-            x if x >= 1.0 => 0.0,
-            x => x,
-        };
-        for i in style.clone() {
+        (before, (before + 1).min(n_frames - 1), share)
+    };
+    for phase in layout.with_role(ColumnRole::Phase).map(|columns| columns.first) {
+        let in_bar: Vec<f64> = frames.column(phase).iter().map(|&x| f64::from(x)).collect();
+        let bars = unwrapped(&in_bar);
+        for (t, x) in stretched.column_mut(phase).iter_mut().enumerate() {
+            let (before, after, share) = between(t);
+            let bar = bars[before] + share * (bars[after] - bars[before]);
+            // A phase that rounds to 1 in single precision is the downbeat it is about to reach.
+            *x = match bar.rem_euclid(1.0) as f32 {
+                x if x >= 1.0 => 0.0,
+                x => x,
+            };
+        }
+    }
+    for i in layout.with_role(ColumnRole::Free).flat_map(|columns| columns.range()) {
+        for (t, x) in stretched.column_mut(i).iter_mut().enumerate() {
+            let (before, after, share) = between(t);
             let (a, b) = (frames[[before, i]], frames[[after, i]]);
-            row[i] = a + share as f32 * (b - a);
+            *x = a + share as f32 * (b - a);
         }
     }
     Ok(stretched)
@@ -110,6 +112,9 @@ fn place(t: usize, rate: f64, n_frames: usize) -> (usize, f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::motion::BODY;
+    use crate::motion::kinematics::frames_of;
+    use crate::motion::layout::tests::ROOT;
     use crate::motion::quaternion::{from_axis_angle, mul};
     use proptest::prelude::*;
 
@@ -173,7 +178,7 @@ mod tests {
     fn a_mirrored_walk_is_the_walk_of_the_mirrored_poses() {
         let frames = walk(53);
         let mut mirrored = frames.clone();
-        mirror_x(mirrored.view_mut());
+        mirror_x(BODY, mirrored.view_mut());
         assert_coherent(&mirrored);
         for (row, was) in mirrored.rows().into_iter().zip(frames.rows()) {
             assert_eq!((row[0], row[1], row[2]), (-was[0], was[1], was[2]));
@@ -186,7 +191,7 @@ mod tests {
             assert!((a[0] + b[0]).abs() + (a[1] - b[1]).abs() + (a[2] - b[2]).abs() < 1e-6);
             assert_eq!(row.slice(ndarray::s![16..]), was.slice(ndarray::s![16..]));
         }
-        mirror_x(mirrored.view_mut());
+        mirror_x(BODY, mirrored.view_mut());
         assert_eq!(mirrored, frames);
     }
 
@@ -194,7 +199,7 @@ mod tests {
     fn a_turned_walk_turns_its_velocities() {
         let frames = walk(41);
         let mut turned = frames.clone();
-        rotate_yaw(&mut turned, std::f64::consts::FRAC_PI_2);
+        rotate_yaw(BODY, &mut turned, std::f64::consts::FRAC_PI_2);
         assert_coherent(&turned);
         for (row, was) in turned.rows().into_iter().zip(frames.rows()) {
             // A quarter turn takes +Z to +X and +X to -Z.
@@ -206,7 +211,7 @@ mod tests {
     #[test]
     fn a_faster_walk_has_closed_forms() {
         let frames = walk(121);
-        let fast = stretch_motion(frames.view(), 1.1).expect("enough frames");
+        let fast = stretch_motion(BODY, frames.view(), 1.1).expect("enough frames");
         assert_eq!(fast.nrows(), stretched_frames(121, 1.1) - 2);
         assert_eq!(fast.nrows(), 108);
         assert_coherent(&fast);
@@ -222,6 +227,36 @@ mod tests {
         }
     }
 
+    /// The columns of the body that the root alone has.
+    fn root_of(frames: &Array2<f32>) -> Array2<f32> {
+        let columns: Vec<usize> = (0..6).chain(9..16).collect();
+        frames.select(ndarray::Axis(1), &columns)
+    }
+
+    #[test]
+    fn the_root_alone_is_augmented_as_within_a_body() {
+        let body = walk(53);
+        let (mut mirrored, mut of_root) = (body.clone(), root_of(&body));
+        mirror_x(BODY, mirrored.view_mut());
+        mirror_x(ROOT, of_root.view_mut());
+        assert_eq!(of_root, root_of(&mirrored));
+        let was = root_of(&body);
+        // By hand: (-x, y, z), (w, x, -y, -z), (ωx, -ωy, -ωz).
+        let row = of_root.row(7).to_vec();
+        let w = was.row(7).to_vec();
+        let wanted =
+            [-w[0], w[1], w[2], -w[3], w[4], w[5], w[6], w[7], -w[8], -w[9], w[10], -w[11], -w[12]];
+        assert_eq!(row, wanted);
+
+        let (mut turned, mut of_root) = (body.clone(), was.clone());
+        rotate_yaw(BODY, &mut turned, 0.7);
+        rotate_yaw(ROOT, &mut of_root, 0.7);
+        assert_eq!(of_root, root_of(&turned));
+        let stretched = stretch_motion(BODY, body.view(), 1.1).expect("enough frames");
+        let of_root = stretch_motion(ROOT, was.view(), 1.1).expect("enough frames");
+        assert_eq!(of_root, root_of(&stretched));
+    }
+
     #[test]
     fn features_follow() {
         let features = Array2::from_shape_fn((7, 3), |(t, i)| (10 * i + t) as f32);
@@ -235,7 +270,7 @@ mod tests {
         #[test]
         fn any_stretch_stays_coherent(rate in 0.8..1.25f64, n in 5usize..90) {
             let frames = walk(n);
-            let other = stretch_motion(frames.view(), rate).expect("enough frames");
+            let other = stretch_motion(BODY, frames.view(), rate).expect("enough frames");
             prop_assert!(other.nrows() >= 1);
             if other.nrows() > 2 {
                 let [velocity, acceleration, turn] = incoherence(&other);

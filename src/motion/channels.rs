@@ -1,8 +1,92 @@
-//! The layout of one motion frame: seven named channel groups side by side, 25 numbers in all.
+//! The layout of this program's motion: seven named groups side by side, 25 columns in all.
 
 use std::ops::Range;
 
-/// One group of columns of a motion frame, in frame order.
+use super::layout::{ColumnGroup, ColumnRole, Columns, GroupLimits, Layout};
+
+/// The layout of a motion frame.
+pub const BODY: Layout = Layout::new(&[
+    ColumnGroup {
+        name: "position",
+        unit: "m",
+        role: ColumnRole::Place,
+        columns: &["position_x", "position_y", "position_z"],
+        derivative_of: None,
+        limits: GroupLimits::both((-100.0, 100.0)),
+    },
+    ColumnGroup {
+        name: "velocity",
+        unit: "m/s",
+        role: ColumnRole::Vector,
+        columns: &["velocity_x", "velocity_y", "velocity_z"],
+        derivative_of: Some("position"),
+        limits: GroupLimits::both((-50.0, 50.0)),
+    },
+    ColumnGroup {
+        name: "acceleration",
+        unit: "m/s²",
+        role: ColumnRole::Vector,
+        columns: &["acceleration_x", "acceleration_y", "acceleration_z"],
+        derivative_of: Some("velocity"),
+        limits: GroupLimits::both((-100.0, 100.0)),
+    },
+    ColumnGroup {
+        name: "quaternion",
+        unit: "1",
+        role: ColumnRole::Turn,
+        columns: &["quaternion_w", "quaternion_x", "quaternion_y", "quaternion_z"],
+        derivative_of: None,
+        // Its norm bounds it.
+        limits: GroupLimits::NONE,
+    },
+    ColumnGroup {
+        name: "angular_velocity",
+        unit: "rad/s",
+        role: ColumnRole::Vector,
+        columns: &["angular_velocity_x", "angular_velocity_y", "angular_velocity_z"],
+        derivative_of: Some("quaternion"),
+        limits: GroupLimits { wide: (-20.0, 20.0), reference: (-10.0, 10.0) },
+    },
+    ColumnGroup {
+        name: "phase",
+        unit: "bar",
+        role: ColumnRole::Phase,
+        columns: &["phase"],
+        derivative_of: None,
+        limits: GroupLimits::both((0.0, 1.0)),
+    },
+    ColumnGroup {
+        name: "style",
+        unit: "1",
+        role: ColumnRole::Free,
+        columns: &[
+            "style_0", "style_1", "style_2", "style_3", "style_4", "style_5", "style_6", "style_7",
+        ],
+        derivative_of: None,
+        limits: GroupLimits::NONE,
+    },
+]);
+
+/// Numbers in one motion frame.
+pub const MOTION_DIM: usize = BODY.width();
+
+/// The name of every column of a motion frame, in order.
+pub const CHANNEL_NAMES: [&str; MOTION_DIM] = {
+    let mut names = [""; MOTION_DIM];
+    let mut group = 0;
+    while group < Channel::ALL.len() {
+        let columns = BODY.group(group);
+        let mut i = 0;
+        while i < columns.width() {
+            names[columns.first + i] = columns.group.columns[i];
+            i += 1;
+        }
+        group += 1;
+    }
+    names
+};
+
+/// A group of [`BODY`] by its name, in frame order, for code that is about a dancing body.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Channel {
     /// Root position in the world, m.
@@ -21,38 +105,6 @@ pub enum Channel {
     Style,
 }
 
-/// Numbers in one motion frame: the end of the last group.
-pub const MOTION_DIM: usize = Channel::Style.range().end;
-
-/// The name of every column of a motion frame, in order.
-pub const CHANNEL_NAMES: [&str; MOTION_DIM] = [
-    "position_x",
-    "position_y",
-    "position_z",
-    "velocity_x",
-    "velocity_y",
-    "velocity_z",
-    "acceleration_x",
-    "acceleration_y",
-    "acceleration_z",
-    "quaternion_w",
-    "quaternion_x",
-    "quaternion_y",
-    "quaternion_z",
-    "angular_velocity_x",
-    "angular_velocity_y",
-    "angular_velocity_z",
-    "phase",
-    "style_0",
-    "style_1",
-    "style_2",
-    "style_3",
-    "style_4",
-    "style_5",
-    "style_6",
-    "style_7",
-];
-
 impl Channel {
     /// Every group, in frame order.
     pub const ALL: [Self; 7] = [
@@ -65,56 +117,35 @@ impl Channel {
         Self::Style,
     ];
 
+    /// The group of the layout.
+    pub const fn columns(self) -> Columns {
+        BODY.group(self as usize)
+    }
+
     /// The name of the group, with which its columns' names begin.
     pub const fn name(self) -> &'static str {
-        match self {
-            Self::Position => "position",
-            Self::Velocity => "velocity",
-            Self::Acceleration => "acceleration",
-            Self::Quaternion => "quaternion",
-            Self::AngularVelocity => "angular_velocity",
-            Self::Phase => "phase",
-            Self::Style => "style",
-        }
+        self.columns().group.name
     }
 
     /// Number of columns of the group.
     pub const fn width(self) -> usize {
-        match self {
-            Self::Position | Self::Velocity | Self::Acceleration | Self::AngularVelocity => 3,
-            Self::Quaternion => 4,
-            Self::Phase => 1,
-            Self::Style => 8,
-        }
+        self.columns().width()
     }
 
     /// The columns of the group within a motion frame.
     pub const fn range(self) -> Range<usize> {
-        let mut start = 0;
-        let mut i = 0;
-        while i < self as usize {
-            start += Self::ALL[i].width();
-            i += 1;
-        }
-        start..start + self.width()
+        self.columns().range()
     }
 
     /// The unit of the group; `1` for numbers without one.
     pub const fn unit(self) -> &'static str {
-        match self {
-            Self::Position => "m",
-            Self::Velocity => "m/s",
-            Self::Acceleration => "m/s²",
-            Self::AngularVelocity => "rad/s",
-            Self::Phase => "bar",
-            Self::Quaternion | Self::Style => "1",
-        }
+        self.columns().group.unit
     }
 }
 
 /// The unit of column `i` of a motion frame, `None` when `i >= MOTION_DIM`.
 pub fn channel_unit(i: usize) -> Option<&'static str> {
-    Channel::ALL.into_iter().find(|c| c.range().contains(&i)).map(Channel::unit)
+    BODY.group_of(i).map(|columns| columns.group.unit)
 }
 
 #[cfg(test)]
@@ -126,10 +157,21 @@ mod tests {
         let ranges = Channel::ALL.map(Channel::range);
         assert_eq!(ranges, [0..3, 3..6, 6..9, 9..13, 13..16, 16..17, 17..25]);
         assert_eq!(MOTION_DIM, 25);
+        assert_eq!(BODY.groups().count(), Channel::ALL.len());
     }
 
     #[test]
     fn names_agree_with_the_groups() {
+        let names = [
+            "position",
+            "velocity",
+            "acceleration",
+            "quaternion",
+            "angular_velocity",
+            "phase",
+            "style",
+        ];
+        assert_eq!(Channel::ALL.map(Channel::name), names);
         for group in Channel::ALL {
             for i in group.range() {
                 assert!(CHANNEL_NAMES[i].starts_with(group.name()), "{}", CHANNEL_NAMES[i]);

@@ -4,7 +4,8 @@ use ndarray::Array2;
 
 use crate::units::FPS;
 
-use super::channels::{Channel, MOTION_DIM};
+use super::channels::BODY;
+use super::layout::{Columns, Layout};
 use super::quaternion::{Quaternion, angular_velocity};
 
 /// Where a rigid body is and how it is turned, frame by frame at [`FPS`].
@@ -33,8 +34,16 @@ pub fn forward_differences(x: &[[f64; 3]]) -> Vec<[f64; 3]> {
     x.windows(2).map(|w| std::array::from_fn(|axis| (w[1][axis] - w[0][axis]) * FPS)).collect()
 }
 
-/// Writes position, velocity, acceleration, quaternion and angular velocity of the first `n_frames`
-/// frames; phase and style stay 0. Shape `[n_frames, 25]`.
+/// Writes frames of [`BODY`]; see [`frames_in`]. Phase and style stay 0. Shape `[n_frames, 25]`.
+///
+/// # Panics
+/// When there are fewer than `n_frames` poses.
+pub fn frames_of(poses: &Poses, n_frames: usize) -> Array2<f32> {
+    frames_in(BODY, poses, n_frames)
+}
+
+/// Writes position, orientation and what a layout has of their derivatives for the first `n_frames` frames; all other
+/// columns stay 0. Shape `[n_frames, columns]`.
 ///
 /// `v[t] = (p[t+1] - p[t]) FPS`, `a[t] = (v[t+1] - v[t]) FPS`, `ω[t] = 2 log(q[t+1] q[t]*) FPS`. With two
 /// frames more than `n_frames` every frame obeys them; a difference that would need a frame beyond the
@@ -42,27 +51,29 @@ pub fn forward_differences(x: &[[f64; 3]]) -> Vec<[f64; 3]> {
 ///
 /// # Panics
 /// When there are fewer than `n_frames` poses.
-pub fn frames_of(poses: &Poses, n_frames: usize) -> Array2<f32> {
+pub fn frames_in(layout: Layout, poses: &Poses, n_frames: usize) -> Array2<f32> {
     assert!(poses.len() >= n_frames, "{n_frames} frames of {} poses", poses.len());
     let (p, q) = (&poses.position_m[..poses.len()], &poses.orientation);
     let v = forward_differences(p);
     let a = forward_differences(&v);
     let held = |x: &[[f64; 3]], t: usize| x.get(t).or(x.last()).copied().unwrap_or([0.0; 3]);
     let turn = |t: usize| angular_velocity(q[t], q[t + 1], FPS);
-    let mut frames = Array2::zeros((n_frames, MOTION_DIM));
+    let body = layout.body();
+    let mut frames = Array2::zeros((n_frames, layout.width()));
     for (t, mut row) in frames.rows_mut().into_iter().enumerate() {
-        let mut write = |channel: Channel, values: &[f64]| {
-            for (i, &x) in channel.range().zip(values) {
+        let mut write = |columns: Option<Columns>, values: &[f64]| {
+            let range = columns.map(|columns| columns.range()).unwrap_or_default();
+            for (i, &x) in range.zip(values) {
                 row[i] = x as f32;
             }
         };
-        write(Channel::Position, &p[t]);
-        write(Channel::Velocity, &held(&v, t));
-        write(Channel::Acceleration, &held(&a, t));
-        write(Channel::Quaternion, &q[t]);
+        write(Some(body.position), &p[t]);
+        write(body.velocity, &held(&v, t));
+        write(body.acceleration, &held(&a, t));
+        write(Some(body.orientation), &q[t]);
         let last_turn = (t + 1).min(poses.len() - 1);
         let omega = if last_turn == 0 { [0.0; 3] } else { turn(last_turn - 1) };
-        write(Channel::AngularVelocity, &omega);
+        write(body.angular_velocity, &omega);
     }
     frames
 }
@@ -70,6 +81,8 @@ pub fn frames_of(poses: &Poses, n_frames: usize) -> Array2<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::motion::channels::MOTION_DIM;
+    use crate::motion::layout::tests::ROOT;
     use crate::motion::quaternion::from_axis_angle;
 
     /// Position (0.1 t², 1, -0.2 t), turning 0.05 rad a frame about the vertical.
@@ -92,6 +105,16 @@ mod tests {
             }
             assert!((row[14] - 1.5).abs() < 1e-6, "{}", row[14]);
             assert_eq!((row[13], row[15], row[16]), (0.0, 0.0, 0.0));
+        }
+    }
+
+    #[test]
+    fn the_root_alone_has_the_same_numbers_in_its_own_columns() {
+        let (root, body) = (frames_in(ROOT, &poses(9), 7), frames_of(&poses(9), 7));
+        assert_eq!(root.dim(), (7, 13));
+        let same = (0..6).zip(0..6).chain((6..10).zip(9..13)).chain((10..13).zip(13..16));
+        for (mine, theirs) in same {
+            assert_eq!(root.column(mine), body.column(theirs), "{mine}");
         }
     }
 

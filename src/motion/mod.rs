@@ -26,6 +26,7 @@ pub mod exchange;
 pub mod formats;
 pub mod group;
 pub mod kinematics;
+pub mod layout;
 pub mod locking;
 pub mod lowpass;
 pub mod normalizer;
@@ -48,10 +49,11 @@ pub use capture::{
     Axis, Capture, CaptureAccount, CaptureError, CaptureNote, GroupCapture, RigidTrack,
     convert_bvh, convert_capture, convert_captures, convert_track, convert_tracks,
 };
-pub use channels::{CHANNEL_NAMES, Channel, MOTION_DIM, channel_unit};
+pub use channels::{BODY, CHANNEL_NAMES, Channel, MOTION_DIM, channel_unit};
 pub use clock::{CLOCK_DIM, CLOCK_NAMES, clock};
 pub use dancers::{Dancers, DancersError};
 pub use kinematics::Poses;
+pub use layout::{BodyColumns, ColumnGroup, ColumnRole, Columns, Layout};
 pub use normalizer::Normalizer;
 pub use phase::{Beats, BeatsError, BeatsPerBarSource, bar_phase};
 pub use placement::Placement;

@@ -205,6 +205,7 @@ pub fn unwrapped(phase: &[f64]) -> Vec<f64> {
 /// Bar phase in `[0, 1)` at `times_s` for a constant tempo with a downbeat at `downbeat_s`.
 ///
 /// `φ(t) = frac((t - t₀) bpm / (60 B))`.
+#[cfg(test)]
 pub fn bar_phase_at_tempo(
     times_s: &[f64],
     tempo_bpm: f64,

@@ -8,12 +8,9 @@ use std::f64::consts::{PI, TAU};
 
 use ndarray::{Array2, ArrayView2};
 
-use super::channels::Channel;
+use super::channels::BODY;
+use super::layout::{ColumnRole, Columns, Layout};
 use super::quaternion::{Quaternion, from_axis_angle, make_sign_continuous, mul, rotate};
-
-/// Channel groups that are vectors in world axes, and so turn with the world.
-const VECTORS: [Channel; 4] =
-    [Channel::Position, Channel::Velocity, Channel::Acceleration, Channel::AngularVelocity];
 
 /// A point of the floor and a heading.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -38,13 +35,19 @@ impl Placement {
         Self { x_m: position_m[0], z_m: position_m[2], yaw_rad }
     }
 
-    /// Returns the placement of the first frame, `None` without frames; shape `[T, 25]`.
+    /// Returns the placement of the first frame of [`BODY`], `None` without frames; shape `[T, 25]`.
     pub fn of_first(frames: ArrayView2<'_, f32>) -> Option<Self> {
+        Self::of_first_in(BODY, frames)
+    }
+
+    /// Returns the placement of the first frame, `None` without frames; shape `[T, columns]`.
+    pub fn of_first_in(layout: Layout, frames: ArrayView2<'_, f32>) -> Option<Self> {
         let first = frames.rows().into_iter().next()?;
-        let at = |channel: Channel, i: usize| f64::from(first[channel.range().start + i]);
+        let at = |columns: Columns, i: usize| f64::from(first[columns.first + i]);
+        let body = layout.body();
         Some(Self::of(
-            std::array::from_fn(|i| at(Channel::Position, i)),
-            std::array::from_fn(|i| at(Channel::Quaternion, i)),
+            std::array::from_fn(|i| at(body.position, i)),
+            std::array::from_fn(|i| at(body.orientation, i)),
         ))
     }
 
@@ -61,52 +64,64 @@ impl Placement {
         }
     }
 
-    /// Takes the placement off, in place: what stood here and faced this way stands over the origin
-    /// and faces +Z. Shape `[T, 25]`.
-    ///
-    /// `p' = R(-yaw) (p - (x, 0, z))`; velocity, acceleration and angular velocity turn by
-    /// `R(-yaw)`, orientations become `q(-yaw) ⊗ q` with continuous signs and the first `w >= 0`.
-    /// Phase, style and height stay, and so does every identity between the channels.
+    /// Takes the placement off frames of [`BODY`], in place; see [`Placement::remove_in`]. Shape `[T, 25]`.
     pub fn remove(&self, frames: &mut Array2<f32>) {
-        move_by(frames, -self.yaw_rad, |p| [p[0] - self.x_m, p[1], p[2] - self.z_m], |p| p);
+        self.remove_in(BODY, frames);
     }
 
-    /// Puts the placement back, in place: the inverse of [`Placement::remove`], up to the common sign
-    /// of the quaternions. Shape `[T, 25]`.
+    /// Takes the placement off, in place: what stood here and faced this way stands over the origin
+    /// and faces +Z. Shape `[T, columns]`.
+    ///
+    /// Places: `p' = R(-yaw) (p - (x, 0, z))`. Vectors turn by `R(-yaw)`, orientations become `q(-yaw) ⊗ q` with
+    /// continuous signs and the first `w >= 0`. Other columns and heights stay, and so does every identity between
+    /// the channels.
+    pub fn remove_in(&self, layout: Layout, frames: &mut Array2<f32>) {
+        move_by(layout, frames, -self.yaw_rad, |p| [p[0] - self.x_m, p[1], p[2] - self.z_m], |p| p);
+    }
+
+    /// Puts the placement back on frames of [`BODY`], in place; see [`Placement::restore_in`]. Shape `[T, 25]`.
     pub fn restore(&self, frames: &mut Array2<f32>) {
-        move_by(frames, self.yaw_rad, |p| p, |p| [p[0] + self.x_m, p[1], p[2] + self.z_m]);
+        self.restore_in(BODY, frames);
+    }
+
+    /// Puts the placement back, in place: the inverse of [`Placement::remove_in`], up to the common sign
+    /// of the quaternions. Shape `[T, columns]`.
+    pub fn restore_in(&self, layout: Layout, frames: &mut Array2<f32>) {
+        move_by(layout, frames, self.yaw_rad, |p| p, |p| [p[0] + self.x_m, p[1], p[2] + self.z_m]);
     }
 }
 
 /// Turns frames about +Y by `yaw_rad`; positions are changed by `before` and `after` the turn.
 fn move_by(
+    layout: Layout,
     frames: &mut Array2<f32>,
     yaw_rad: f64,
     before: impl Fn([f64; 3]) -> [f64; 3],
     after: impl Fn([f64; 3]) -> [f64; 3],
 ) {
     let turn = from_axis_angle([0.0, 1.0, 0.0], yaw_rad);
-    let mut orientation: Vec<Quaternion> = Vec::with_capacity(frames.nrows());
-    for mut row in frames.rows_mut() {
-        for channel in VECTORS {
-            let columns = channel.range();
-            let v: [f64; 3] = std::array::from_fn(|i| f64::from(row[columns.start + i]));
-            let v = match channel {
-                Channel::Position => after(rotate(turn, before(v))),
+    for columns in layout.spatial() {
+        for mut row in frames.rows_mut() {
+            let v: [f64; 3] = std::array::from_fn(|i| f64::from(row[columns.first + i]));
+            let v = match columns.group.role {
+                ColumnRole::Place => after(rotate(turn, before(v))),
                 _ => rotate(turn, v),
             };
-            for (i, x) in columns.zip(v) {
+            for (i, x) in columns.range().zip(v) {
                 row[i] = x as f32;
             }
         }
-        let first = Channel::Quaternion.range().start;
-        let q: Quaternion = std::array::from_fn(|i| f64::from(row[first + i]));
-        orientation.push(mul(turn, q));
     }
-    make_sign_continuous(&mut orientation);
-    for (mut row, q) in frames.rows_mut().into_iter().zip(orientation) {
-        for (i, c) in Channel::Quaternion.range().zip(q) {
-            row[i] = c as f32;
+    for columns in layout.with_role(ColumnRole::Turn) {
+        let turned = |row: ndarray::ArrayView1<f32>| {
+            mul(turn, std::array::from_fn(|i| f64::from(row[columns.first + i])))
+        };
+        let mut orientation: Vec<Quaternion> = frames.rows().into_iter().map(turned).collect();
+        make_sign_continuous(&mut orientation);
+        for (mut row, q) in frames.rows_mut().into_iter().zip(orientation) {
+            for (i, c) in columns.range().zip(q) {
+                row[i] = c as f32;
+            }
         }
     }
 }

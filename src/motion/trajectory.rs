@@ -3,7 +3,8 @@
 use ndarray::{Array2, ArrayView2, s};
 use thiserror::Error;
 
-use super::channels::{CHANNEL_NAMES, Channel, MOTION_DIM};
+use super::channels::{BODY, CHANNEL_NAMES, Channel, MOTION_DIM};
+use super::layout::ColumnGroup;
 
 /// Largest allowed deviation of a quaternion norm from one.
 pub const QUATERNION_NORM_TOLERANCE: f64 = 0.05;
@@ -83,17 +84,17 @@ pub enum ChannelLimits {
 }
 
 impl ChannelLimits {
+    /// Lowest and highest allowed value of a group of columns, in the group's unit.
+    pub const fn of(self, group: &ColumnGroup) -> (f32, f32) {
+        match self {
+            Self::Wide => group.limits.wide,
+            Self::Reference => group.limits.reference,
+        }
+    }
+
     /// Lowest and highest allowed value of a channel group, in the group's unit.
     pub const fn bounds(self, channel: Channel) -> (f32, f32) {
-        match (channel, self) {
-            (Channel::Position | Channel::Acceleration, _) => (-100.0, 100.0),
-            (Channel::Velocity, _) => (-50.0, 50.0),
-            (Channel::AngularVelocity, Self::Wide) => (-20.0, 20.0),
-            (Channel::AngularVelocity, Self::Reference) => (-10.0, 10.0),
-            (Channel::Phase, _) => (0.0, 1.0),
-            // The norm bounds a quaternion; the style has no bounds but finiteness.
-            (Channel::Quaternion | Channel::Style, _) => (f32::MIN, f32::MAX),
-        }
+        self.of(channel.columns().group)
     }
 }
 
@@ -159,10 +160,10 @@ impl Trajectory {
         let Some(values) = self.frames.as_slice() else { return false };
         let mut low = [0.0; MOTION_DIM];
         let mut high = [0.0; MOTION_DIM];
-        for channel in Channel::ALL {
-            let (l, h) = limits.bounds(channel);
-            low[channel.range()].fill(l);
-            high[channel.range()].fill(h);
+        for columns in BODY.groups() {
+            let (l, h) = limits.of(columns.group);
+            low[columns.range()].fill(l);
+            high[columns.range()].fill(h);
         }
         let (min_norm2, max_norm2) = norm2_bounds();
         let mut sound = true;
@@ -203,13 +204,13 @@ impl Trajectory {
     }
 
     fn check_limits(&self, limits: &ChannelLimits) -> Result<(), TrajectoryError> {
-        let outside = Channel::ALL.into_iter().flat_map(|channel| {
-            let (low, high) = limits.bounds(channel);
-            let first = channel.range().start;
-            self.channel(channel)
+        let outside = BODY.groups().flat_map(|columns| {
+            let (low, high) = limits.of(columns.group);
+            self.frames
+                .slice(s![.., columns.range()])
                 .indexed_iter()
                 .filter(|(_, v)| !(low..=high).contains(*v))
-                .map(|((frame, i), &v)| (frame, first + i, v, channel))
+                .map(|((frame, i), &v)| (frame, columns.first + i, v, columns.group))
                 .collect::<Vec<_>>()
         });
         let outside: Vec<_> = outside.collect();
@@ -217,14 +218,14 @@ impl Trajectory {
         else {
             return Ok(());
         };
-        let (low, high) = limits.bounds(group);
+        let (low, high) = limits.of(group);
         Err(TrajectoryError::ChannelLimit {
             channel: CHANNEL_NAMES[i],
             frame,
             value,
             low,
             high,
-            unit: group.unit(),
+            unit: group.unit,
             count: outside.len(),
         })
     }

@@ -138,21 +138,19 @@ impl Graph for Builder<'_> {
         let Attention { query, key, value, width, heads, key_mask, causal } = attention;
         let q = self.heads(&query, width, heads)?;
         let k = self.heads(&key, width, heads)?;
-        let v = self.heads(&value, width, heads)?;
+        let mut v = self.heads(&value, width, heads)?;
         let swap = || vec![integers("perm", &[0, 1, 3, 2])];
         let q = self.node("Transpose", &[&q], swap());
         let scores = self.node("MatMul", &[&q, &k], vec![]);
         let factor = self.number(1.0 / ((width / heads) as f64).sqrt());
-        let mut scores = self.node("Mul", &[&scores, &factor], vec![]);
-        if let Some(mask) = key_mask {
-            let bias = self.bias(*mask)?;
-            scores = self.node("Add", &[&scores, &bias], vec![]);
+        let scores = self.node("Mul", &[&scores, &factor], vec![]);
+        let mask = key_mask.map(|mask| self.key_row(*mask)).transpose()?;
+        if let Some(mask) = &mask {
+            // A query none of whose keys counts gets zeros.
+            v = self.node("Mul", &[&v, mask], vec![]);
         }
-        if causal {
-            let bias = self.causal_bias(*query.tensor, *key.tensor)?;
-            scores = self.node("Add", &[&scores, &bias], vec![]);
-        }
-        let weights = self.node("Softmax", &[&scores], vec![integer("axis", -1)]);
+        let later = causal.then(|| self.later(*query.tensor, *key.tensor)).transpose()?;
+        let weights = self.key_weights(&scores, mask.as_deref(), later.as_deref());
         let weights = self.node("Transpose", &[&weights], swap());
         let y = self.node("MatMul", &[&v, &weights], vec![]);
         let shape = self.frames_shape(width);

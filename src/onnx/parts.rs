@@ -252,26 +252,51 @@ impl Builder<'_> {
         Ok(self.new_last(axes, channels, y))
     }
 
-    /// The mask as what is added to scores, \[batch, 1, 1, keys\].
-    pub(super) fn bias(&mut self, mask: Value) -> Result<String> {
-        let mask = self.last(mask)?;
-        let (one, factor) = (self.number(1.0), self.number(-MASKED));
-        let less = self.node("Sub", &[&mask, &one], vec![]);
-        let bias = self.node("Mul", &[&less, &factor], vec![]);
-        let axes = self.integers(&[1, 2]);
-        Ok(self.node("Unsqueeze", &[&bias, &axes], vec![]))
+    /// A mask beside heads and queries, \[batch, 1, 1, keys\].
+    pub(super) fn key_row(&mut self, mask: Value) -> Result<String> {
+        let (mask, axes) = (self.last(mask)?, self.integers(&[1, 2]));
+        Ok(self.node("Unsqueeze", &[&mask, &axes], vec![]))
     }
 
-    /// \[queries, keys\], [`MASKED`] where the key comes after the query.
-    pub(super) fn causal_bias(&mut self, query: Value, key: Value) -> Result<String> {
+    /// The softmax of scores over the keys that count: those that `mask` has as 1 and `later`, if any, as 0.
+    pub(super) fn key_weights(
+        &mut self,
+        scores: &str,
+        mask: Option<&str>,
+        later: Option<&str>,
+    ) -> String {
+        let mut scores = scores.to_owned();
+        if let Some(mask) = mask {
+            let (one, factor) = (self.number(1.0), self.number(-MASKED));
+            let less = self.node("Sub", &[mask, &one], vec![]);
+            let bias = self.node("Mul", &[&less, &factor], vec![]);
+            scores = self.node("Add", &[&scores, &bias], vec![]);
+        }
+        if let Some(later) = later {
+            let factor = self.number(MASKED);
+            let bias = self.node("Mul", &[later, &factor], vec![]);
+            scores = self.node("Add", &[&scores, &bias], vec![]);
+        }
+        let weights = self.node("Softmax", &[&scores], vec![integer("axis", -1)]);
+        match (mask, later) {
+            (Some(_), Some(later)) => {
+                // Where all keys up to the query are masked, the softmax has turned to later ones.
+                let one = self.number(1.0);
+                let kept = self.node("Sub", &[&one, later], vec![]);
+                self.node("Mul", &[&weights, &kept], vec![])
+            }
+            _ => weights,
+        }
+    }
+
+    /// \[queries, keys\], 1 where the key comes after the query and 0 elsewhere.
+    pub(super) fn later(&mut self, query: Value, key: Value) -> Result<String> {
         let (n_queries, n_keys) = (self.n_frames(query)?, self.n_frames(key)?);
         let (queries, keys) = (self.places(&n_queries), self.places(&n_keys));
         let axes = self.integers(&[1]);
         let queries = self.node("Unsqueeze", &[&queries, &axes], vec![]);
         let later = self.node("Less", &[&queries, &keys], vec![]);
-        let later = self.cast(&later, DataType::Float);
-        let factor = self.number(MASKED);
-        Ok(self.node("Mul", &[&later, &factor], vec![]))
+        Ok(self.cast(&later, DataType::Float))
     }
 
     pub(super) fn product(

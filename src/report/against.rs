@@ -1,108 +1,92 @@
 //! The section that compares this run with another one.
 
+use askama::Template;
+
 use super::comparison::{Change, Pair, counts, family, pairs};
-use super::html::{Escaped, put};
 use super::names::{music, words};
 use super::numbers::{MISSING, difference, interval, value};
 use super::{ComparedRun, Metric, Report, ordered};
 
-/// Writes the section: settings that differ, numbers that differ, and folded away all others.
-pub(super) fn section(out: &mut String, report: &Report, against: &ComparedRun) {
-    let run = Escaped(&against.run);
-    put!(out, "<section id=\"against\">\n<h2>Compared with {run}</h2>\n");
-    settings(out, against);
-    let pairs = pairs(report, against);
-    if pairs.is_empty() {
-        put!(out, "<p>No number was measured in both runs.</p>\n</section>\n");
-        return;
-    }
-    put!(out, "<p>{}.</p>\n<p>{}.</p>\n", family(against), counts(&pairs));
-    let (notable, others): (Vec<Pair>, Vec<Pair>) = pairs.into_iter().partition(Pair::is_notable);
-    if notable.is_empty() {
-        put!(out, "<p>Nothing is shown to differ.</p>\n");
-    } else {
-        table(out, against, &notable);
-    }
-    if !others.is_empty() {
-        put!(out, "<details>\n<summary>The others ({})</summary>\n", others.len());
-        table(out, against, &others);
-        put!(out, "</details>\n");
-    }
-    put!(out, "</section>\n");
+/// Settings that differ, numbers that differ, and folded away all others.
+#[derive(Template)]
+#[template(path = "report/templates/against.html")]
+pub(super) struct AgainstSection<'a> {
+    run: &'a str,
+    settings: &'a [(String, String, String)],
+    /// What the comparison rests on.
+    family: String,
+    counts: String,
+    notable: Vec<PairRow<'a>>,
+    others: Vec<PairRow<'a>>,
 }
 
-fn settings(out: &mut String, against: &ComparedRun) {
-    if against.settings.is_empty() {
-        put!(out, "<p>Both runs have the same settings.</p>\n");
-        return;
-    }
-    put!(
-        out,
-        "<div class=\"scroll\"><table>\n<thead><tr><th scope=\"col\">setting</th><th scope=\"col\" \
-         class=\"text\">{}</th><th scope=\"col\" class=\"text\">here</th></tr></thead>\n<tbody>\n",
-        Escaped(&against.run)
-    );
-    for (setting, there, here) in &against.settings {
-        put!(
-            out,
-            "<tr><th scope=\"row\">{}</th><td class=\"text\">{}</td><td class=\"text\">{}</td></tr>\n",
-            Escaped(setting),
-            Escaped(there),
-            Escaped(here)
-        );
-    }
-    put!(out, "</tbody></table></div>\n");
+struct PairRow<'a> {
+    metric: &'a str,
+    variant: String,
+    music: String,
+    unit: &'a str,
+    /// There and here.
+    both: [PairNumber; 2],
+    difference: String,
+    interval: Option<String>,
+    p: String,
+    n_songs: String,
+    class: &'static str,
+    change: &'static str,
 }
 
-fn table(out: &mut String, against: &ComparedRun, pairs: &[Pair]) {
-    put!(
-        out,
-        "<div class=\"scroll\"><table>\n<thead><tr><th scope=\"col\">metric</th><th scope=\"col\">{}</th>\
-         <th scope=\"col\">here</th><th scope=\"col\">difference</th><th scope=\"col\">p (Holm)</th><th \
-         scope=\"col\">songs</th><th scope=\"col\" class=\"text\">change</th></tr></thead>\n<tbody>\n",
-        Escaped(&against.run)
-    );
-    for pair in pairs {
-        row(out, pair);
-    }
-    put!(out, "</tbody></table></div>\n");
+struct PairNumber {
+    n: i64,
+    value: String,
+    interval: Option<String>,
 }
 
-fn row(out: &mut String, pair: &Pair) {
-    let Metric { metric, variant, split, unit, .. } = pair.here;
-    put!(out, "<tr><th scope=\"row\"><code>{}</code>", Escaped(metric));
-    if !variant.is_empty() {
-        put!(out, " {}", Escaped(&words(variant)));
-    }
-    put!(out, " <small>{}", Escaped(&music(split)));
-    if !unit.is_empty() {
-        put!(out, ", {}", Escaped(unit));
-    }
-    put!(out, "</small></th>");
-    for metric in [pair.there, pair.here] {
-        put!(out, "<td title=\"n = {}\">{}", metric.n, value(metric.value));
-        if let Some((low, high)) = metric.interval() {
-            put!(out, " <span class=\"interval\">{}</span>", interval(low, high));
+impl<'a> AgainstSection<'a> {
+    /// Compares a report with another run.
+    pub fn new(report: &'a Report, against: &'a ComparedRun) -> Self {
+        let pairs = pairs(report, against);
+        let (family, counts) = (family(against), counts(&pairs));
+        let (notable, others): (Vec<Pair>, Vec<Pair>) =
+            pairs.into_iter().partition(Pair::is_notable);
+        let rows = |pairs: &[Pair<'a>]| pairs.iter().map(PairRow::new).collect();
+        Self {
+            run: &against.run,
+            settings: &against.settings,
+            family,
+            counts,
+            notable: rows(&notable),
+            others: rows(&others),
         }
-        put!(out, "</td>");
     }
-    put!(out, "<td>{}", pair.difference.map_or_else(|| MISSING.to_owned(), difference));
-    let ends = pair.paired.and_then(|paired| paired.ci_low.zip(paired.ci_high));
-    if let Some((low, high)) = ends.and_then(|(low, high)| ordered(low, high)) {
-        put!(out, " <span class=\"interval\">{}</span>", interval(low, high));
+}
+
+impl<'a> PairRow<'a> {
+    fn new(pair: &Pair<'a>) -> Self {
+        let Metric { metric, variant, split, unit, .. } = pair.here;
+        let written = |(low, high): (f64, f64)| interval(low, high);
+        let ends = pair.paired.and_then(|paired| paired.ci_low.zip(paired.ci_high));
+        Self {
+            metric,
+            variant: words(variant),
+            music: music(split),
+            unit,
+            both: [pair.there, pair.here].map(|metric| PairNumber {
+                n: metric.n,
+                value: value(metric.value),
+                interval: metric.interval().map(written),
+            }),
+            difference: pair.difference.map_or_else(|| MISSING.to_owned(), difference),
+            interval: ends.and_then(|(low, high)| ordered(low, high)).map(written),
+            p: value(pair.paired.and_then(|paired| paired.p_holm)),
+            n_songs: pair.paired.map_or_else(|| MISSING.to_owned(), |p| p.n_songs.to_string()),
+            class: match pair.change {
+                Change::Better => "word good",
+                Change::Worse => "word bad",
+                _ => "word",
+            },
+            change: pair.change.words(),
+        }
     }
-    let n_songs = pair.paired.map_or_else(|| MISSING.to_owned(), |p| p.n_songs.to_string());
-    let class = match pair.change {
-        Change::Better => "word good",
-        Change::Worse => "word bad",
-        _ => "word",
-    };
-    put!(
-        out,
-        "</td><td>{}</td><td>{n_songs}</td><td class=\"{class}\">{}</td></tr>\n",
-        value(pair.paired.and_then(|paired| paired.p_holm)),
-        pair.change.words()
-    );
 }
 
 #[cfg(test)]
@@ -112,9 +96,8 @@ mod tests {
     use super::*;
 
     fn told(here: Vec<Metric>, against: &ComparedRun) -> String {
-        let mut out = String::new();
-        section(&mut out, &Report { metrics: here, ..Report::default() }, against);
-        out
+        let report = Report { metrics: here, ..Report::default() };
+        format!("{}\n", AgainstSection::new(&report, against))
     }
 
     #[test]

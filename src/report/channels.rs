@@ -1,8 +1,7 @@
 //! One bar for each channel: how far its values are from those of the ground truth.
 
 use super::Metric;
-use super::chart::{color_class, told};
-use super::html::{Escaped, put};
+use super::chart::{SubjectKey, color_class, tenths, told};
 use super::names::{HELD_OUT_TRUTH, OWN, words};
 use super::numbers::{number, value};
 use super::rows::Row;
@@ -15,72 +14,90 @@ const ROW_PX: f64 = 17.0;
 const FOOT_PX: f64 = 16.0;
 const BAR_PX: f64 = 6.0;
 
-/// Writes the channels of one split as a figure with a bar for what was generated and one for held-out real
-/// motion; where neither has numbers, for every subject that has.
-pub(super) fn bars(out: &mut String, rows: &[&Row], caption: &str) {
-    let shown = shown(rows);
-    let shown_values = |row: &Row| -> Vec<Option<f64>> {
-        shown.iter().map(|subject| row.of(subject).and_then(Metric::finite)).collect()
-    };
-    let longest = rows.iter().flat_map(|row| shown_values(row)).flatten().fold(0.0, f64::max);
-    let room = WIDTH_PX - NAMES_PX - VALUES_PX;
-    let length = |x: f64| if longest > 0.0 { (x / longest).max(0.0) * room } else { 0.0 };
-    let bottom = rows.len() as f64 * ROW_PX;
-    let height = bottom + FOOT_PX;
-    put!(out, "<figure><figcaption>{}", Escaped(caption));
-    for subject in &shown {
-        put!(
-            out,
-            " <span class=\"key {}\">{}</span>",
-            color_class(subject),
-            Escaped(&words(subject))
-        );
-    }
-    put!(
-        out,
-        "</figcaption><div class=\"scroll\"><svg class=\"bars\" width=\"{WIDTH_PX}\" height=\"{height}\" \
-         viewBox=\"0 0 {WIDTH_PX} {height}\" role=\"img\"><title>{}</title>",
-        Escaped(caption)
-    );
-    for (i, row) in rows.iter().enumerate() {
-        let top = i as f64 * ROW_PX;
-        let baseline = top + 12.0;
-        let all: Vec<String> = row.cells.iter().flatten().map(|metric| told(metric)).collect();
-        put!(
-            out,
-            "<g><title>{}: {}</title><text x=\"{}\" y=\"{baseline}\" class=\"end\">{}</text>",
-            Escaped(&words(row.variant)),
-            Escaped(&all.join("; ")),
-            NAMES_PX - 6.0,
-            Escaped(&words(row.variant))
-        );
-        let values = shown_values(row);
-        for (j, (subject, value)) in shown.iter().zip(&values).enumerate() {
-            let y = top + 2.0 + j as f64 * BAR_PX;
-            put!(
-                out,
-                "<rect x=\"{NAMES_PX}\" y=\"{y}\" width=\"{:.1}\" height=\"{BAR_PX}\" class=\"{}\"/>",
-                value.map_or(0.0, length),
-                color_class(subject)
-            );
+/// The channels of one split: a bar for what was generated and one for held-out real motion; where neither has
+/// numbers, for the first subject that has.
+pub(super) struct BarFigure {
+    pub caption: String,
+    pub shown: Vec<SubjectKey>,
+    pub rows: Vec<BarRow>,
+    pub width_px: f64,
+    pub height_px: f64,
+    pub bar_px: f64,
+    /// Where names end, bars begin, and the longest bar ends.
+    pub names_px: f64,
+    pub left_px: f64,
+    pub right_px: f64,
+    pub bottom_px: f64,
+    pub foot: String,
+    pub longest: String,
+}
+
+/// A channel.
+pub(super) struct BarRow {
+    pub name: String,
+    /// The numbers of all subjects, as a sentence has them.
+    pub numbers: String,
+    pub baseline_px: f64,
+    pub bars: Vec<Bar>,
+    /// Where the longer bar ends, and the first one's number.
+    pub end: String,
+    pub value: String,
+}
+
+pub(super) struct Bar {
+    pub y_px: f64,
+    pub width: String,
+    pub class: String,
+}
+
+impl BarFigure {
+    /// Draws rows of channels.
+    pub fn new(rows: &[&Row], caption: &str) -> Self {
+        let shown = shown(rows);
+        let shown_values = |row: &Row| -> Vec<Option<f64>> {
+            shown.iter().map(|subject| row.of(subject).and_then(Metric::finite)).collect()
+        };
+        let longest = rows.iter().flat_map(|row| shown_values(row)).flatten().fold(0.0, f64::max);
+        let room = WIDTH_PX - NAMES_PX - VALUES_PX;
+        let length = |x: f64| if longest > 0.0 { (x / longest).max(0.0) * room } else { 0.0 };
+        let bottom_px = rows.len() as f64 * ROW_PX;
+        let height_px = bottom_px + FOOT_PX;
+        let bar_row = |(i, row): (usize, &&Row)| {
+            let top = i as f64 * ROW_PX;
+            let all: Vec<String> = row.cells.iter().flatten().map(|metric| told(metric)).collect();
+            let values = shown_values(row);
+            let bars = shown.iter().zip(&values).enumerate();
+            let end = values.iter().flatten().map(|x| length(*x)).fold(0.0, f64::max);
+            BarRow {
+                name: words(row.variant),
+                numbers: all.join("; "),
+                baseline_px: top + 12.0,
+                bars: bars
+                    .map(|(j, (subject, value))| Bar {
+                        y_px: top + 2.0 + j as f64 * BAR_PX,
+                        width: tenths(value.map_or(0.0, length)),
+                        class: color_class(subject),
+                    })
+                    .collect(),
+                end: tenths(NAMES_PX + end + 5.0),
+                value: value(values.first().copied().flatten()),
+            }
+        };
+        Self {
+            caption: caption.to_owned(),
+            rows: rows.iter().enumerate().map(bar_row).collect(),
+            shown: shown.iter().map(|subject| SubjectKey::new(subject)).collect(),
+            width_px: WIDTH_PX,
+            height_px,
+            bar_px: BAR_PX,
+            names_px: NAMES_PX - 6.0,
+            left_px: NAMES_PX,
+            right_px: NAMES_PX + room,
+            bottom_px,
+            foot: tenths(height_px - 3.0),
+            longest: number(longest),
         }
-        let end = values.iter().flatten().map(|x| length(*x)).fold(0.0, f64::max);
-        put!(
-            out,
-            "<text x=\"{:.1}\" y=\"{baseline}\">{}</text></g>",
-            NAMES_PX + end + 5.0,
-            value(values.first().copied().flatten())
-        );
     }
-    put!(out, "<path class=\"axis\" d=\"M{NAMES_PX} 0V{bottom}\"/>");
-    put!(out, "<text x=\"{NAMES_PX}\" y=\"{:.1}\">0</text>", height - 3.0);
-    put!(
-        out,
-        "<text x=\"{}\" y=\"{:.1}\" class=\"end\">{}</text></svg></div></figure>\n",
-        NAMES_PX + room,
-        height - 3.0,
-        number(longest)
-    );
 }
 
 /// Returns whose bars are drawn.
@@ -104,9 +121,14 @@ mod tests {
 
     fn figure(metrics: &[Metric]) -> String {
         let rows = rows(metrics, &subjects(metrics));
-        let mut out = String::new();
-        bars(&mut out, &rows.iter().collect::<Vec<_>>(), "unseen music");
-        out
+        let figure = BarFigure::new(&rows.iter().collect::<Vec<_>>(), "unseen music");
+        Alone { figure }.to_string()
+    }
+
+    #[derive(askama::Template)]
+    #[template(path = "report/templates/bars.html")]
+    struct Alone {
+        figure: BarFigure,
     }
 
     fn of(subject: &str, channel: &str, value: Option<f64>) -> Metric {
@@ -144,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn without_the_two_whoever_has_numbers_is_drawn() {
+    fn without_the_two_the_first_subject_with_numbers_is_drawn() {
         let told = figure(&[of("retrieval", "x", Some(0.0)), of("mean_motion", "x", Some(0.0))]);
         assert_eq!(told.matches("<rect").count(), 1);
         assert!(told.contains("width=\"0.0\" height=\"6\" class=\"of-retrieval\""));

@@ -1,6 +1,5 @@
 //! Dots with intervals: the numbers of all subjects on one scale.
 
-use super::html::{Escaped, put};
 use super::names::{self, OWN, TRUTHS};
 use super::numbers::{interval, number};
 use super::rows::Row;
@@ -80,67 +79,122 @@ pub(super) fn told(metric: &Metric) -> String {
     }
 }
 
-/// Writes the chart of a row as SVG; nothing where fewer than two subjects have a number, or all the same.
-pub(super) fn dots(out: &mut String, row: &Row) {
-    let metrics: Vec<&Metric> =
-        row.cells.iter().flatten().copied().filter(|m| m.finite().is_some()).collect();
-    if metrics.len() < MIN_VALUES {
-        return;
+/// A subject as tables and figures name it.
+pub(super) struct SubjectKey {
+    pub class: String,
+    pub words: String,
+    pub meaning: &'static str,
+}
+
+impl SubjectKey {
+    pub fn new(subject: &str) -> Self {
+        Self {
+            class: color_class(subject),
+            words: names::words(subject),
+            meaning: names::meaning(subject),
+        }
     }
-    let Some(scale) = Scale::of(&metrics) else { return };
-    let lanes_px = metrics.len() as f64 * LANE_PX;
-    let height = lanes_px + FOOT_PX;
-    let name = [row.metric, row.variant].map(names::words).join(" ");
-    put!(
-        out,
-        "<svg class=\"dots\" width=\"{WIDTH_PX}\" height=\"{height}\" viewBox=\"0 0 {WIDTH_PX} {height}\" \
-         role=\"img\"><title>{}: {}</title>",
-        Escaped(name.trim_end()),
-        Escaped(&metrics.iter().map(|metric| told(metric)).collect::<Vec<_>>().join("; "))
-    );
-    put!(out, "<path class=\"axis\" d=\"M{SIDE_PX} {lanes_px}H{:.1}\"/>", WIDTH_PX - SIDE_PX);
-    if !scale.is_log && scale.low < 0.0 && scale.high > 0.0 {
-        put!(out, "<path class=\"zero\" d=\"M{:.1} 0V{lanes_px}\"/>", scale.x(0.0));
+}
+
+/// The chart of a row.
+pub(super) struct DotChart {
+    pub width_px: f64,
+    pub height_px: f64,
+    pub lane_px: f64,
+    /// Height of all lanes.
+    pub lanes_px: f64,
+    pub left_px: f64,
+    pub middle_px: f64,
+    pub right_px: f64,
+    pub right: String,
+    pub baseline_px: f64,
+    pub name: String,
+    /// All numbers, as a sentence has them.
+    pub numbers: String,
+    /// Where zero is, if the scale runs through it.
+    pub zero: Option<String>,
+    /// Where the number of real motion is.
+    pub truth: Option<String>,
+    pub marks: Vec<DotMark>,
+    pub low: String,
+    pub high: String,
+    pub is_log: bool,
+}
+
+/// The number of a subject, with its interval, in a lane of its own.
+pub(super) struct DotMark {
+    pub class: String,
+    pub number: String,
+    pub top_px: f64,
+    pub middle_px: f64,
+    pub radius_px: f64,
+    pub x: String,
+    pub interval: Option<(String, String)>,
+}
+
+impl DotChart {
+    /// Draws a row; nothing where fewer than two subjects have a number, or all the same.
+    pub fn new(row: &Row) -> Option<Self> {
+        let metrics: Vec<&Metric> =
+            row.cells.iter().flatten().copied().filter(|m| m.finite().is_some()).collect();
+        if metrics.len() < MIN_VALUES {
+            return None;
+        }
+        let scale = Scale::of(&metrics)?;
+        let lanes_px = metrics.len() as f64 * LANE_PX;
+        let height_px = lanes_px + FOOT_PX;
+        let is_zero_within = !scale.is_log && scale.low < 0.0 && scale.high > 0.0;
+        let name = [row.metric, row.variant].map(names::words).join(" ");
+        let lanes = metrics.iter().enumerate();
+        Some(Self {
+            width_px: WIDTH_PX,
+            height_px,
+            lane_px: LANE_PX,
+            lanes_px,
+            left_px: SIDE_PX,
+            middle_px: WIDTH_PX / 2.0,
+            right_px: WIDTH_PX - SIDE_PX,
+            right: tenths(WIDTH_PX - SIDE_PX),
+            baseline_px: height_px - 2.0,
+            name: name.trim_end().to_owned(),
+            numbers: metrics.iter().map(|metric| told(metric)).collect::<Vec<_>>().join("; "),
+            zero: is_zero_within.then(|| tenths(scale.x(0.0))),
+            truth: truth(row).map(|truth| tenths(scale.x(truth))),
+            marks: lanes
+                .filter_map(|(lane, metric)| DotMark::new(metric, scale, lane as f64 * LANE_PX))
+                .collect(),
+            low: number(scale.low),
+            high: number(scale.high),
+            is_log: scale.is_log,
+        })
     }
-    if let Some(truth) = truth(row) {
-        put!(out, "<path class=\"truth\" d=\"M{:.1} 0V{lanes_px}\"/>", scale.x(truth));
+}
+
+impl DotMark {
+    fn new(metric: &Metric, scale: Scale, top_px: f64) -> Option<Self> {
+        let value = metric.finite()?;
+        Some(Self {
+            class: color_class(&metric.subject),
+            number: told(metric),
+            top_px,
+            middle_px: top_px + LANE_PX / 2.0,
+            radius_px: if metric.subject == OWN { OWN_DOT_PX } else { DOT_PX },
+            x: tenths(scale.x(value)),
+            interval: metric
+                .interval()
+                .map(|(low, high)| (tenths(scale.x(low)), tenths(scale.x(high)))),
+        })
     }
-    for (lane, metric) in metrics.iter().enumerate() {
-        mark(out, metric, scale, lane as f64 * LANE_PX);
-    }
-    let baseline = height - 2.0;
-    put!(out, "<text x=\"{SIDE_PX}\" y=\"{baseline}\">{}</text>", number(scale.low));
-    if scale.is_log {
-        put!(out, "<text x=\"{}\" y=\"{baseline}\" class=\"middle\">log</text>", WIDTH_PX / 2.0);
-    }
-    put!(
-        out,
-        "<text x=\"{}\" y=\"{baseline}\" class=\"end\">{}</text></svg>",
-        WIDTH_PX - SIDE_PX,
-        number(scale.high)
-    );
+}
+
+/// Writes a place in the chart, CSS pixels.
+pub(super) fn tenths(x: f64) -> String {
+    format!("{x:.1}")
 }
 
 /// Returns the number of real motion, preferably of music that was not learnt from.
 fn truth(row: &Row) -> Option<f64> {
     TRUTHS.into_iter().find_map(|subject| row.of(subject)?.finite())
-}
-
-fn mark(out: &mut String, metric: &Metric, scale: Scale, top: f64) {
-    let Some(value) = metric.finite() else { return };
-    let middle = top + LANE_PX / 2.0;
-    put!(
-        out,
-        "<g class=\"{}\"><title>{}</title><rect y=\"{top}\" width=\"{WIDTH_PX}\" height=\"{LANE_PX}\" \
-         class=\"lane\"/>",
-        color_class(&metric.subject),
-        Escaped(&told(metric))
-    );
-    if let Some((low, high)) = metric.interval() {
-        put!(out, "<path d=\"M{:.1} {middle}H{:.1}\"/>", scale.x(low), scale.x(high));
-    }
-    let radius = if metric.subject == OWN { OWN_DOT_PX } else { DOT_PX };
-    put!(out, "<circle cx=\"{:.1}\" cy=\"{middle}\" r=\"{radius}\"/></g>", scale.x(value));
 }
 
 #[cfg(test)]
@@ -151,9 +205,13 @@ mod tests {
     fn chart(metrics: &[Metric]) -> String {
         let cells = metrics.iter().map(Some).collect();
         let row = Row { metric: "fid_k", variant: "axes", split: "all", unit: "", cells };
-        let mut out = String::new();
-        dots(&mut out, &row);
-        out
+        DotChart::new(&row).map_or_else(String::new, |chart| Alone { chart }.to_string())
+    }
+
+    #[derive(askama::Template)]
+    #[template(path = "report/templates/dots.html")]
+    struct Alone {
+        chart: DotChart,
     }
 
     #[test]

@@ -12,7 +12,6 @@ mod chart;
 mod comparison;
 #[cfg(test)]
 mod example;
-mod html;
 mod meaning;
 mod names;
 mod numbers;

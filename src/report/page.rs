@@ -1,110 +1,78 @@
 //! Writes the page.
 
-use base64::Engine as _;
-use base64::engine::general_purpose::STANDARD;
+use askama::Template;
+use base64::display::Base64Display;
+use base64::engine::general_purpose::{GeneralPurpose, STANDARD};
 
-use super::html::{Escaped, put};
-use super::{Report, WorstMotion, against, panel, sanity, tables};
+use super::against::AgainstSection;
+use super::panel::VerdictsSection;
+use super::sanity::SanitySection;
+use super::tables::{self, MetricsSections};
+use super::{Report, WorstMotion};
 
-/// The page, with slots such as `{{title}}`.
-const TEMPLATE: &str = include_str!("page.html");
-const STYLE: &str = include_str!("page.css");
+const STYLE: &str = include_str!("templates/page.css");
+
+/// The page. Every value is escaped but for those that the template marks as safe: the style, and sections, which
+/// are templates themselves.
+#[derive(Template)]
+#[template(path = "report/templates/page.html")]
+struct Page<'a> {
+    title: &'a str,
+    style: &'static str,
+    facts: &'a [(String, String)],
+    verdicts: VerdictsSection<'a>,
+    /// Ids and headings of the sections that are there.
+    links: Vec<(&'static str, &'static str)>,
+    sanity: Option<SanitySection<'a>>,
+    metrics: Option<MetricsSections<'a>>,
+    against: Option<AgainstSection<'a>>,
+    worst: &'a [WorstMotion],
+}
 
 /// Returns the report as HTML that is complete in itself. The same report gives the same text.
 ///
 /// Whatever comes from outside is text there, and pictures are images: nothing can become markup or script.
 pub fn page(report: &Report) -> String {
-    let mut out = String::new();
-    for (i, piece) in TEMPLATE.split("{{").enumerate() {
-        let slot = if i == 0 { None } else { piece.split_once("}}") };
-        let Some((name, rest)) = slot else {
-            out.push_str(piece);
-            continue;
-        };
-        match name {
-            "title" => put!(out, "{}", Escaped(&report.title)),
-            "style" => out.push_str(STYLE),
-            "facts" => facts(&mut out, &report.facts),
-            "verdicts" => panel::section(&mut out, report),
-            "links" => links(&mut out, report),
-            "sanity" => sanity::section(&mut out, report),
-            "metrics" => tables::metrics(&mut out, report),
-            "against" => {
-                if let Some(other) = &report.against {
-                    against::section(&mut out, report, other);
-                }
-            }
-            "worst" => worst(&mut out, &report.worst),
-            _ => {}
-        }
-        out.push_str(rest);
-    }
+    let page = Page {
+        title: &report.title,
+        style: STYLE,
+        facts: &report.facts,
+        verdicts: VerdictsSection::new(report),
+        links: links(report),
+        sanity: SanitySection::new(report),
+        metrics: MetricsSections::new(report),
+        against: report.against.as_ref().map(|other| AgainstSection::new(report, other)),
+        worst: &report.worst,
+    };
+    let mut out = page.render().expect("invariant: a string takes all that is written to it");
+    out.push('\n');
     out
 }
 
-fn facts(out: &mut String, facts: &[(String, String)]) {
-    if facts.is_empty() {
-        return;
-    }
-    put!(out, "<dl class=\"facts\">\n");
-    for (name, text) in facts {
-        put!(out, "<div><dt>{}</dt><dd>{}</dd></div>\n", Escaped(name), Escaped(text));
-    }
-    put!(out, "</dl>\n");
-}
-
-/// Writes links to the sections that are there.
-fn links(out: &mut String, report: &Report) {
-    let mut link = |id: &str, heading: &str| put!(out, "<a href=\"#{id}\">{heading}</a>\n");
+/// Returns links to the sections that are there.
+fn links(report: &Report) -> Vec<(&'static str, &'static str)> {
+    let mut links = Vec::new();
     if !report.checks.is_empty() {
-        link("sanity", "Sanity checks");
+        links.push(("sanity", "Sanity checks"));
     }
     if !report.metrics.is_empty() {
-        link(tables::SUBJECTS_ID, tables::SUBJECTS_HEADING);
+        links.push((tables::SUBJECTS_ID, tables::SUBJECTS_HEADING));
     }
-    for section in tables::sections(report) {
-        link(section.id(), section.heading());
-    }
+    links.extend(tables::sections(report).iter().map(|section| (section.id(), section.heading())));
     if report.against.is_some() {
-        link("against", "Comparison");
+        links.push(("against", "Comparison"));
     }
     if !report.worst.is_empty() {
-        link("worst", "Worst motions");
+        links.push(("worst", "Worst motions"));
     }
+    links
 }
 
-fn worst(out: &mut String, motions: &[WorstMotion]) {
-    if motions.is_empty() {
-        return;
+impl WorstMotion {
+    /// Returns the picture for an image, in which nothing can run or be asked of a network.
+    fn svg_base64(&self) -> Base64Display<'_, 'static, GeneralPurpose> {
+        Base64Display::new(self.svg.as_bytes(), &STANDARD)
     }
-    put!(out, "<section id=\"worst\">\n<h2>Worst motions</h2>\n");
-    for motion in motions {
-        put!(out, "<article class=\"card\">\n<h3>{}</h3>\n", Escaped(&motion.name));
-        facts(out, &motion.facts);
-        if motion.failed.is_empty() {
-            put!(out, "<p>Passes every check.</p>\n");
-        } else {
-            put!(out, "<ul>\n");
-            for message in &motion.failed {
-                put!(out, "<li class=\"bad\">{}</li>\n", Escaped(message));
-            }
-            put!(out, "</ul>\n");
-        }
-        picture(out, motion);
-        put!(out, "</article>\n");
-    }
-    put!(out, "</section>\n");
-}
-
-/// Writes the picture as an image, in which nothing can run or be asked of a network.
-fn picture(out: &mut String, motion: &WorstMotion) {
-    if motion.svg.is_empty() {
-        return;
-    }
-    put!(out, "<div class=\"scroll\"><img alt=\"Plot of {}\" src=\"", Escaped(&motion.name));
-    out.push_str("data:image/svg+xml;base64,");
-    STANDARD.encode_string(&motion.svg, out);
-    out.push_str("\"></div>\n");
 }
 
 #[cfg(test)]
@@ -120,18 +88,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_slot_is_filled() {
+    fn every_section_is_there() {
         let page = page(&example());
-        let slots: Vec<&str> = TEMPLATE
-            .split("{{")
-            .skip(1)
-            .map(|piece| piece.split_once("}}").expect("an end of the slot").0)
-            .collect();
-        let wanted = [
-            "title", "style", "title", "facts", "verdicts", "links", "sanity", "metrics",
-            "against", "worst",
-        ];
-        assert_eq!(slots, wanted);
+        assert!(!page.contains("{{") && !page.contains("{%") && page.ends_with("\n</html>\n"));
         assert!(page.starts_with("<!DOCTYPE html>\n<html lang=\"en\">\n"));
         assert!(page.contains("<title>Evaluation of demo</title>"));
         assert!(page.contains("<h1>Evaluation of demo</h1>"));
@@ -160,12 +119,27 @@ mod tests {
         }
     }
 
-    /// Writes the page of the example for a look at it:
-    /// `MOTIONGEN_PAGE=example.html cargo test --lib example_page -- --ignored`.
+    /// Writes the page of all subjects for a look at it:
+    /// `MOTIONGEN_PAGE=tests/golden/report/example.html cargo test --lib example_page -- --ignored`.
     #[test]
     #[ignore = "writes a file"]
     fn example_page_to_look_at() {
         let file = std::env::var_os("MOTIONGEN_PAGE").expect("MOTIONGEN_PAGE names a file");
+        std::fs::write(file, page(&of_all_subjects())).expect("written");
+    }
+
+    #[test]
+    fn the_page_is_the_one_that_is_kept() {
+        let kept = include_str!("../../tests/golden/report/example.html");
+        let page = page(&of_all_subjects());
+        for (line, (found, wanted)) in (1..).zip(page.lines().zip(kept.lines())) {
+            assert_eq!(found, wanted, "line {line}");
+        }
+        assert_eq!(page.len(), kept.len());
+    }
+
+    /// Returns the example with some numbers of every subject.
+    fn of_all_subjects() -> Report {
         let mut report = example();
         for (i, (subject, _)) in SUBJECTS.into_iter().enumerate() {
             let x = 0.1 + 0.1 * i as f64;
@@ -182,7 +156,7 @@ mod tests {
                 held_out_metric("share_upright", Some(1.1 - x)),
             ]);
         }
-        std::fs::write(file, page(&report)).expect("written");
+        report
     }
 
     #[test]

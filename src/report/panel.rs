@@ -1,91 +1,84 @@
 //! The head of the page: the verdicts, and what limits them.
 
-use super::html::{Escaped, put};
+use askama::Template;
+
 use super::names::words;
 use super::numbers::{MISSING, interval};
 use super::verdicts::{VerdictView, measured, shown};
 use super::{Outcome, Report, VerdictTest, ordered};
 
-/// Writes the verdicts, lost ones first, and the caveats below them.
-pub(super) fn section(out: &mut String, report: &Report) {
-    put!(out, "<section id=\"verdicts\" aria-label=\"Verdicts\">\n");
-    for verdict in shown(report) {
-        one(out, &verdict);
+/// The verdicts, lost ones first, and the caveats below them.
+#[derive(Template)]
+#[template(path = "report/templates/verdicts.html")]
+pub(super) struct VerdictsSection<'a> {
+    verdicts: Vec<VerdictCard<'a>>,
+    notes: &'a [String],
+}
+
+/// A verdict with its tests.
+struct VerdictCard<'a> {
+    outcome: Outcome,
+    question: String,
+    songs: String,
+    reason: String,
+    counts: String,
+    tests: Vec<TestRow<'a>>,
+}
+
+struct TestRow<'a> {
+    name: String,
+    statistic: &'a str,
+    outcome: Outcome,
+    measured: String,
+    interval: Option<String>,
+    wanted: String,
+    against: &'a str,
+    message: &'a str,
+}
+
+impl<'a> VerdictsSection<'a> {
+    /// Takes the verdicts and notes of a report.
+    pub fn new(report: &'a Report) -> Self {
+        let verdicts = shown(report).iter().map(VerdictCard::new).collect();
+        Self { verdicts, notes: &report.notes }
     }
-    if !report.notes.is_empty() {
-        put!(out, "<ul class=\"notes\">\n");
-        for note in &report.notes {
-            put!(out, "<li>{}</li>\n", Escaped(note));
+}
+
+impl<'a> VerdictCard<'a> {
+    fn new(verdict: &VerdictView<'a>) -> Self {
+        let tests = Outcome::ALL
+            .into_iter()
+            .flat_map(|outcome| verdict.with(outcome).into_iter().map(move |test| (test, outcome)))
+            .map(|(test, outcome)| TestRow::new(test, outcome))
+            .collect();
+        Self {
+            outcome: verdict.outcome,
+            question: verdict.question.clone(),
+            songs: verdict.songs.clone(),
+            reason: verdict.reason(),
+            counts: verdict.counts(),
+            tests,
         }
-        put!(out, "</ul>\n");
     }
-    put!(out, "</section>\n");
 }
 
-fn one(out: &mut String, verdict: &VerdictView) {
-    put!(out, "<article class=\"verdict {}\">\n<h2>", verdict.outcome.name());
-    badge(out, verdict.outcome);
-    put!(out, " {}", Escaped(&verdict.question));
-    if !verdict.songs.is_empty() {
-        put!(out, " <small>{}</small>", Escaped(&verdict.songs));
-    }
-    put!(out, "</h2>\n<p>{}</p>\n", Escaped(&verdict.reason()));
-    if !verdict.tests.is_empty() {
-        put!(
-            out,
-            "<details>\n<summary>{}</summary>\n<div class=\"scroll\"><table class=\"tests\">\n<thead><tr><th \
-             scope=\"col\">test</th><th scope=\"col\" class=\"text\">outcome</th><th \
-             scope=\"col\">value</th><th scope=\"col\">must be</th><th scope=\"col\" class=\"text\">held \
-             against</th></tr></thead>\n<tbody>\n",
-            verdict.counts()
-        );
-        for outcome in Outcome::ALL {
-            for test in verdict.with(outcome) {
-                row(out, test, outcome);
-            }
+impl<'a> TestRow<'a> {
+    fn new(test: &'a VerdictTest, outcome: Outcome) -> Self {
+        let ends = test.finite().and(test.ci_low.zip(test.ci_high));
+        let wanted = test.wanted();
+        Self {
+            name: words(&test.test),
+            statistic: &test.statistic,
+            outcome,
+            measured: measured(test),
+            interval: ends
+                .and_then(|(low, high)| ordered(low, high))
+                .map(|(low, high)| interval(low, high)),
+            wanted: if wanted.is_empty() { MISSING.to_owned() } else { wanted },
+            against: &test.against,
+            message: &test.message,
         }
-        put!(out, "</tbody></table></div>\n</details>\n");
     }
-    put!(out, "</article>\n");
-}
-
-/// Writes an outcome as a word with a sign; the colour only repeats it.
-fn badge(out: &mut String, outcome: Outcome) {
-    let sign = match outcome {
-        Outcome::Lost => "✗",
-        Outcome::Open => "?",
-        Outcome::Won => "✓",
-    };
-    put!(
-        out,
-        "<span class=\"badge {}\"><span aria-hidden=\"true\">{sign}</span> {}</span>",
-        outcome.name(),
-        outcome.word()
-    );
-}
-
-fn row(out: &mut String, test: &VerdictTest, outcome: Outcome) {
-    put!(
-        out,
-        "<tr><th scope=\"row\">{} <small>{}</small></th><td class=\"word\">",
-        Escaped(&words(&test.test)),
-        Escaped(&test.statistic)
-    );
-    badge(out, outcome);
-    put!(out, "</td><td>{}", Escaped(&measured(test)));
-    let ends = test.finite().and(test.ci_low.zip(test.ci_high));
-    if let Some((low, high)) = ends.and_then(|(low, high)| ordered(low, high)) {
-        put!(out, " <span class=\"interval\">{}</span>", interval(low, high));
-    }
-    let wanted = test.wanted();
-    let wanted = if wanted.is_empty() { MISSING } else { &wanted };
-    put!(
-        out,
-        "</td><td>{}</td><td class=\"text\">{} <small>{}</small></td></tr>\n",
-        Escaped(wanted),
-        Escaped(&test.against),
-        Escaped(&test.message)
-    );
 }
 
 #[cfg(test)]
@@ -96,9 +89,8 @@ mod tests {
 
     fn panel(verdicts: Vec<Verdict>, notes: &[&str]) -> String {
         let notes = notes.iter().map(|note| (*note).to_owned()).collect();
-        let mut out = String::new();
-        section(&mut out, &Report { verdicts, notes, ..Report::default() });
-        out
+        let report = Report { verdicts, notes, ..Report::default() };
+        format!("{}\n", VerdictsSection::new(&report))
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! Sanity checks: who passed all of a set, and each check with its worst answer.
 
-use super::html::{Escaped, put};
+use askama::Template;
+
 use super::names::{ALL, OWN, words};
 use super::numbers::{number, percent, short};
 use super::rows::find;
@@ -118,83 +119,96 @@ pub(super) fn lines<'a>(
     report.checks.iter().filter(move |line| line.set == set && stage_of(line) == stage)
 }
 
-/// Writes a section with a table for each set, of each stage.
-pub(super) fn section(out: &mut String, report: &Report) {
-    if report.checks.is_empty() {
-        return;
-    }
-    put!(out, "<section id=\"sanity\">\n<h2>Sanity checks</h2>\n");
-    if report.checks.iter().any(|line| line.by_construction) {
-        put!(
-            out,
-            "<p>What post-processing makes true is marked “{BY_CONSTRUCTION}” and counts in no pass \
-             rate.</p>\n"
-        );
-    }
-    for stage in stages(&report.checks) {
-        let known = STAGES.iter().find(|(name, _)| *name == stage);
-        let motion = known.map_or("", |(_, motion)| motion);
-        for set in sets(&report.checks) {
-            if lines(report, stage, set).next().is_none() {
-                continue;
-            }
-            put!(
-                out,
-                "<h3>{} checks, {} <small>{motion}</small></h3>\n<p>Share that passes all of them: \
-                 {}.</p>\n<div class=\"scroll\"><table class=\"checks\">\n<thead><tr><th \
-                 scope=\"col\">check</th><th scope=\"col\">threshold</th><th \
-                 scope=\"col\">passed</th><th scope=\"col\" class=\"text\">share</th><th \
-                 scope=\"col\">worst</th><th scope=\"col\" class=\"text\">what the worst \
-                 says</th></tr></thead>\n<tbody>\n",
-                Escaped(&capitalized(set)),
-                Escaped(&words(stage)),
-                Escaped(&PassCount::of(report, stage, set).words())
-            );
-            for line in lines(report, stage, set) {
-                row(out, line);
-            }
-            put!(out, "</tbody></table></div>\n");
-        }
-    }
-    put!(out, "</section>\n");
+/// A table for each set of checks, of each stage.
+#[derive(Template)]
+#[template(path = "report/templates/sanity.html")]
+pub(super) struct SanitySection<'a> {
+    /// Whether post-processing makes a check true.
+    has_moot: bool,
+    tables: Vec<CheckTable<'a>>,
 }
 
-fn row(out: &mut String, line: &CheckLine) {
-    let CheckLine { check, threshold, n, n_passed, worst_value, worst_message, .. } = line;
-    let class = match (n_passed == n, line.by_construction) {
-        // A failure of what should be true by construction is one all the same.
-        (false, _) => "bad",
-        (true, true) => "moot",
-        (true, false) => "good",
-    };
-    put!(
-        out,
-        "<tr class=\"{class}\"><th scope=\"row\">{}</th><td>{}</td><td>{n_passed} of {n}</td><td \
-         class=\"share\">",
-        Escaped(&words(check)),
-        short(*threshold)
-    );
-    if line.by_construction {
-        put!(out, "{BY_CONSTRUCTION}");
-    } else if *n > 0 {
-        let share = *n_passed as f64 / *n as f64;
-        put!(
-            out,
-            "<svg class=\"share-bar\" width=\"{BAR_PX}\" height=\"10\" aria-hidden=\"true\"><rect \
-             width=\"{BAR_PX}\" height=\"10\" class=\"rest\"/><rect width=\"{:.1}\" height=\"10\" \
-             class=\"part\"/></svg> {}",
-            share.min(1.0) * BAR_PX,
-            Escaped(&percent(share))
-        );
-    } else {
-        put!(out, "–");
+struct CheckTable<'a> {
+    set: String,
+    stage: String,
+    /// Which motion the stage is.
+    motion: &'static str,
+    passed: String,
+    rows: Vec<CheckRow<'a>>,
+}
+
+struct CheckRow<'a> {
+    class: &'static str,
+    name: String,
+    threshold: String,
+    n_passed: usize,
+    n: usize,
+    is_moot: bool,
+    /// None where nothing was checked.
+    bar: Option<ShareBar>,
+    worst_value: String,
+    worst_message: &'a str,
+}
+
+struct ShareBar {
+    whole_px: f64,
+    part_px: String,
+    share: String,
+}
+
+impl<'a> SanitySection<'a> {
+    /// Takes the checks of a report; none where there are none.
+    pub fn new(report: &'a Report) -> Option<Self> {
+        if report.checks.is_empty() {
+            return None;
+        }
+        let mut tables = Vec::new();
+        for stage in stages(&report.checks) {
+            let known = STAGES.iter().find(|(name, _)| *name == stage);
+            for set in sets(&report.checks) {
+                let rows: Vec<CheckRow> = lines(report, stage, set).map(CheckRow::new).collect();
+                if rows.is_empty() {
+                    continue;
+                }
+                tables.push(CheckTable {
+                    set: capitalized(set),
+                    stage: words(stage),
+                    motion: known.map_or("", |(_, motion)| motion),
+                    passed: PassCount::of(report, stage, set).words(),
+                    rows,
+                });
+            }
+        }
+        let has_moot = report.checks.iter().any(|line| line.by_construction);
+        Some(Self { has_moot, tables })
     }
-    put!(
-        out,
-        "</td><td>{}</td><td class=\"text\">{}</td></tr>\n",
-        number(*worst_value),
-        Escaped(worst_message)
-    );
+}
+
+impl<'a> CheckRow<'a> {
+    fn new(line: &'a CheckLine) -> Self {
+        let CheckLine { check, threshold, n, n_passed, worst_value, worst_message, .. } = line;
+        let share = *n_passed as f64 / *n as f64;
+        Self {
+            class: match (n_passed == n, line.by_construction) {
+                // A failure of what should be true by construction is one all the same.
+                (false, _) => "bad",
+                (true, true) => "moot",
+                (true, false) => "good",
+            },
+            name: words(check),
+            threshold: short(*threshold),
+            n_passed: *n_passed,
+            n: *n,
+            is_moot: line.by_construction,
+            bar: (*n > 0).then(|| ShareBar {
+                whole_px: BAR_PX,
+                part_px: format!("{:.1}", share.min(1.0) * BAR_PX),
+                share: percent(share),
+            }),
+            worst_value: number(*worst_value),
+            worst_message,
+        }
+    }
 }
 
 /// Returns a text with its first letter as a capital.
@@ -208,6 +222,10 @@ mod tests {
     use super::super::Metric;
     use super::super::example::{check, metric};
     use super::*;
+
+    fn told(report: &Report) -> String {
+        SanitySection::new(report).expect("checks").to_string()
+    }
 
     fn passed(report: &Report, set: &str) -> String {
         PassCount::of(report, "final", set).words()
@@ -254,8 +272,7 @@ mod tests {
         };
         assert_eq!(passed(&report, "strict"), "7 of 10 (70 %)");
         assert_eq!(passed(&report, "reference"), "all are true by construction");
-        let mut out = String::new();
-        section(&mut out, &report);
+        let mut out = told(&report);
         assert!(out.contains("marked “by construction” and counts in no pass rate"));
         assert!(out.contains(
             "<tr class=\"moot\"><th scope=\"row\">velocity</th><td>404</td><td>10 of 10</td><td \
@@ -264,8 +281,7 @@ mod tests {
         assert!(!out.contains("class=\"good\""), "{out}");
         // Unless it fails.
         report.checks[0].n_passed = 9;
-        out.clear();
-        section(&mut out, &report);
+        out = told(&report);
         assert!(out.contains("<tr class=\"bad\"><th scope=\"row\">velocity</th>"), "{out}");
         assert_eq!(passed(&report, "strict"), "7 of 10 (70 %)");
     }
@@ -285,8 +301,7 @@ mod tests {
             passed,
             ["2 of 9 (22.2 %)", "8 of 9 (88.9 %)", "1 of 9 (11.1 %)", "not measured"]
         );
-        let mut out = String::new();
-        section(&mut out, &report);
+        let out = told(&report);
         let headings: Vec<&str> =
             out.split("<h3>").skip(1).filter_map(|rest| rest.split("</h3>").next()).collect();
         assert_eq!(
@@ -304,8 +319,7 @@ mod tests {
         let checks = ["strict", "mine", "reference", "strict"].map(|set| check(set, "jerk", 4, 3));
         assert_eq!(sets(&checks), ["reference", "strict", "mine"]);
         let report = Report { checks: checks.to_vec(), ..Report::default() };
-        let mut out = String::new();
-        section(&mut out, &report);
+        let out = told(&report);
         assert_eq!(out.matches("<table").count(), 3);
         let headings: Vec<&str> = out.split("<h3>").skip(1).map(|rest| &rest[..6]).collect();
         assert_eq!(headings, ["Refere", "Strict", "Mine c"]);
@@ -323,18 +337,20 @@ mod tests {
             worst_message: "<b>&\"'".to_owned(),
             ..CheckLine::default()
         };
-        let mut out = String::new();
-        row(&mut out, &line);
+        let row_of = |line: &CheckLine| {
+            let out = told(&Report { checks: vec![line.clone()], ..Report::default() });
+            let (_, rows) = out.split_once("<tbody>\n").expect("a table");
+            rows.split_once("</tbody>").expect("its end").0.to_owned()
+        };
         assert_eq!(
-            out,
+            row_of(&line),
             "<tr class=\"bad\"><th scope=\"row\">phase monotonic</th><td>0.05</td><td>6 of 8</td><td \
              class=\"share\"><svg class=\"share-bar\" width=\"90\" height=\"10\" \
              aria-hidden=\"true\"><rect width=\"90\" height=\"10\" class=\"rest\"/><rect width=\"67.5\" \
              height=\"10\" class=\"part\"/></svg> 75 %</td><td>inf</td><td \
              class=\"text\">&lt;b&gt;&amp;&quot;&#39;</td></tr>\n"
         );
-        out.clear();
-        row(&mut out, &CheckLine { n: 0, n_passed: 0, ..line });
-        assert!(out.contains("<td class=\"share\">–</td>"));
+        let nothing = row_of(&CheckLine { n: 0, n_passed: 0, ..line });
+        assert!(nothing.contains("<td class=\"share\">–</td>"));
     }
 }

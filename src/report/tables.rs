@@ -1,14 +1,17 @@
 //! The sections of metrics: a table each, with a column for every subject and a chart in every row.
 
-use super::html::{Escaped, put};
+use askama::Template;
+
+use super::channels::BarFigure;
+use super::chart::{DotChart, SubjectKey};
 use super::meaning::{CHANNELS, Section, meaning_of};
 use super::names::{self, music, words};
 use super::numbers::{MISSING, interval, value};
 use super::rows::{Row, rows, subjects};
-use super::{BY_CONSTRUCTION, BetterDirection, Metric, Report, channels, chart};
+use super::{BY_CONSTRUCTION, BetterDirection, Metric, Report};
 
 /// The note on variants that reproduce a published formula.
-const COMPAT: &str = "These reproduce a published formula that has a defect, a misplaced parenthesis in \
+pub(super) const COMPAT: &str = "These reproduce a published formula that has a defect, a misplaced parenthesis in \
                       its acceleration, and are only for comparison with published numbers.";
 
 /// The section that says what the numbers are held against, in links, and its heading.
@@ -23,139 +26,183 @@ pub(super) fn sections(report: &Report) -> Vec<Section> {
     Section::ALL.into_iter().filter(has_numbers).collect()
 }
 
-/// Writes what the subjects are, and a section for every question.
-pub(super) fn metrics(out: &mut String, report: &Report) {
-    let subjects = subjects(&report.metrics);
-    if subjects.is_empty() {
-        return;
-    }
-    legend(out, &subjects);
-    let rows = rows(&report.metrics, &subjects);
-    for section in sections(report) {
-        let section_rows: Vec<&Row> =
-            rows.iter().filter(|row| meaning_of(row.metric).section == section).collect();
-        put!(out, "<section id=\"{}\">\n<h2>{}</h2>\n", section.id(), section.heading());
-        let (channels, numbers): (Vec<&Row>, Vec<&Row>) =
-            section_rows.into_iter().partition(|row| row.metric == CHANNELS);
-        let (compat, plain): (Vec<&Row>, Vec<&Row>) =
-            numbers.into_iter().partition(|row| row.is_compat());
-        table(out, &plain, &subjects);
-        channel_figures(out, &channels);
-        if !compat.is_empty() {
-            put!(out, "<h3>As published</h3>\n<p>{COMPAT}</p>\n");
-            table(out, &compat, &subjects);
+/// What the subjects are, and a section for every question.
+#[derive(Template)]
+#[template(path = "report/templates/metrics.html")]
+pub(super) struct MetricsSections<'a> {
+    subjects: Vec<SubjectKey>,
+    sections: Vec<MetricSection<'a>>,
+}
+
+struct MetricSection<'a> {
+    id: &'static str,
+    heading: &'static str,
+    plain: Option<MetricTable<'a>>,
+    channels: Option<ChannelFigures>,
+    /// Numbers that reproduce a published formula with a defect.
+    compat: Option<MetricTable<'a>>,
+}
+
+struct MetricTable<'a> {
+    columns: Vec<SubjectKey>,
+    n_columns: usize,
+    bodies: Vec<MetricBody<'a>>,
+}
+
+/// The rows of a metric under what it means.
+struct MetricBody<'a> {
+    metric: &'a str,
+    text: &'static str,
+    ideal: &'static str,
+    way: Option<&'static str>,
+    rows: Vec<MetricRow<'a>>,
+}
+
+struct MetricRow<'a> {
+    variant: String,
+    music: String,
+    unit: &'a str,
+    cells: Vec<MetricCell>,
+    chart: Option<DotChart>,
+}
+
+struct MetricCell {
+    class: &'static str,
+    title: String,
+    text: String,
+    interval: Option<String>,
+}
+
+/// A figure for each split that has distances of channels.
+struct ChannelFigures {
+    metric: &'static str,
+    text: &'static str,
+    ideal: &'static str,
+    figures: Vec<BarFigure>,
+}
+
+impl<'a> MetricsSections<'a> {
+    /// Takes the numbers of a report; none where there are none.
+    pub fn new(report: &'a Report) -> Option<Self> {
+        let subjects = subjects(&report.metrics);
+        if subjects.is_empty() {
+            return None;
         }
-        put!(out, "</section>\n");
+        let rows = rows(&report.metrics, &subjects);
+        let section = |section: Section| {
+            let section_rows: Vec<&Row<'a>> =
+                rows.iter().filter(|row| meaning_of(row.metric).section == section).collect();
+            let (channels, numbers): (Vec<&Row>, Vec<&Row>) =
+                section_rows.into_iter().partition(|row| row.metric == CHANNELS);
+            let (compat, plain): (Vec<&Row>, Vec<&Row>) =
+                numbers.into_iter().partition(|row| row.is_compat());
+            MetricSection {
+                id: section.id(),
+                heading: section.heading(),
+                plain: MetricTable::new(&plain, &subjects),
+                channels: ChannelFigures::new(&channels),
+                compat: MetricTable::new(&compat, &subjects),
+            }
+        };
+        let sections = sections(report).into_iter().map(section).collect();
+        Some(Self {
+            subjects: subjects.iter().map(|name| SubjectKey::new(name)).collect(),
+            sections,
+        })
     }
 }
 
-fn legend(out: &mut String, subjects: &[&str]) {
-    put!(
-        out,
-        "<section id=\"{SUBJECTS_ID}\">\n<h2>{SUBJECTS_HEADING}</h2>\n<dl class=\"legend\">\n"
-    );
-    for subject in subjects {
-        put!(
-            out,
-            "<div><dt class=\"key {}\">{}</dt><dd>{}</dd></div>\n",
-            chart::color_class(subject),
-            Escaped(&words(subject)),
-            names::meaning(subject)
-        );
-    }
-    put!(out, "</dl>\n</section>\n");
-}
-
-/// Writes rows as a table, those of a metric under what it means.
-fn table(out: &mut String, rows: &[&Row], subjects: &[&str]) {
-    if rows.is_empty() {
-        return;
-    }
-    // What was asked is measured of what was generated alone; columns for others would be empty.
-    let is_asked = rows.iter().all(|row| row.is_asked());
-    let columns: Vec<usize> = (0..subjects.len())
-        .filter(|i| !is_asked || rows.iter().any(|row| row.cells[*i].is_some()))
-        .collect();
-    put!(
-        out,
-        "<div class=\"scroll\"><table class=\"metrics\">\n<thead><tr><th scope=\"col\"></th>"
-    );
-    for i in &columns {
-        put!(
-            out,
-            "<th scope=\"col\" title=\"{}\"><span class=\"key {}\">{}</span></th>",
-            names::meaning(subjects[*i]),
-            chart::color_class(subjects[*i]),
-            Escaped(&words(subjects[*i]))
-        );
-    }
-    put!(out, "<th scope=\"col\">all on one scale</th></tr></thead>\n");
-    for of_metric in rows.chunk_by(|a, b| a.metric == b.metric) {
-        put!(out, "<tbody>\n");
-        heading(out, of_metric[0], columns.len() + 2);
-        for row in of_metric {
-            line(out, row, &columns);
+impl<'a> MetricTable<'a> {
+    /// Takes rows, those of a metric under what it means; none where there are none.
+    fn new(rows: &[&Row<'a>], subjects: &[&str]) -> Option<Self> {
+        if rows.is_empty() {
+            return None;
         }
-        put!(out, "</tbody>\n");
+        // What was asked is measured of what was generated alone; columns for others would be empty.
+        let is_asked = rows.iter().all(|row| row.is_asked());
+        let columns: Vec<usize> = (0..subjects.len())
+            .filter(|i| !is_asked || rows.iter().any(|row| row.cells[*i].is_some()))
+            .collect();
+        let bodies = rows.chunk_by(|a, b| a.metric == b.metric);
+        Some(Self {
+            columns: columns.iter().map(|i| SubjectKey::new(subjects[*i])).collect(),
+            // The name of the row, and the chart.
+            n_columns: columns.len() + 2,
+            bodies: bodies.map(|rows| MetricBody::new(rows, &columns)).collect(),
+        })
     }
-    put!(out, "</table></div>\n");
 }
 
-fn heading(out: &mut String, row: &Row, n_columns: usize) {
-    let meaning = meaning_of(row.metric);
-    let way = match row.better() {
-        BetterDirection::Higher => "<em>↑ higher is better</em>",
-        BetterDirection::Lower => "<em>↓ lower is better</em>",
-        BetterDirection::Neither => "",
-    };
-    put!(
-        out,
-        "<tr class=\"about\"><th colspan=\"{n_columns}\" scope=\"rowgroup\"><div><code>{}</code> {} {} \
-         {way}</div></th></tr>\n",
-        Escaped(row.metric),
-        meaning.text,
-        meaning.ideal
-    );
+impl<'a> MetricBody<'a> {
+    fn new(rows: &[&Row<'a>], columns: &[usize]) -> Self {
+        let first = rows[0];
+        let meaning = meaning_of(first.metric);
+        Self {
+            metric: first.metric,
+            text: meaning.text,
+            ideal: meaning.ideal,
+            way: match first.better() {
+                BetterDirection::Higher => Some("↑ higher is better"),
+                BetterDirection::Lower => Some("↓ lower is better"),
+                BetterDirection::Neither => None,
+            },
+            rows: rows
+                .iter()
+                .map(|row| MetricRow {
+                    variant: words(row.variant),
+                    music: music(row.split),
+                    unit: row.unit,
+                    cells: columns.iter().map(|i| MetricCell::new(row, row.cells[*i])).collect(),
+                    chart: DotChart::new(row),
+                })
+                .collect(),
+        }
+    }
 }
 
-fn line(out: &mut String, row: &Row, columns: &[usize]) {
-    put!(out, "<tr><th scope=\"row\">");
-    if !row.variant.is_empty() {
-        put!(out, "{} ", Escaped(&words(row.variant)));
+impl MetricCell {
+    fn new(row: &Row, metric: Option<&Metric>) -> Self {
+        let Some(metric) = metric else {
+            let text = if row.is_asked() { "" } else { MISSING }.to_owned();
+            return Self { class: "", title: "not measured".to_owned(), text, interval: None };
+        };
+        let title = tooltip(metric);
+        if metric.finite().is_none() && metric.is_by_construction() {
+            return Self { class: "moot", title, text: BY_CONSTRUCTION.to_owned(), interval: None };
+        }
+        Self {
+            class: if metric.subject == names::OWN { "own" } else { "" },
+            title,
+            text: value(metric.value),
+            interval: metric.interval().map(|(low, high)| interval(low, high)),
+        }
     }
-    put!(out, "<small>{}", Escaped(&music(row.split)));
-    if !row.unit.is_empty() {
-        put!(out, ", {}", Escaped(row.unit));
-    }
-    put!(out, "</small></th>");
-    for i in columns {
-        cell(out, row, row.cells[*i]);
-    }
-    put!(out, "<td class=\"chart\">");
-    chart::dots(out, row);
-    put!(out, "</td></tr>\n");
 }
 
-fn cell(out: &mut String, row: &Row, metric: Option<&Metric>) {
-    let Some(metric) = metric else {
-        let missing = if row.is_asked() { "" } else { MISSING };
-        put!(out, "<td title=\"not measured\">{missing}</td>");
-        return;
-    };
-    if metric.finite().is_none() && metric.is_by_construction() {
-        put!(
-            out,
-            "<td class=\"moot\" title=\"{}\">{BY_CONSTRUCTION}</td>",
-            Escaped(&tooltip(metric))
-        );
-        return;
+impl ChannelFigures {
+    fn new(rows: &[&Row]) -> Option<Self> {
+        let mut splits: Vec<&str> = Vec::new();
+        for row in rows {
+            if !splits.contains(&row.split) {
+                splits.push(row.split);
+            }
+        }
+        if splits.is_empty() {
+            return None;
+        }
+        let meaning = meaning_of(CHANNELS);
+        let figure = |split: &str| {
+            let of_split: Vec<&Row> =
+                rows.iter().copied().filter(|row| row.split == split).collect();
+            BarFigure::new(&of_split, &music(split))
+        };
+        Some(Self {
+            metric: CHANNELS,
+            text: meaning.text,
+            ideal: meaning.ideal,
+            figures: splits.into_iter().map(figure).collect(),
+        })
     }
-    let class = if metric.subject == names::OWN { " class=\"own\"" } else { "" };
-    put!(out, "<td{class} title=\"{}\">{}", Escaped(&tooltip(metric)), value(metric.value));
-    if let Some((low, high)) = metric.interval() {
-        put!(out, " <span class=\"interval\">{}</span>", interval(low, high));
-    }
-    put!(out, "</td>");
 }
 
 /// Returns what a number rests on.
@@ -168,40 +215,14 @@ fn tooltip(metric: &Metric) -> String {
     if metric.protocol.is_empty() { counted } else { format!("{counted}; {}", metric.protocol) }
 }
 
-/// Writes a figure for each split that has distances of channels.
-fn channel_figures(out: &mut String, rows: &[&Row]) {
-    let mut splits: Vec<&str> = Vec::new();
-    for row in rows {
-        if !splits.contains(&row.split) {
-            splits.push(row.split);
-        }
-    }
-    if splits.is_empty() {
-        return;
-    }
-    let meaning = meaning_of(CHANNELS);
-    put!(
-        out,
-        "<h3>Channel by channel</h3>\n<p><code>{CHANNELS}</code> {} {}</p>\n<div class=\"figures\">\n",
-        meaning.text,
-        meaning.ideal
-    );
-    for split in splits {
-        let split_rows: Vec<&Row> = rows.iter().copied().filter(|row| row.split == split).collect();
-        channels::bars(out, &split_rows, &music(split));
-    }
-    put!(out, "</div>\n");
-}
-
 #[cfg(test)]
 mod tests {
     use super::super::example::{metric, with_interval};
     use super::*;
 
     fn told(metrics: Vec<Metric>) -> String {
-        let mut out = String::new();
-        super::metrics(&mut out, &Report { metrics, ..Report::default() });
-        out
+        let report = Report { metrics, ..Report::default() };
+        format!("{}\n", MetricsSections::new(&report).expect("numbers"))
     }
 
     #[test]

@@ -16,6 +16,15 @@ impl Outcome {
             Self::Open | Self::Won => self.name(),
         }
     }
+
+    /// Returns the sign that stands before the word.
+    pub(super) const fn sign(self) -> &'static str {
+        match self {
+            Self::Lost => "✗",
+            Self::Open => "?",
+            Self::Won => "✓",
+        }
+    }
 }
 
 impl VerdictTest {

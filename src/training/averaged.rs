@@ -117,6 +117,34 @@ impl NetworkState {
     }
 }
 
+/// Writes the methods of [`Learner`](super::drive::Learner) that say what a checkpoint keeps, for a learner that keeps
+/// a [`NetworkState`] and nothing else.
+macro_rules! keeps_network {
+    ($field:ident) => {
+        fn sections(&self) -> Vec<crate::weights::Section<'_, f32>> {
+            self.$field.sections()
+        }
+
+        fn best(&self) -> Vec<crate::weights::Section<'_, f32>> {
+            self.$field.best()
+        }
+
+        fn n_updates(&self) -> (u64, u64) {
+            self.$field.n_updates()
+        }
+
+        fn restore(
+            &mut self,
+            archive: &crate::weights::Archive,
+            place: &str,
+            at: &crate::training::checkpoint::Progress,
+        ) -> Result<(), crate::training::TrainingError> {
+            self.$field.restore(archive, place, at)
+        }
+    };
+}
+pub(super) use keeps_network;
+
 /// Reads a section of a checkpoint that lies as `like` does.
 pub(super) fn section(
     archive: &Archive,

@@ -111,7 +111,7 @@ pub enum Ensemble {
 }
 
 impl Ensemble {
-    /// Returns why so many dancers are not learned from, to go on from "has".
+    /// Returns why a phrase of this number of dancers is not learned from; the text goes on from "has".
     fn refusal(self, n_dancers: usize) -> Option<String> {
         match self {
             Self::Soloists if n_dancers > 1 => {

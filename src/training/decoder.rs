@@ -8,12 +8,10 @@ use ndarray::Array3;
 use crate::autodiff::{Arena, Eager, Gradients, Interpreter, Parameters, Stream, Tape, Threads};
 use crate::diffusion::{Schedule, ddim_update};
 use crate::model::{DecoderConfig, MotionDecoder, ParameterList};
-use crate::motion::{Channel, ChannelLimits, MOTION_DIM, Normalizer};
-use crate::weights::{Archive, Section};
+use crate::motion::{ChannelLimits, ColumnRole, MOTION_DIM, Normalizer};
 
-use super::averaged::NetworkState;
+use super::averaged::{NetworkState, keeps_network};
 use super::batch::Batch;
-use super::checkpoint::Progress;
 use super::config::DecoderTraining;
 use super::diffusion::tape_seed;
 use super::drive::{Learner, Losses, NoReduction, Reducer, StepResult, Validation};
@@ -195,21 +193,19 @@ fn near_the_data(
         list.iter().map(|(id, parameter)| (parameter.name.clone(), id)).collect();
     Parameters::from_fn(list, |parameter| {
         let mut values = plain.unpacked(ids[&parameter.name]);
-        let head = Channel::ALL.into_iter().find_map(|channel| {
-            let rest = parameter.name.strip_prefix(channel.name())?.strip_prefix("_head.")?;
-            Some((channel, rest == "bias"))
+        let head = normalizer.layout().groups().find_map(|columns| {
+            let rest = parameter.name.strip_prefix(columns.group.name)?.strip_prefix("_head.")?;
+            Some((columns, rest == "bias"))
         });
-        let Some((channel, is_bias)) = head else { return values };
-        let limit = match channel {
-            Channel::Velocity | Channel::Acceleration | Channel::AngularVelocity => {
-                limits.bounds(channel).1
-            }
-            Channel::Position | Channel::Style => 1.0,
+        let Some((columns, is_bias)) = head else { return values };
+        let limit = match columns.group.role {
+            ColumnRole::Vector => limits.of(columns.group).1,
+            ColumnRole::Place | ColumnRole::Free => 1.0,
             // Of unit norm and within 0 to 1 whatever the weights.
-            Channel::Quaternion | Channel::Phase => return values,
+            ColumnRole::Turn | ColumnRole::Phase => return values,
         };
-        let row = values.len() / channel.width();
-        for (values, i) in values.chunks_exact_mut(row).zip(channel.range()) {
+        let row = values.len() / columns.width();
+        for (values, i) in values.chunks_exact_mut(row).zip(columns.range()) {
             for x in values {
                 *x = if is_bias { normalizer.centre[i] } else { *x * normalizer.scale[i] } / limit;
             }
@@ -276,24 +272,49 @@ impl Learner for DecoderLearner<'_> {
         Ok(Validation { losses, live: Some(live), distance: None })
     }
 
-    fn sections(&self) -> Vec<Section<'_, f32>> {
-        self.network.sections()
-    }
+    keeps_network!(network);
+}
 
-    fn best(&self) -> Vec<Section<'_, f32>> {
-        self.network.best()
-    }
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::Scope;
+    use crate::motion::layout::tests::ROOT;
 
-    fn n_updates(&self) -> (u64, u64) {
-        self.network.n_updates()
-    }
-
-    fn restore(
-        &mut self,
-        archive: &Archive,
-        place: &str,
-        at: &Progress,
-    ) -> Result<(), TrainingError> {
-        self.network.restore(archive, place, at)
+    #[test]
+    fn the_root_alone_is_decoded_within_the_bounds_of_its_roles() {
+        let config = DecoderConfig { input_dim: 5, hidden_dim: 8, ..DecoderConfig::default() };
+        let mut list = ParameterList::default();
+        let decoder = MotionDecoder::of_layout(&mut Scope::root(&mut list), &config, ROOT);
+        let mut normalizer = Normalizer::identity_of(ROOT);
+        normalizer.centre[1] = 0.9;
+        normalizer.centre[4] = 5.0;
+        normalizer.centre[12] = 1e3;
+        let parameters = near_the_data(list, &normalizer, ChannelLimits::Wide, 7);
+        let arena = Arena::default();
+        let mut g = Eager::new(&parameters, &arena);
+        // Nothing but biases is left of a latent through weights of zeros.
+        let still = Parameters::from_fn(parameters.list().clone(), |parameter| {
+            let values = parameters.unpacked(parameters.list().by_name()[parameter.name.as_str()]);
+            if parameter.name.ends_with("bias") { values } else { vec![0.0; values.len()] }
+        });
+        let latent = g.input(&[1, 3, 5], &[0.5; 15]);
+        let mut of_biases = Eager::new(&still, &arena);
+        for (g, exact) in [(&mut g, false), (&mut of_biases, true)] {
+            let found = decoder.forward(g, &latent).expect("shapes fit");
+            assert_eq!(found.shape(), [1, 3, 13]);
+            for row in found.data().chunks_exact(13) {
+                let norm = row[6..10].iter().map(|x| x * x).sum::<f32>().sqrt();
+                assert!((norm - 1.0).abs() < 1e-5, "{norm}");
+                assert!(row[3..6].iter().all(|x| x.abs() <= 50.0));
+                assert!(row[10..].iter().all(|x| x.abs() <= 20.0));
+                if exact {
+                    // A bias of 5 / 50 within a tanh, and one that the limit holds.
+                    assert_eq!(row[1], 0.9);
+                    assert!((row[4] - 50.0 * 0.1_f32.tanh()).abs() < 1e-4, "{}", row[4]);
+                    assert!((row[12] - 20.0).abs() < 1e-4, "{}", row[12]);
+                }
+            }
+        }
     }
 }

@@ -9,11 +9,9 @@ use crate::diffusion::Schedule;
 use crate::model::{Graph as _, UNet1D, UNetInputs};
 use crate::motion::style::STYLE_DIM;
 use crate::motion::{MOTION_DIM, Normalizer};
-use crate::weights::{Archive, Section};
 
-use super::averaged::NetworkState;
+use super::averaged::{NetworkState, keeps_network};
 use super::batch::Batch;
-use super::checkpoint::Progress;
 use super::config::{DiffusionTraining, NetworkConfig};
 use super::drive::{Learner, Losses, NoReduction, Reducer, StepResult, Validation};
 use super::error::TrainingError;
@@ -338,7 +336,8 @@ impl<'a> DiffusionInputs<'a> {
     ) -> Result<Tensor<f32>, TrainingError> {
         let target = g.constant(prediction.shape(), &self.target);
         let mask = &self.batch.mask;
-        let loss = objective.loss(g, schedule, &self.t, [prediction, &target], mask)?;
+        let layout = normalizer.layout();
+        let loss = objective.loss(g, layout, schedule, &self.t, [prediction, &target], mask)?;
         let x_t = g.constant(prediction.shape(), &self.x_t);
         let estimate_loss = objective.estimate.loss(
             g,
@@ -445,26 +444,7 @@ impl Learner for DiffusionLearner {
         Ok(Validation { losses, live: Some(live), distance })
     }
 
-    fn sections(&self) -> Vec<Section<'_, f32>> {
-        self.network.sections()
-    }
-
-    fn best(&self) -> Vec<Section<'_, f32>> {
-        self.network.best()
-    }
-
-    fn n_updates(&self) -> (u64, u64) {
-        self.network.n_updates()
-    }
-
-    fn restore(
-        &mut self,
-        archive: &Archive,
-        place: &str,
-        at: &Progress,
-    ) -> Result<(), TrainingError> {
-        self.network.restore(archive, place, at)
-    }
+    keeps_network!(network);
 }
 
 #[cfg(test)]

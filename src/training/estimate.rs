@@ -14,7 +14,7 @@ use crate::autodiff::op::loss::{Cost, Loss};
 use crate::autodiff::{Element, Interpreter, Tensor};
 use crate::diffusion::{Schedule, ddim_linear};
 use crate::model::{Graph, Result};
-use crate::motion::{Channel, MOTION_DIM, Normalizer};
+use crate::motion::{Columns, Normalizer};
 use crate::units::FPS;
 
 /// Ratio of the size of a derivative of captured motion to that of the one before, 1/s: its jerk is 19 times its
@@ -50,8 +50,11 @@ impl EstimateLosses {
     /// - differences k = 1, 2, 3: ⟨(f^k D^k (p̂ − p))² / u_k²⟩ with u = s_v, s_a, 20 s_a, over positions, and over
     ///   quaternions with u = s_ω/2, 20 s_ω/2, 400 s_ω/2 (|q̇| = |ω|/2)
     ///
+    /// Where the layout lacks a derivative, its residual is not added, and its spread counts as 20/s times that of what
+    /// it would be the derivative of.
+    ///
     /// # Shapes
-    /// - `prediction`: \[batch, frames, 25\]; `x_t`, `motion`: the same, normalised; `t`: \[batch\]; `mask`:
+    /// - `prediction`: \[batch, frames, columns\]; `x_t`, `motion`: the same, normalised; `t`: \[batch\]; `mask`:
     ///   \[batch, frames\], 1 or 0
     ///
     /// # Errors
@@ -69,25 +72,30 @@ impl EstimateLosses {
             return Ok(None);
         }
         let estimate = estimate(g, (schedule, t), [prediction, x_t])?;
-        let scale = normalizer.scale.map(f64::from);
-        let centre = normalizer.centre.map(f64::from);
-        let [p, v, a] = [Channel::Position, Channel::Velocity, Channel::Acceleration];
+        let body = normalizer.layout().body();
+        let (p, v, a) = (body.position, body.velocity, body.acceleration);
         let mut terms: Vec<(f64, Tensor<I::Element>)> = Vec::new();
-        for (weight, [value, derivative]) in [(self.velocity, [p, v]), (self.acceleration, [v, a])]
+        for (weight, value, derivative) in [(self.velocity, Some(p), v), (self.acceleration, v, a)]
         {
-            if weight > 0.0 {
-                let residual = residual(g, &estimate, [value, derivative], &scale, &centre)?;
+            if let (true, Some(value), Some(derivative)) = (weight > 0.0, value, derivative) {
+                let residual = residual(g, &estimate, [value, derivative], normalizer)?;
                 terms.push((weight, mean_square(g, &residual, mask, 1)?));
             }
         }
         if self.differences != [0.0; 3] {
-            let spread = |channel: Channel, i: usize| scale[channel.range().start + i];
-            let turn = (0..3).map(|i| spread(Channel::AngularVelocity, i)).sum::<f64>() / 6.0;
-            let poses = [Channel::Position, Channel::Quaternion];
+            let spread =
+                |columns: Columns, i: usize| f64::from(normalizer.scale[columns.first + i]);
+            let speed = |i: usize| v.map_or(RATE_PER_S * spread(p, i), |v| spread(v, i));
+            let change = |i: usize| a.map_or(RATE_PER_S * speed(i), |a| spread(a, i));
+            let turn = match body.angular_velocity {
+                Some(omega) => (0..3).map(|i| spread(omega, i)).sum::<f64>() / 6.0,
+                None => RATE_PER_S * (1..4).map(|i| spread(body.orientation, i)).sum::<f64>() / 3.0,
+            };
+            let poses = [p, body.orientation];
             let truth = constant(g, prediction.shape(), motion);
             let error = g.apply(Binary::new(Pair::Subtract), &[&estimate, &truth])?;
             let parts = poses
-                .map(|channel| g.channels(&error, channel.range()))
+                .map(|columns| g.channels(&error, columns.range()))
                 .into_iter()
                 .collect::<Result<Vec<_>>>()?;
             let mut error = g.concat(&parts.iter().collect::<Vec<_>>())?;
@@ -99,11 +107,11 @@ impl EstimateLosses {
                 let growth = (FPS / RATE_PER_S).powi(order - 1);
                 let units: Vec<f64> = (0..3)
                     .map(|i| match order {
-                        1 => FPS * spread(p, i) / spread(v, i),
+                        1 => FPS * spread(p, i) / speed(i),
                         // f² / s_a, and f³ / (20 s_a).
-                        _ => FPS * RATE_PER_S * growth * spread(p, i) / spread(a, i),
+                        _ => FPS * RATE_PER_S * growth * spread(p, i) / change(i),
                     })
-                    .chain((0..4).map(|i| FPS * growth * spread(Channel::Quaternion, i) / turn))
+                    .chain((0..4).map(|i| FPS * growth * spread(body.orientation, i) / turn))
                     .collect();
                 let scaled = times(g, &error, &units)?;
                 terms.push((weight, mean_square(g, &scaled, mask, order as usize)?));
@@ -144,23 +152,24 @@ fn estimate<I: Interpreter>(
     g.add(&x, &y)
 }
 
-/// (ŷ − f D x̂) / s_y for a channel x and its derivative y, \[batch, frames − 1, 3\].
+/// (ŷ − f D x̂) / s_y for columns x and their derivative y, \[batch, frames − 1, 3\].
 fn residual<I: Interpreter>(
     g: &mut I,
     estimate: &Tensor<I::Element>,
-    [value, derivative]: [Channel; 2],
-    scale: &[f64; MOTION_DIM],
-    centre: &[f64; MOTION_DIM],
+    [value, derivative]: [Columns; 2],
+    normalizer: &Normalizer,
 ) -> Result<Tensor<I::Element>> {
+    let scale = |i: usize| f64::from(normalizer.scale[i]);
+    let centre = |i: usize| f64::from(normalizer.centre[i]);
     let (x, y) = (value.range(), derivative.range());
     let change = g.channels(estimate, x.clone())?;
     let change = difference(g, &change)?;
     let units: Vec<f64> =
-        x.clone().zip(y.clone()).map(|(x, y)| -FPS * scale[x] / scale[y]).collect();
+        x.clone().zip(y.clone()).map(|(x, y)| -FPS * scale(x) / scale(y)).collect();
     let change = times(g, &change, &units)?;
     let said = g.channels(estimate, y.clone())?;
     let said = g.apply(TakeFrames::inner(0, 1), &[&said])?;
-    let shift: Vec<f32> = y.map(|y| (centre[y] / scale[y]) as f32).collect();
+    let shift: Vec<f32> = y.map(|y| (centre(y) / scale(y)) as f32).collect();
     let shift = constant(g, &[shift.len()], &shift);
     let said = g.apply(Binary::new(Pair::Add), &[&said, &shift])?;
     g.add(&said, &change)
@@ -215,12 +224,14 @@ mod tests {
     use crate::autodiff::{Arena, Eager, Parameters};
     use crate::diffusion::{DiffusionConfig, Prediction};
     use crate::model::ParameterList;
+    use crate::motion::layout::tests::ROOT;
+    use crate::motion::{BODY, Layout, MOTION_DIM};
 
     const FRAMES: usize = 7;
 
-    fn normalizer() -> Normalizer {
-        let mut normalizer = Normalizer::identity();
-        for i in 0..MOTION_DIM {
+    fn normalizer(layout: Layout) -> Normalizer {
+        let mut normalizer = Normalizer::identity_of(layout);
+        for i in 0..layout.width() {
             normalizer.scale[i] = 0.5 + 0.1 * i as f32;
             normalizer.centre[i] = 0.02 * i as f32 - 0.1;
         }
@@ -228,11 +239,12 @@ mod tests {
     }
 
     /// Numbers that no two channels share.
-    fn numbers(seed: f64) -> Vec<f32> {
-        (0..2 * FRAMES * MOTION_DIM).map(|i| (0.7 * i as f64 + seed).sin() as f32).collect()
+    fn numbers(layout: Layout, seed: f64) -> Vec<f32> {
+        (0..2 * FRAMES * layout.width()).map(|i| (0.7 * i as f64 + seed).sin() as f32).collect()
     }
 
     fn loss_of(
+        layout: Layout,
         losses: &EstimateLosses,
         prediction: Prediction,
         t: [usize; 2],
@@ -244,16 +256,16 @@ mod tests {
         let parameters = Parameters::<f64>::new(ParameterList::default(), 0);
         let arena = Arena::default();
         let mut g = Eager::new(&parameters, &arena);
-        let shape = [2, FRAMES, MOTION_DIM];
+        let shape = [2, FRAMES, layout.width()];
         let [says, x_t] = [says, x_t].map(|values| constant(&g, &shape, values));
-        let n = normalizer();
+        let n = normalizer(layout);
         let loss = losses.loss(&mut g, &n, (&schedule, &t), [&says, &x_t], (motion, mask));
         loss.expect("shapes fit").expect("a loss").scalar()
     }
 
     /// The definition, in loops.
     fn expected(losses: &EstimateLosses, estimate: &[f64], motion: &[f32], mask: &[f32]) -> f64 {
-        let n = normalizer();
+        let n = normalizer(BODY);
         let at = |values: &dyn Fn(usize) -> f64, b: usize, t: usize, i: usize| {
             values((b * FRAMES + t) * MOTION_DIM + i) * f64::from(n.scale[i])
                 + f64::from(n.centre[i])
@@ -322,7 +334,7 @@ mod tests {
     fn losses_are_those_of_their_definition() {
         let mut mask = vec![1.0; 2 * FRAMES];
         mask[2 * FRAMES - 2..].fill(0.0);
-        let (says, x_t, motion) = (numbers(0.0), numbers(5.0), numbers(11.0));
+        let (says, x_t, motion) = (numbers(BODY, 0.0), numbers(BODY, 5.0), numbers(BODY, 11.0));
         let all = EstimateLosses { velocity: 0.7, acceleration: 0.3, differences: [0.5, 0.2, 0.1] };
         let only = |k: usize| {
             let mut differences = [0.0; 3];
@@ -332,7 +344,7 @@ mod tests {
         let as_f64: Vec<f64> = says.iter().map(|&x| f64::from(x)).collect();
         for losses in [all.clone(), only(0), only(1), only(2)] {
             let given = [says.as_slice(), &x_t, &motion];
-            let found = loss_of(&losses, Prediction::Sample, [3, 900], given, &mask);
+            let found = loss_of(BODY, &losses, Prediction::Sample, [3, 900], given, &mask);
             let expected = expected(&losses, &as_f64, &motion, &mask);
             assert!((found - expected).abs() < 1e-6 * expected, "{found} {expected}");
         }
@@ -345,8 +357,49 @@ mod tests {
                 (f64::from(x_t[k]) - level.noise * as_f64[k]) / level.signal
             })
             .collect();
-        let found = loss_of(&all, Prediction::Epsilon, t, [&says, &x_t, &motion], &mask);
+        let found = loss_of(BODY, &all, Prediction::Epsilon, t, [&says, &x_t, &motion], &mask);
         let expected = expected(&all, &estimate, &motion, &mask);
+        assert!((found - expected).abs() < 1e-6 * expected, "{found} {expected}");
+    }
+
+    #[test]
+    fn the_root_alone_has_the_losses_of_its_columns() {
+        let losses =
+            EstimateLosses { velocity: 0.7, acceleration: 0.3, differences: [0.5, 0.2, 0.1] };
+        let [says, motion] = [numbers(ROOT, 0.0), numbers(ROOT, 11.0)];
+        let mask = vec![1.0; 2 * FRAMES];
+        let given = [says.as_slice(), &says, &motion];
+        let found = loss_of(ROOT, &losses, Prediction::Sample, [3, 900], given, &mask);
+        let n = normalizer(ROOT);
+        let scale = |i: usize| f64::from(n.scale[i]);
+        let error = |k: usize| f64::from(says[k]) - f64::from(motion[k]);
+        let frames = 2.0 * FRAMES as f64;
+        let mut expected = 0.0;
+        for b in 0..2 {
+            let at = |t: usize, i: usize| (b * FRAMES + t) * 13 + i;
+            let value =
+                |t: usize, i: usize| f64::from(says[at(t, i)]) * scale(i) + f64::from(n.centre[i]);
+            for (t, i) in (0..FRAMES - 1).flat_map(|t| (0..3).map(move |i| (t, i))) {
+                let rate = 30.0 * (value(t + 1, i) - value(t, i));
+                let residual = (value(t, 3 + i) - rate) / scale(3 + i);
+                expected += 0.7 * residual.powi(2) / 3.0 / frames;
+            }
+            let turn = (scale(10) + scale(11) + scale(12)) / 6.0;
+            for i in (0..3).chain(6..10) {
+                let e = |t: usize| scale(i) * error(at(t, i));
+                // Without accelerations their spread is 20 times that of velocities.
+                let unit = if i < 3 { scale(3 + i) } else { turn };
+                let first = |t: usize| 30.0 * (e(t + 1) - e(t)) / unit;
+                let second = |t: usize| 30.0 * (first(t + 1) - first(t)) / 20.0;
+                let third = |t: usize| 30.0 * (second(t + 1) - second(t)) / 20.0;
+                let sum = |n: usize, x: &dyn Fn(usize) -> f64| -> f64 {
+                    (0..n).map(|t| x(t).powi(2)).sum::<f64>() / 7.0 / frames
+                };
+                expected += 0.5 * sum(FRAMES - 1, &first)
+                    + 0.2 * sum(FRAMES - 2, &second)
+                    + 0.1 * sum(FRAMES - 3, &third);
+            }
+        }
         assert!((found - expected).abs() < 1e-6 * expected, "{found} {expected}");
     }
 
@@ -357,11 +410,12 @@ mod tests {
         let position_m: Vec<_> = (0..FRAMES + 2).map(pose).collect();
         let orientation = vec![[1.0, 0.0, 0.0, 0.0]; FRAMES + 2];
         let mut frames = frames_of(&Poses { position_m, orientation }, FRAMES);
-        normalizer().normalize(frames.view_mut());
+        normalizer(BODY).normalize(frames.view_mut());
         let motion: Vec<f32> = frames.iter().copied().collect::<Vec<_>>().repeat(2);
         let mask = vec![1.0; 2 * FRAMES];
         let all = EstimateLosses { velocity: 1.0, acceleration: 1.0, differences: [1.0; 3] };
-        let loss = loss_of(&all, Prediction::Sample, [0, 9], [&motion, &motion, &motion], &mask);
+        let loss =
+            loss_of(BODY, &all, Prediction::Sample, [0, 9], [&motion, &motion, &motion], &mask);
         // Positions are rounded to single precision, and accelerations differ by thirty times that.
         assert!(loss < 1e-6, "{loss}");
     }

@@ -17,7 +17,8 @@ use crate::autodiff::{
 };
 use crate::diffusion::{Schedule, Spacing, steps};
 use crate::model::{Graph, Parameter};
-use crate::motion::{Channel, MOTION_DIM};
+use crate::motion::vector::norm;
+use crate::motion::{Columns, Layout, MOTION_DIM};
 use crate::units::FPS;
 use crate::weights::{Archive, Section};
 
@@ -160,7 +161,7 @@ impl FinetuneLearner {
         batch: &Batch,
     ) -> Result<SampledMotion<Tensor<f32>>, TrainingError> {
         let Self { pipeline, schedule, config: c, .. } = self;
-        // The sample begins with the same noise that was added for the prediction, turned round: independent
+        // The sample begins with the same noise that was added for the prediction, in reverse: independent
         // of where a network that sees only the other went, and no further draw.
         let noise: Vec<f32> = batch.noise.iter().rev().copied().collect();
         let from = c.first_step(schedule.len());
@@ -169,7 +170,7 @@ impl FinetuneLearner {
         let decoded = pipeline.decoder.forward(g, &latent)?;
         let normalizer = self.windows.normalizer();
         let found = reconstruction(g, normalizer, &decoded, &batch.motion, &batch.mask)?;
-        let temporal = temporal_losses(g, &c.temporal, &decoded, &batch.mask)?;
+        let temporal = temporal_losses(g, normalizer.layout(), &c.temporal, &decoded, &batch.mask)?;
         let (position, quaternion) = (found.position, found.quaternion);
         Ok(SampledMotion { position, quaternion, temporal, decoded })
     }
@@ -269,10 +270,6 @@ fn named(
     Losses { total, parts }
 }
 
-fn norm(x: &[f32]) -> f64 {
-    x.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>().sqrt()
-}
-
 /// Mean |v − f Δp| and |a − f Δv|, and whether every turn keeps |q · q'| above a target.
 struct Coherence {
     velocity_m_s: f64,
@@ -281,14 +278,14 @@ struct Coherence {
 }
 
 impl Coherence {
-    /// Measures the first `n` frames of one motion.
-    fn of(frames: &[f32], n: usize, target_dot: f64) -> Self {
-        let at = |t: usize, i: usize| f64::from(frames[t * MOTION_DIM + i]);
-        let [p, v, a, q] =
-            [Channel::Position, Channel::Velocity, Channel::Acceleration, Channel::Quaternion]
-                .map(|channel| channel.range().start);
+    /// Measures the first `n` frames of one motion; errors of what the layout lacks are 0.
+    fn of(layout: Layout, frames: &[f32], n: usize, target_dot: f64) -> Self {
+        let at = |t: usize, i: usize| f64::from(frames[t * layout.width() + i]);
+        let body = layout.body();
         let n_pairs = n.saturating_sub(1).max(1);
-        let error = |of: usize, derivative: usize| {
+        let error = |of: Option<Columns>, derivative: Option<Columns>| {
+            let (Some(of), Some(derivative)) = (of, derivative) else { return 0.0 };
+            let (of, derivative) = (of.first, derivative.first);
             let differences = (0..n.saturating_sub(1)).flat_map(|t| {
                 (0..3).map(move |i| {
                     (at(t, derivative + i) - FPS * (at(t + 1, of + i) - at(t, of + i))).abs()
@@ -297,10 +294,14 @@ impl Coherence {
             differences.sum::<f64>() / (3 * n_pairs) as f64
         };
         let is_smooth = (0..n.saturating_sub(1)).all(|t| {
-            let dot: f64 = (0..4).map(|i| at(t, q + i) * at(t + 1, q + i)).sum();
+            let dot: f64 = body.orientation.range().map(|i| at(t, i) * at(t + 1, i)).sum();
             dot.abs() >= target_dot
         });
-        Self { velocity_m_s: error(p, v), acceleration_m_s2: error(v, a), is_smooth }
+        Self {
+            velocity_m_s: error(Some(body.position), body.velocity),
+            acceleration_m_s2: error(body.velocity, body.acceleration),
+            is_smooth,
+        }
     }
 }
 
@@ -349,11 +350,12 @@ impl Learner for FinetuneLearner {
             let decoded = self.threads.run(|| self.generated(&batch))?;
             let motions = decoded.data().chunks_exact(batch.n_frames * MOTION_DIM);
             let target = self.config.temporal.target_quaternion_dot;
+            let layout = self.windows.normalizer().layout();
             let measured: Vec<_> = motions
                 .zip(batch.mask.chunks_exact(batch.n_frames))
                 .map(|(motion, mask)| {
                     let n_frames = mask.iter().filter(|&&w| w > 0.0).count();
-                    Coherence::of(motion, n_frames, target)
+                    Coherence::of(layout, motion, n_frames, target)
                 })
                 .collect();
             let mut real = batch.motion.clone();
@@ -364,7 +366,9 @@ impl Learner for FinetuneLearner {
             let speed = |frames: &[f32]| -> f64 {
                 let rows = frames.chunks_exact(MOTION_DIM).zip(&batch.mask);
                 let counted = rows.filter(|(_, w)| **w > 0.0);
-                counted.map(|(row, _)| norm(&row[Channel::Velocity.range()])).sum()
+                let Some(velocity) = layout.body().velocity else { return 0.0 };
+                let at = |row: &[f32], i: usize| f64::from(row[velocity.first + i]);
+                counted.map(|(row, _)| norm(std::array::from_fn(|i| at(row, i)))).sum()
             };
             let speed_ratio = speed(decoded.data()) / speed(&real).max(f64::MIN_POSITIVE);
             let mean = |value: &dyn Fn(&Coherence) -> f64| {

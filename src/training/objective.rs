@@ -8,7 +8,7 @@ use crate::autodiff::op::loss::{Cost, Loss};
 use crate::autodiff::{Element, Interpreter, Tensor};
 use crate::diffusion::{LossType, Schedule, min_snr_weights};
 use crate::model::{Graph, Result};
-use crate::motion::{Channel, MOTION_DIM, Normalizer};
+use crate::motion::{ColumnRole, Columns, Layout, Normalizer};
 
 use super::estimate::EstimateLosses;
 
@@ -32,7 +32,7 @@ pub struct Objective {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ChannelWeights {
-    /// Of each of the eight style channels, which change slowly and are a third of all.
+    /// Of each of the free channels, the eight of style, which change slowly and are a third of all.
     pub style: f64,
     /// Of vertical position, velocity and acceleration, by which dancers follow the beat.
     pub vertical: f64,
@@ -45,15 +45,17 @@ impl Default for ChannelWeights {
 }
 
 impl ChannelWeights {
-    /// Returns the weight of each channel; their mean is 1.
-    pub fn weights(&self) -> [f64; MOTION_DIM] {
-        let mut weights = [1.0; MOTION_DIM];
-        for channel in [Channel::Position, Channel::Velocity, Channel::Acceleration] {
-            weights[channel.range().start + 1] = self.vertical;
+    /// Returns the weight of each column of a layout; their mean is 1.
+    pub fn weights(&self, layout: Layout) -> Vec<f64> {
+        let mut weights = vec![1.0; layout.width()];
+        for columns in layout.spatial().filter(|columns| !layout.is_axial(*columns)) {
+            weights[columns.first + 1] = self.vertical;
         }
-        weights[Channel::Style.range()].fill(self.style);
-        let mean = weights.iter().sum::<f64>() / MOTION_DIM as f64;
-        weights.map(|weight| weight / mean)
+        for columns in layout.with_role(ColumnRole::Free) {
+            weights[columns.range()].fill(self.style);
+        }
+        let mean = weights.iter().sum::<f64>() / layout.width() as f64;
+        weights.into_iter().map(|weight| weight / mean).collect()
     }
 }
 
@@ -74,6 +76,7 @@ impl Objective {
     fn weighed<I: Interpreter>(
         &self,
         g: &mut I,
+        layout: Layout,
         both: [&Tensor<I::Element>; 2],
     ) -> Result<[Tensor<I::Element>; 2]> {
         let [prediction, target] = both;
@@ -84,8 +87,9 @@ impl Objective {
             LossType::L1 => weight,
             LossType::Mse | LossType::Huber => weight.sqrt(),
         };
-        let factors = self.channels.weights().map(|w| I::Element::from_f64(factor(w)));
-        let factors = g.constant(&[MOTION_DIM], &factors);
+        let weights = self.channels.weights(layout).into_iter();
+        let factors: Vec<_> = weights.map(|w| I::Element::from_f64(factor(w))).collect();
+        let factors = g.constant(&[factors.len()], &factors);
         let mut times = |x: &Tensor<_>| g.apply(Binary::new(Pair::Multiply), &[x, &factors]);
         Ok([times(prediction)?, times(target)?])
     }
@@ -102,17 +106,18 @@ impl Objective {
     /// the cost is |d|).
     ///
     /// # Shapes
-    /// - `prediction`, `target`: \[batch, frames, 25\]; `mask`: \[batch, frames\]; `t`: \[batch\]
+    /// - `prediction`, `target`: \[batch, frames, columns\]; `mask`: \[batch, frames\]; `t`: \[batch\]
     pub fn loss<I: Interpreter>(
         &self,
         g: &mut I,
+        layout: Layout,
         schedule: &Schedule,
         t: &[usize],
         [prediction, target]: [&Tensor<I::Element>; 2],
         mask: &[f32],
     ) -> Result<Tensor<I::Element>> {
         let frames = prediction.shape()[1];
-        let [prediction, target] = &self.weighed(g, [prediction, target])?;
+        let [prediction, target] = &self.weighed(g, layout, [prediction, target])?;
         let Some(gamma) = self.min_snr_gamma else {
             let mask: Vec<_> = mask.iter().map(|&w| I::Element::from_f64(w.into())).collect();
             let mask = g.constant(&prediction.shape()[..2], &mask);
@@ -145,7 +150,7 @@ pub struct Reconstruction<T> {
 /// Compares decoded motion with motion, frame by frame where they count.
 ///
 /// # Shapes
-/// - `decoded`: \[batch, frames, 25\] in metres and the like; `motion`: the same, normalised;
+/// - `decoded`: \[batch, frames, columns\] of the normalizer's layout in metres and the like; `motion`: the same, normalised;
 ///   `mask`: \[batch, frames\]
 pub fn reconstruction<I: Interpreter>(
     g: &mut I,
@@ -161,9 +166,11 @@ pub fn reconstruction<I: Interpreter>(
     let squared =
         |g: &mut I, x: &Tensor<_>, y: &Tensor<_>| g.apply(Loss::new(Cost::Squared), &[x, y, &mask]);
     // The same turn has two quaternions: the one on the side of the decoded one is meant.
-    let q = Channel::Quaternion.range();
+    let layout = normalizer.layout();
+    let (body, width) = (layout.body(), layout.width());
+    let q = body.orientation.range();
     let mut wanted = motion.to_vec();
-    let frames = decoded.data().chunks_exact(MOTION_DIM).zip(wanted.chunks_exact_mut(MOTION_DIM));
+    let frames = decoded.data().chunks_exact(width).zip(wanted.chunks_exact_mut(width));
     for (decoded, wanted) in frames {
         let scaled = |i: usize| wanted[i] * normalizer.scale[i] + normalizer.centre[i];
         let dot: f64 = q.clone().map(|i| decoded[i].to_f64() * f64::from(scaled(i))).sum();
@@ -178,29 +185,29 @@ pub fn reconstruction<I: Interpreter>(
         let values: Vec<_> = values.iter().map(|&x| element(x)).collect();
         g.constant(&[values.len()], &values)
     };
-    let (centre, scale) = (constant(g, &normalizer.centre), normalizer.scale.map(|s| 1.0 / s));
-    let scale = constant(g, &scale);
+    let scale: Vec<f32> = normalizer.scale.iter().map(|s| 1.0 / s).collect();
+    let (centre, scale) = (constant(g, &normalizer.centre), constant(g, &scale));
     let z = g.apply(Binary::new(Pair::Subtract), &[decoded, &centre])?;
     let z = g.apply(Binary::new(Pair::Multiply), &[&z, &scale])?;
     let values: Vec<_> = wanted.iter().map(|&x| element(x)).collect();
     let wanted_z = g.constant(decoded.shape(), &values);
     let all = squared(g, &z, &wanted_z)?;
 
-    let group = |g: &mut I, channel: Channel| -> Result<[Tensor<I::Element>; 2]> {
-        let got = g.channels(decoded, channel.range())?;
+    let group = |g: &mut I, columns: Columns| -> Result<[Tensor<I::Element>; 2]> {
+        let got = g.channels(decoded, columns.range())?;
         let values: Vec<_> = wanted
-            .chunks_exact(MOTION_DIM)
+            .chunks_exact(width)
             .flat_map(|row| {
-                channel.range().map(|i| row[i] * normalizer.scale[i] + normalizer.centre[i])
+                columns.range().map(|i| row[i] * normalizer.scale[i] + normalizer.centre[i])
             })
             .map(element)
             .collect();
         let wanted = g.constant(got.shape(), &values);
         Ok([got, wanted])
     };
-    let [p, wanted_p] = group(g, Channel::Position)?;
+    let [p, wanted_p] = group(g, body.position)?;
     let position = squared(g, &p, &wanted_p)?;
-    let [q, wanted_q] = group(g, Channel::Quaternion)?;
+    let [q, wanted_q] = group(g, body.orientation)?;
     let quaternion = squared(g, &q, &wanted_q)?;
     Ok(Reconstruction { position, quaternion, all })
 }
@@ -211,6 +218,8 @@ mod tests {
     use crate::autodiff::{Arena, Eager, Parameters};
     use crate::diffusion::DiffusionConfig;
     use crate::model::ParameterList;
+    use crate::motion::layout::tests::ROOT;
+    use crate::motion::{BODY, MOTION_DIM};
 
     fn parameters() -> Parameters<f64> {
         Parameters::new(ParameterList::default(), 0)
@@ -227,7 +236,7 @@ mod tests {
         let mask = [1.0, 1.0, 0.0, 1.0, 0.0, 0.0];
         let t = [20, 700];
         let loss_of = |g: &mut Eager<f64>, objective: &Objective| {
-            let loss = objective.loss(g, &schedule, &t, [&prediction, &target], &mask);
+            let loss = objective.loss(g, BODY, &schedule, &t, [&prediction, &target], &mask);
             loss.expect("shapes fit").scalar()
         };
         // Squares of 0 to 3 and of 6 and 7, over six numbers.
@@ -238,6 +247,56 @@ mod tests {
         let w = t.map(|t| schedule.snr(t).min(5.0) / schedule.snr(t));
         let wanted = (w[0] * 14.0 + w[1] * 85.0) / 6.0;
         assert!((loss_of(&mut g, &weighted) - wanted).abs() < 1e-12 * wanted);
+    }
+
+    #[test]
+    fn columns_weigh_by_their_roles() {
+        let weights = ChannelWeights { style: 0.5, vertical: 3.0 };
+        let (root, body) = (weights.weights(ROOT), weights.weights(BODY));
+        // Two of 13 weigh 3; three of 25 do, and eight a half.
+        let (of_root, of_body) = (17.0 / 13.0, 27.0 / 25.0);
+        for (i, found) in root.into_iter().enumerate() {
+            let weight = if [1, 4].contains(&i) { 3.0 } else { 1.0 };
+            assert!((found - weight / of_root).abs() < 1e-15, "{i}: {found}");
+        }
+        for (i, found) in body.into_iter().enumerate() {
+            let weight = match i {
+                1 | 4 | 7 => 3.0,
+                17.. => 0.5,
+                _ => 1.0,
+            };
+            assert!((found - weight / of_body).abs() < 1e-15, "{i}: {found}");
+        }
+    }
+
+    #[test]
+    fn the_root_alone_is_weighed_and_compared() {
+        let schedule = Schedule::new(&DiffusionConfig::default()).expect("a schedule");
+        let (parameters, arena) = (parameters(), Arena::default());
+        let mut g = Eager::new(&parameters, &arena);
+        let objective = Objective {
+            channels: ChannelWeights { style: 1.0, vertical: 2.0 },
+            ..Objective::default()
+        };
+        let says: Vec<f64> = (0..26).map(|i| f64::from(i) / 8.0).collect();
+        let (says_x, zero) = (g.input(&[1, 2, 13], &says), g.input(&[1, 2, 13], &[0.0; 26]));
+        let loss = objective.loss(&mut g, ROOT, &schedule, &[20], [&says_x, &zero], &[1.0, 1.0]);
+        let weight = |i: usize| if [1, 4].contains(&(i % 13)) { 26.0 / 15.0 } else { 13.0 / 15.0 };
+        let wanted = (0..26).map(|i| weight(i) * says[i].powi(2)).sum::<f64>() / 26.0;
+        assert!((loss.expect("shapes fit").scalar() - wanted).abs() < 1e-12 * wanted);
+
+        // Two frames, the second 0.3 m off and with the other sign of its quaternion.
+        let mut motion = [0.0_f32; 26];
+        (motion[6], motion[13 + 6]) = (1.0, 1.0);
+        let mut decoded = motion.map(f64::from);
+        (decoded[13], decoded[13 + 6]) = (0.3, -1.0);
+        let x = g.input(&[1, 2, 13], &decoded);
+        let normalizer = Normalizer::identity_of(ROOT);
+        let found = reconstruction(&mut g, &normalizer, &x, &motion, &[1.0, 1.0]);
+        let found = found.expect("shapes fit");
+        assert!((found.position.scalar() - 0.09 / 6.0).abs() < 1e-12);
+        assert_eq!(found.quaternion.scalar(), 0.0);
+        assert!((found.all.scalar() - 0.09 / 26.0).abs() < 1e-12);
     }
 
     #[test]

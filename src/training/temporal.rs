@@ -1,5 +1,7 @@
 //! Losses that hold motion together in time: what it says of its derivatives must be their differences.
 
+use std::ops::Range;
+
 use serde::{Deserialize, Serialize};
 
 use crate::autodiff::op::binary::{Binary, Pair};
@@ -9,8 +11,8 @@ use crate::autodiff::op::loss::{Cost, Loss};
 use crate::autodiff::op::reduce::{Over, Reduce};
 use crate::autodiff::{Element, Interpreter, Tensor};
 use crate::model::{Activation, Graph, Result};
-use crate::motion::Channel;
 use crate::motion::phase::WRAP_BARS;
+use crate::motion::{ColumnRole, Layout};
 use crate::units::FPS;
 
 /// Weights and targets of the losses; the defaults are the reference's \[7.2\].
@@ -109,10 +111,13 @@ impl<T> TemporalLosses<T> {
 ///   unless it is that of a new bar. (The reference's relu(−Δφ − 0.5) punishes the new bar instead.)
 /// - steps: w ⟨max(|Δp| − longest, 0)⟩
 ///
+/// Those of columns that the layout lacks are 0.
+///
 /// # Shapes
-/// - `motion`: \[batch, frames, 25\], at least two frames; `mask`: \[batch, frames\], 1 or 0
+/// - `motion`: \[batch, frames, columns\], at least two frames; `mask`: \[batch, frames\], 1 or 0
 pub fn temporal_losses<I: Interpreter>(
     g: &mut I,
+    layout: Layout,
     config: &TemporalConfig,
     motion: &Tensor<I::Element>,
     mask: &[f32],
@@ -131,9 +136,12 @@ pub fn temporal_losses<I: Interpreter>(
     let tail = g.apply(TakeFrames::inner(1, 0), &[motion])?;
     let difference = g.apply(Binary::new(Pair::Subtract), &[&tail, &head])?;
 
-    let [p, v, a] =
-        [Channel::Position, Channel::Velocity, Channel::Acceleration].map(Channel::range);
-    let derivative = |g: &mut I, range: std::ops::Range<usize>| {
+    let body = layout.body();
+    let [p, q] = [body.position, body.orientation].map(|columns| columns.range());
+    let [v, a] =
+        [body.velocity, body.acceleration].map(|found| found.map(|columns| columns.range()));
+    let none = g.constant(&[], &[I::Element::ZERO]);
+    let derivative = |g: &mut I, range: Range<usize>| {
         let change = g.channels(&difference, range)?;
         g.scale(&change, FPS)
     };
@@ -141,18 +149,29 @@ pub fn temporal_losses<I: Interpreter>(
         let loss = g.apply(Loss::new(Cost::Squared), &[x, y, &pairs])?;
         g.scale(&loss, factor)
     };
-    let (speed, velocity) = (derivative(g, p.clone())?, g.channels(&head, v.clone())?);
+    let coherence = |g: &mut I,
+                     of: Option<Range<usize>>,
+                     said: Option<Range<usize>>,
+                     factor: f64|
+     -> Result<Tensor<I::Element>> {
+        let (Some(of), Some(said)) = (of, said) else { return Ok(none.clone()) };
+        let (change, said) = (derivative(g, of)?, g.channels(&head, said)?);
+        squared(g, &said, &change, factor)
+    };
     let factor = c.velocity_weight / c.target_velocity.powi(2);
-    let velocity_coherence = squared(g, &velocity, &speed, factor)?;
-    let (change, acceleration) = (derivative(g, v)?, g.channels(&head, a.clone())?);
+    let velocity_coherence = coherence(g, Some(p.clone()), v.clone(), factor)?;
     let factor = c.acceleration_weight / c.target_acceleration.powi(2);
-    let acceleration_coherence = squared(g, &acceleration, &change, factor)?;
-    let jerk = derivative(g, a)?;
-    let still = g.scale(&jerk, 0.0)?;
-    // The mean over three coordinates, three times, is that of the squared length.
-    let jerk = squared(g, &jerk, &still, 3.0 * c.jerk_weight / c.target_jerk.powi(2))?;
+    let acceleration_coherence = coherence(g, v, a.clone(), factor)?;
+    let jerk = match a {
+        None => none.clone(),
+        Some(a) => {
+            let jerk = derivative(g, a)?;
+            let still = g.scale(&jerk, 0.0)?;
+            // The mean over three coordinates, three times, is that of the squared length.
+            squared(g, &jerk, &still, 3.0 * c.jerk_weight / c.target_jerk.powi(2))?
+        }
+    };
 
-    let q = Channel::Quaternion.range();
     let (q, q_next) = (g.channels(&head, q.clone())?, g.channels(&tail, q)?);
     let product = g.mul(&q, &q_next)?;
     let dot = g.apply(Reduce::sum(Over::Axis(2)), &[&product])?;
@@ -160,17 +179,22 @@ pub fn temporal_losses<I: Interpreter>(
     let quaternion_delta = hinge(g, &dot, -1.0, c.target_quaternion_dot, &pairs)?;
     let quaternion_delta = g.scale(&quaternion_delta, c.quaternion_delta_weight)?;
 
-    let change = g.channels(&difference, Channel::Phase.range())?;
-    let is_fall: Vec<I::Element> = change
-        .data()
-        .iter()
-        .map(|d| if d.to_f64() < -WRAP_BARS { I::Element::ZERO } else { I::Element::ONE })
-        .collect();
-    let is_fall = g.constant(change.shape(), &is_fall);
-    let change = g.mul(&change, &is_fall)?;
-    let phase_monotonic = hinge(g, &change, -1.0, 0.0, &pairs)?;
-    let per_motion = n_pairs / batch.max(1) as f64;
-    let phase_monotonic = g.scale(&phase_monotonic, c.phase_weight * per_motion)?;
+    let phase_monotonic = match layout.with_role(ColumnRole::Phase).next() {
+        None => none,
+        Some(phase) => {
+            let change = g.channels(&difference, phase.range())?;
+            let is_fall: Vec<I::Element> = change
+                .data()
+                .iter()
+                .map(|d| if d.to_f64() < -WRAP_BARS { I::Element::ZERO } else { I::Element::ONE })
+                .collect();
+            let is_fall = g.constant(change.shape(), &is_fall);
+            let change = g.mul(&change, &is_fall)?;
+            let falls = hinge(g, &change, -1.0, 0.0, &pairs)?;
+            let per_motion = n_pairs / batch.max(1) as f64;
+            g.scale(&falls, c.phase_weight * per_motion)?
+        }
+    };
 
     let step = g.channels(&difference, p)?;
     let step = g.apply(Map::new(Function::Abs), &[&step])?;
@@ -205,7 +229,8 @@ mod tests {
     use super::*;
     use crate::autodiff::{Arena, Eager, Parameters};
     use crate::model::ParameterList;
-    use crate::motion::MOTION_DIM;
+    use crate::motion::layout::tests::ROOT;
+    use crate::motion::{BODY, MOTION_DIM};
 
     /// The definitions, written out.
     fn by_definition(motion: &[f64], frames: usize, mask: &[f32], c: &TemporalConfig) -> [f64; 6] {
@@ -262,7 +287,8 @@ mod tests {
         let losses = |motion: &[f64]| {
             let mut g = Eager::new(&parameters, &arena);
             let motion = g.input(&[batch, frames, MOTION_DIM], motion);
-            let losses = temporal_losses(&mut g, &config, &motion, &mask).expect("shapes fit");
+            let losses =
+                temporal_losses(&mut g, BODY, &config, &motion, &mask).expect("shapes fit");
             losses.all().map(Tensor::scalar)
         };
         for (i, (got, wanted)) in losses(&motion).into_iter().zip(wanted).enumerate() {
@@ -275,5 +301,35 @@ mod tests {
             motion[t * MOTION_DIM..(t + 1) * MOTION_DIM].fill(1e3);
         }
         assert_eq!(losses(&motion), before);
+    }
+
+    #[test]
+    fn the_root_alone_has_the_losses_of_its_columns() {
+        let (frames, width) = (6, ROOT.width());
+        let motion: Vec<f64> = (0..2 * frames * width)
+            .map(|i| ((i * 7919 + 13) % 1009) as f64 / 504.5 - 1.0)
+            .collect();
+        let config = TemporalConfig::reference();
+        let parameters = Parameters::<f64>::new(ParameterList::default(), 0);
+        let arena = Arena::default();
+        let mut g = Eager::new(&parameters, &arena);
+        let x = g.input(&[2, frames, width], &motion);
+        let mask = vec![1.0; 2 * frames];
+        let found = temporal_losses(&mut g, ROOT, &config, &x, &mask).expect("shapes fit");
+        let (mut velocity, mut delta, mut steps) = (0.0, 0.0, 0.0);
+        for (b, t) in (0..2).flat_map(|b| (0..frames - 1).map(move |t| (b, t))) {
+            let at = |t: usize, i: usize| motion[(b * frames + t) * width + i];
+            for i in 0..3 {
+                let step = at(t + 1, i) - at(t, i);
+                velocity += (at(t, 3 + i) - 30.0 * step).powi(2) / 30.0;
+                steps += (step.abs() - 0.5).max(0.0) / 30.0;
+            }
+            let dot: f64 = (6..10).map(|i| at(t, i) * at(t + 1, i)).sum();
+            delta += (0.95 - dot.abs()).max(0.0) / 10.0;
+        }
+        let wanted = [10.0 * velocity / 25.0, 0.0, 0.0, 2.0 * delta, 0.0, steps];
+        for (got, wanted) in found.all().map(Tensor::scalar).into_iter().zip(wanted) {
+            assert!((got - wanted).abs() <= 1e-12 * wanted, "{got}, {wanted}");
+        }
     }
 }

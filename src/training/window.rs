@@ -278,8 +278,9 @@ impl Windows {
         let first = (crop * (phrase.n_frames - n + 1) as f64) as usize;
         let mut dancers = self.dancers(phrase, first, n)?;
         let mut audio = self.dataset.features(phrase, first, n)?;
+        let layout = self.scales.motion.layout();
         let stretched: Result<Vec<_>, _> =
-            dancers.iter().map(|motion| stretch_motion(motion.view(), rate)).collect();
+            dancers.iter().map(|motion| stretch_motion(layout, motion.view(), rate)).collect();
         if is_stretched && let Ok(stretched) = stretched {
             let n_stretched = stretched.iter().map(|motion| motion.nrows()).min().unwrap_or(n);
             let n = n_stretched.min(self.n_frames).min(stretched_frames(n, rate));
@@ -289,10 +290,10 @@ impl Windows {
         place(&mut dancers);
         for motion in &mut dancers {
             if mirror && side < 0.5 {
-                mirror_x(motion.view_mut());
+                mirror_x(layout, motion.view_mut());
             }
             if yaw_deg > 0.0 {
-                rotate_yaw(motion, (2.0 * turn - 1.0) * yaw_deg.to_radians());
+                rotate_yaw(layout, motion, (2.0 * turn - 1.0) * yaw_deg.to_radians());
             }
         }
         self.scales.features.apply(audio.view_mut());

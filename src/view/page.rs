@@ -2,18 +2,18 @@
 
 use std::fmt::Write as _;
 
+use askama::Template;
 use base64::Engine as _;
-use base64::engine::general_purpose::STANDARD;
+use base64::display::Base64Display;
+use base64::engine::general_purpose::{GeneralPurpose, STANDARD};
 use ndarray::Array2;
 use serde::Serialize;
 
-use super::{Audio, View, ViewSample};
+use super::View;
 use crate::motion::group::DANCER_COLORS;
 use crate::motion::{CHANNEL_NAMES, MOTION_DIM};
 use crate::units::FPS;
 
-/// The page, with slots such as `{{title}}`.
-const TEMPLATE: &str = include_str!("page.html");
 const STYLE: &str = include_str!("page.css");
 /// Parts of one script, in the order in which they build on each other.
 const SCRIPTS: [&str; 5] = [
@@ -25,60 +25,51 @@ const SCRIPTS: [&str; 5] = [
 ];
 /// The part that a page with a group has after them.
 const GROUP_SCRIPT: &str = include_str!("group.js");
+/// About how long the page is without scripts, style and data.
+const OWN_BYTES: usize = 20 << 10;
+
+/// The page. Every value is escaped but for those that the template marks as safe: files of this program, base64, and
+/// JSON that [`inert`] went through.
+#[derive(Template)]
+#[template(path = "view/page.html")]
+struct Page<'a> {
+    title: &'a str,
+    style: &'static str,
+    audio: Option<EmbeddedAudio<'a>>,
+    data: String,
+    script: String,
+}
+
+struct EmbeddedAudio<'a> {
+    mime: &'a str,
+    base64: Base64Display<'a, 'static, GeneralPurpose>,
+}
 
 /// Returns the page as HTML. The same view gives the same text.
 ///
 /// Whatever comes from outside is text there: no title, name or fact can become markup or script.
 pub fn page(view: &View) -> String {
-    let mut out = String::with_capacity(size_bytes(view));
-    for (i, piece) in TEMPLATE.split("{{").enumerate() {
-        let slot = if i == 0 { None } else { piece.split_once("}}") };
-        let Some((name, rest)) = slot else {
-            out.push_str(piece);
-            continue;
-        };
-        match name {
-            "title" => write_escaped(&mut out, &view.title),
-            "style" => out.push_str(STYLE),
-            "audio" => write_audio(&mut out, view.audio.as_ref()),
-            "data" => out.push_str(&data(view)),
-            "script" => {
-                SCRIPTS.iter().for_each(|script| out.push_str(script));
-                if has_group(view) {
-                    out.push_str(GROUP_SCRIPT);
-                }
-            }
-            _ => {}
-        }
-        out.push_str(rest);
-    }
+    let group_script = if has_group(view) { GROUP_SCRIPT } else { "" };
+    let page = Page {
+        title: &view.title,
+        style: STYLE,
+        audio: view.audio.as_ref().map(|audio| EmbeddedAudio {
+            mime: &audio.mime,
+            base64: Base64Display::new(&audio.bytes, &STANDARD),
+        }),
+        data: data(view),
+        script: SCRIPTS.concat() + group_script,
+    };
+    let audio_bytes = view.audio.as_ref().map_or(0, |audio| audio.bytes.len().div_ceil(3) * 4);
+    let n_bytes = audio_bytes + page.data.len() + page.script.len() + STYLE.len() + OWN_BYTES;
+    let mut out = String::with_capacity(n_bytes);
+    page.render_into(&mut out).expect("invariant: a string takes all that is written to it");
+    out.push('\n');
     out
 }
 
 fn has_group(view: &View) -> bool {
     view.samples.iter().any(|sample| !sample.further_dancers.is_empty())
-}
-
-/// Returns about how long the page will be.
-fn size_bytes(view: &View) -> usize {
-    let in_base64 = |n_bytes: usize| n_bytes.div_ceil(3) * 4;
-    let motion_bytes = |sample: &ViewSample| {
-        let dancers = [&sample.frames].into_iter().chain(&sample.further_dancers);
-        dancers.map(|frames| in_base64(size_of::<f32>() * frames.len())).sum::<usize>()
-    };
-    let motions: usize = view.samples.iter().map(motion_bytes).sum();
-    let audio = view.audio.as_ref().map_or(0, |audio| in_base64(audio.bytes.len()));
-    let own: usize = SCRIPTS.iter().map(|script| script.len()).sum();
-    motions + audio + own + STYLE.len() + TEMPLATE.len() + (16 << 10)
-}
-
-fn write_audio(out: &mut String, audio: Option<&Audio>) {
-    let Some(Audio { mime, bytes }) = audio else { return };
-    out.push_str("<audio id=\"audio\" preload=\"auto\" src=\"data:");
-    write_escaped(out, mime);
-    out.push_str(";base64,");
-    STANDARD.encode_string(bytes, out);
-    out.push_str("\"></audio>\n");
 }
 
 /// The data that the script reads.
@@ -148,23 +139,9 @@ fn inert(json: &str) -> String {
     out
 }
 
-/// Writes text between tags or in a quoted attribute; control characters become replacement characters.
-fn write_escaped(out: &mut String, text: &str) {
-    for c in text.chars() {
-        match c {
-            '<' => out.push_str("&lt;"),
-            '>' => out.push_str("&gt;"),
-            '&' => out.push_str("&amp;"),
-            '"' => out.push_str("&quot;"),
-            '\'' => out.push_str("&#39;"),
-            c if c.is_control() => out.push(char::REPLACEMENT_CHARACTER),
-            c => out.push(c),
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use super::super::{Audio, ViewSample};
     use super::*;
     use ndarray::Array3;
     use proptest::prelude::*;
@@ -196,12 +173,7 @@ mod tests {
     #[test]
     fn every_slot_is_filled_and_every_script_is_there() {
         let page = page(&view("A walk", vec![sample("0", 3)]));
-        let slots: Vec<&str> = TEMPLATE
-            .split("{{")
-            .skip(1)
-            .map(|piece| piece.split_once("}}").expect("an end of the slot").0)
-            .collect();
-        assert_eq!(slots, ["title", "style", "title", "audio", "data", "script"]);
+        assert!(!page.contains("{{") && !page.contains("{%") && page.ends_with("\n</html>\n"));
         assert!(page.starts_with("<!DOCTYPE html>\n<html lang=\"en\">\n"));
         assert!(page.contains("<title>A walk</title>") && page.contains("<h1>A walk</h1>"));
         for part in SCRIPTS {

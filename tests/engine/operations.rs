@@ -4,10 +4,10 @@ use std::collections::BTreeSet;
 
 use motiongen::autodiff::op::loss::{Cost, Loss};
 use motiongen::autodiff::op::softmax::CrossEntropy;
-use motiongen::autodiff::{Arena, Gradients, Interpreter, Parameters, Tape, Tensor};
+use motiongen::autodiff::{Arena, Eager, Gradients, Interpreter, Parameters, Tape, Tensor};
 use motiongen::model::{
-    Activation, Attention, Channels, Convolution, Graph, GroupNormalization, Init, ParameterId,
-    ParameterList, Result, Role, Scope,
+    Activation, Attention, Channels, Convolution, Graph, GroupNormalization, Init, Outline,
+    ParameterId, ParameterList, Result, Role, Scope,
 };
 
 use super::golden::{Golden, assert_near};
@@ -104,6 +104,63 @@ fn attention_is_pytorchs() {
     check("attention_causal", &["query", "key", "value"], &[], |g, x, _| {
         g.attention(attention(x, None))
     });
+}
+
+/// Attention of four queries over five keys of their own, with a mask of the keys.
+fn attend<G: Graph>(g: &mut G, x: [&G::Tensor; 4], causal: bool) -> G::Tensor {
+    let [query, key, value] = [0, 1, 2].map(|i| Channels { tensor: x[i], first: 0 });
+    let key_mask = Some(x[3]);
+    g.attention(Attention { query, key, value, width: 6, heads: 2, key_mask, causal })
+        .expect("shapes fit")
+}
+
+#[test]
+fn a_query_without_keys_gets_zeros_and_gives_no_gradient() {
+    let shapes = [&[2, 4, 6][..], &[2, 5, 6], &[2, 5, 6]];
+    let numbers =
+        |n: usize, k: usize| (0..n).map(|i| ((i * 37 + k * 11) % 23) as f64 / 9.0 - 1.2).collect();
+    let values: [Vec<f64>; 3] =
+        std::array::from_fn(|k| numbers(shapes[k].iter().product::<usize>(), k));
+    // The first sample has no key at all, the second none before its third.
+    let mask = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0];
+    let parameters = Parameters::<f64>::new(ParameterList::default(), 0);
+    let arena = Arena::default();
+    for causal in [false, true] {
+        // Queries of the second sample that see no key.
+        let n_blind = if causal { 2 } else { 0 };
+        let mut tape = Tape::new(&parameters, &arena, None);
+        let x = [0, 1, 2].map(|k| tape.input(shapes[k], &values[k]));
+        let of_keys = tape.constant(&[2, 5], &mask);
+        let y = attend(&mut tape, [&x[0], &x[1], &x[2], &of_keys], causal);
+        let is_zero = |row: &[f64]| row.iter().all(|x| *x == 0.0);
+        let rows: Vec<bool> = y.data().chunks(6).map(is_zero).collect();
+        let wanted: Vec<bool> = (0..8).map(|row| row < 4 + n_blind).collect();
+        assert_eq!(rows, wanted, "tape, causal {causal}");
+
+        let ones = tape.constant(y.shape(), &vec![1.0; y.len()]);
+        let shown = y.clone();
+        let found = tape.backward_from(y, ones, &mut Gradients::new(&parameters)).expect("finite");
+        let gradients = x.each_ref().map(|x| found.of(x).expect("a gradient").data().to_vec());
+        assert!(is_zero(&gradients[0][..(4 + n_blind) * 6]), "of queries, causal {causal}");
+        for gradient in &gradients[1..] {
+            // Keys of the first sample, and the masked ones of the second.
+            assert!(is_zero(&gradient[..7 * 6]), "of keys and values, causal {causal}");
+        }
+        assert!(!is_zero(&gradients[2][7 * 6..]));
+
+        let mut eager = Eager::new(&parameters, &arena);
+        let x = [0, 1, 2].map(|k| eager.input(shapes[k], &values[k]));
+        let of_keys = eager.constant(&[2, 5], &mask);
+        let y = attend(&mut eager, [&x[0], &x[1], &x[2], &of_keys], causal);
+        assert_eq!(y.data(), shown.data(), "eager, causal {causal}");
+
+        // An outline has no numbers: a mask changes neither shapes nor costs.
+        let mut outline = Outline::new(parameters.list());
+        let x = shapes.map(|shape| outline.input(shape));
+        let of_keys = outline.input(&[2, 5]);
+        let shape = attend(&mut outline, [&x[0], &x[1], &x[2], &of_keys], causal);
+        assert_eq!(shape, shown.shape(), "outline, causal {causal}");
+    }
 }
 
 #[test]

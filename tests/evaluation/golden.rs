@@ -112,7 +112,6 @@ pub struct ControlRows {
     pub samples: Vec<SampleRow>,
     pub position: Vec<ControlRow>,
     pub rotation: Vec<ControlRow>,
-    pub spread_mm: f64,
 }
 
 #[derive(Deserialize)]

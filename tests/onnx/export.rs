@@ -292,8 +292,9 @@ fn the_documented_python_samples_what_motiongen_samples() {
         bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
     };
     let [noise, audio, clock, motion] = ["noise", "audio", "clock", "motion"].map(floats_of);
-    let times_s: Vec<f64> = (0..120).map(|t| f64::from(t) / 30.0).collect();
-    let phase = motiongen::motion::phase::bar_phase_at_tempo(&times_s, 124.0, 0.5, 4);
+    // 124 beats a minute in bars of four, a downbeat at 0.5 s.
+    let bars = |t: u32| (f64::from(t) / 30.0 - 0.5) * 124.0 / 60.0 / 4.0;
+    let phase: Vec<f64> = (0..120).map(|t| bars(t).rem_euclid(1.0)).collect();
     let own: Vec<f32> = motiongen::motion::clock(&phase, 4).into_iter().collect();
     // Of single precision.
     assert!(max_difference(&clock, &own) <= 1e-5, "{clock:?} {own:?}");

@@ -19,10 +19,23 @@ enum Call {
     Linear,
     LinearAfterConvolution,
     Convolution(Convolution),
-    GroupNorm { groups: usize, film: bool, activation: Activation },
-    LayerNorm { affine: bool },
+    GroupNorm {
+        groups: usize,
+        film: bool,
+        activation: Activation,
+    },
+    LayerNorm {
+        affine: bool,
+    },
     Activate(Activation),
-    SelfAttention { masked: bool, causal: bool },
+    SelfAttention {
+        masked: bool,
+        causal: bool,
+    },
+    /// A sample without keys, and queries that see none yet.
+    AttentionWithoutKeys {
+        causal: bool,
+    },
     CrossAttention,
     Add,
     AddChannels,
@@ -39,16 +52,25 @@ enum Call {
     Normalize,
     Rotary,
     HoldAndCrop,
-    ShiftFrames { shift: isize, spare: usize },
+    ShiftFrames {
+        shift: isize,
+        spare: usize,
+    },
     ShiftFramesOfConvolution,
     ReplaceEnds,
-    FilterFrames { taps: usize, mirror: Mirror },
+    FilterFrames {
+        taps: usize,
+        mirror: Mirror,
+    },
     FilterFramesOfConvolution,
     HeldMask,
     StridedMask,
     NearestRows,
     NearestRowsOfSamples,
-    Modulate { bias: f64, of_frames: bool },
+    Modulate {
+        bias: f64,
+        of_frames: bool,
+    },
 }
 
 /// Sizes: odd, and all different.
@@ -69,6 +91,8 @@ struct Given<T> {
     film: T,
     choice: T,
     mask: T,
+    /// Without the first keys of a sample, and without any of another.
+    few: T,
     index: T,
 }
 
@@ -136,6 +160,18 @@ fn run<G: Graph>(call: Call, g: &mut G, x: &Given<G::Tensor>, ids: &Ids) -> Resu
                 width: WIDTH,
                 heads: HEADS,
                 key_mask: masked.then_some(&x.mask),
+                causal,
+            })
+        }
+        Call::AttentionWithoutKeys { causal } => {
+            let part = |tensor| Channels { tensor, first: 0 };
+            g.attention(Attention {
+                query: part(&x.x),
+                key: part(&x.other),
+                value: part(&x.other),
+                width: WIDTH,
+                heads: HEADS,
+                key_mask: Some(&x.few),
                 causal,
             })
         }
@@ -238,7 +274,11 @@ fn values() -> BTreeMap<&'static str, (Vec<usize>, Vec<f32>)> {
     let mut mask = vec![1.0; BATCH * FRAMES];
     mask[FRAMES - 4..FRAMES].fill(0.0);
     mask[2 * FRAMES - 1] = 0.0;
+    let mut few = vec![1.0; BATCH * FRAMES];
+    few[..3].fill(0.0);
+    few[FRAMES..2 * FRAMES].fill(0.0);
     BTreeMap::from([
+        ("few", (vec![BATCH, FRAMES], few)),
         ("x", normal_array(&[BATCH, FRAMES, WIDTH], 1)),
         ("other", normal_array(&[BATCH, FRAMES, WIDTH], 2)),
         ("context", normal_array(&[BATCH, KEYS, WIDTH], 3)),
@@ -269,6 +309,7 @@ fn by_interpreter(call: Call) -> (Vec<usize>, Vec<f32>) {
             film: input("film"),
             choice: input("choice"),
             mask: input("mask"),
+            few: input("few"),
             index: input("index"),
         }
     };
@@ -289,6 +330,7 @@ fn by_onnxruntime(call: Call, form: Form) -> (Vec<usize>, Vec<f32>) {
         film: g.input("film", Axes::Samples, 2 * WIDTH, ""),
         choice: g.input("choice", Axes::Batch, 0, ""),
         mask: g.input("mask", Axes::Mask, 0, ""),
+        few: g.input("few", Axes::Mask, 0, ""),
         index: g.integer_input("index", Axes::Batch, ""),
     };
     let y = run(call, &mut g, &given, &ids).unwrap_or_else(|e| panic!("{call:?}: {e}"));
@@ -301,11 +343,12 @@ fn by_onnxruntime(call: Call, form: Form) -> (Vec<usize>, Vec<f32>) {
     let folder = tempfile::tempdir().expect("a folder");
     let mut session = session(file, folder.path(), "call.onnx");
     let values = values();
-    let inputs: Vec<NamedTensor> = ["x", "other", "context", "samples", "film", "choice", "mask"]
-        .iter()
-        .map(|&name| floats(name, &values[name].0, &values[name].1))
-        .chain([integers("index", &[8, 0, 3])])
-        .collect();
+    let inputs: Vec<NamedTensor> =
+        ["x", "other", "context", "samples", "film", "choice", "mask", "few"]
+            .iter()
+            .map(|&name| floats(name, &values[name].0, &values[name].1))
+            .chain([integers("index", &[8, 0, 3])])
+            .collect();
     session.run(&inputs, "y").unwrap_or_else(|e| panic!("{call:?}: {e}"))
 }
 
@@ -327,6 +370,8 @@ fn every_operation_gives_what_the_interpreter_gives() {
         Call::SelfAttention { masked: false, causal: false },
         Call::SelfAttention { masked: true, causal: false },
         Call::SelfAttention { masked: false, causal: true },
+        Call::AttentionWithoutKeys { causal: false },
+        Call::AttentionWithoutKeys { causal: true },
         Call::CrossAttention,
         Call::Add,
         Call::AddChannels,
@@ -385,6 +430,21 @@ fn every_operation_gives_what_the_interpreter_gives() {
             // Sums of up to 36 products of numbers about 1, in f32 and in another order.
             let difference = max_difference(&found, &wanted);
             assert!(difference <= 1e-5, "{call:?} {form:?}: {difference:e}");
+        }
+    }
+}
+
+#[test]
+fn a_query_without_keys_gets_zeros() {
+    for (causal, n_zero) in [(false, FRAMES), (true, FRAMES + 3)] {
+        let call = Call::AttentionWithoutKeys { causal };
+        let (_, of_interpreter) = by_interpreter(call);
+        for found in [of_interpreter, by_onnxruntime(call, Form::Line).1] {
+            let rows: Vec<bool> =
+                found.chunks(WIDTH).map(|row| row.iter().all(|x| *x == 0.0)).collect();
+            assert_eq!(rows.iter().filter(|is_zero| **is_zero).count(), n_zero, "{call:?}");
+            assert!(rows[FRAMES..2 * FRAMES].iter().all(|is_zero| *is_zero));
+            assert_eq!(rows[..3], [causal; 3]);
         }
     }
 }

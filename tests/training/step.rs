@@ -7,7 +7,7 @@ use motiongen::autodiff::{
 };
 use motiongen::diffusion::{DiffusionConfig, LossType, Prediction, Schedule};
 use motiongen::model::{DecoderConfig, Preset, UNet1D, UNetConfig, UNetInputs};
-use motiongen::motion::Normalizer;
+use motiongen::motion::{BODY, Normalizer};
 use motiongen::training::{
     Augmentation, Batch, DiffusionInputs, DiffusionLearner, DiffusionTraining, EmaConfig, Learner,
     NetworkConfig, Objective, OptimizerConfig, WithholdProbabilities,
@@ -136,7 +136,7 @@ fn a_step_in_double_precision_is_pytorchs() {
     };
     let y = unet.forward(&mut tape, inputs).expect("shapes fit");
     let noise = tape.constant(y.shape(), &double(&batch.noise));
-    let loss = Objective::default().loss(&mut tape, &schedule, &t, [&y, &noise], &batch.mask);
+    let loss = Objective::default().loss(&mut tape, BODY, &schedule, &t, [&y, &noise], &batch.mask);
     let loss = loss.expect("shapes fit");
     assert_near("loss", loss.data(), golden.values("loss"), DOUBLE);
     let mut gradients = Gradients::new(&parameters);

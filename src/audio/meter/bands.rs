@@ -1,11 +1,11 @@
 //! What a song sounds like at 100 frames per second: magnitudes in 36 mel bands, and of the 12 notes.
 
-use super::super::bank::Bank;
-use super::super::framing::Framer;
-use super::super::mel::{hz_to_mel, mel_to_hz};
-use super::super::stft::PairDft;
-use super::super::{N_FFT, SAMPLE_RATE_HZ};
 use super::HOP;
+use crate::audio::bank::Bank;
+use crate::audio::framing::Framer;
+use crate::audio::mel::{hz_to_mel, mel_to_hz};
+use crate::audio::stft::PairDft;
+use crate::audio::{N_FFT, SAMPLE_RATE_HZ};
 use crate::instructions::vectorized;
 
 /// Bins of a frame's spectrum.

@@ -6,7 +6,7 @@ use super::bands::{N_BANDS, Spectra, centres_hz};
 pub const N_REGISTERS: usize = 4;
 /// Where a register ends, in Hz.
 const ENDS_HZ: [f64; N_REGISTERS - 1] = [150.0, 500.0, 2000.0];
-/// A rise is told from so many frames before.
+/// Frames before, from which a rise is measured.
 const LAG: usize = 2;
 /// Frames on either side over which the local mean is taken: 0.4 s.
 const HALF_MEAN: usize = 40;

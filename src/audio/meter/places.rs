@@ -20,7 +20,7 @@ pub enum Sign {
     LowMiddle,
     HighMiddle,
     High,
-    /// Change of the 12 notes: 1 − cos of the means over so many places before and after.
+    /// Change of the 12 notes: 1 − cos of the means over this many places before and after.
     Harmony(usize),
     /// The same of the 36 bands.
     Colour(usize),
@@ -52,7 +52,7 @@ impl Places {
         let change = |rows: &[f32], width: usize, length: usize| {
             let reach = length as f64 * step;
             let end = (rows.len() / width) as f64;
-            let of = |&place: &f64| {
+            let change_at = |&place: &f64| {
                 // What lies outside the song differs from all that is in it.
                 if place < reach || place + reach > end {
                     return None;
@@ -61,7 +61,7 @@ impl Places {
                 let after = mean_row(rows, width, place, place + reach);
                 Some(1.0 - cosine(&before, &after))
             };
-            places.iter().map(of).collect::<Vec<Option<f64>>>()
+            places.iter().map(change_at).collect::<Vec<Option<f64>>>()
         };
         Self {
             registers,

@@ -1,8 +1,8 @@
 //! The beat period: the hypothesis whose multiples the song repeats itself at.
 
-use super::super::stft::planner;
 use super::RATE_HZ;
 use super::onsets::Onsets;
+use crate::audio::stft::planner;
 
 /// Slowest and fastest hypothesis, beats/min.
 const RANGE_BPM: (f64, f64) = (50.0, 230.0);
@@ -42,14 +42,14 @@ const MIN_SALIENCE: (f64, f64) = (0.06, 3.0);
 
 /// What [`find`] found.
 #[derive(Clone, Copy, Debug)]
-pub struct Found {
+pub struct TempoEstimate {
     pub period_frames: f64,
     /// Mean likeness at one, two and four beats.
     pub salience: f64,
 }
 
 /// Returns the beat period of a song; none where it has no pulse.
-pub fn find(onsets: &Onsets) -> Option<Found> {
+pub fn find(onsets: &Onsets) -> Option<TempoEstimate> {
     let heard = onsets.registers.iter().zip(onsets.is_heard).filter(|(_, is_heard)| *is_heard);
     let each: Vec<Vec<f64>> = heard.map(|(e, _)| autocorrelation(e)).collect();
     let mean = |lag: usize| each.iter().map(|a| a[lag]).sum::<f64>() / each.len() as f64;
@@ -73,7 +73,10 @@ pub fn find(onsets: &Onsets) -> Option<Found> {
     if salience < least {
         return None;
     }
-    Some(Found { period_frames: refined(&autocorrelation(&onsets.sum), period(best)), salience })
+    Some(TempoEstimate {
+        period_frames: refined(&autocorrelation(&onsets.sum), period(best)),
+        salience,
+    })
 }
 
 /// Returns the likeness at every multiple of the comb; that of half as long a lag where the song is too short.

@@ -101,7 +101,7 @@ impl PhaseCache {
 
     /// Returns the phases of a rate, and makes them if they are not kept.
     ///
-    /// They are made outside the lock: only who wants the same rate waits.
+    /// They are made outside the lock: only threads that want the same rate wait.
     pub fn phases(&self, rate_hz: u32, make: impl FnOnce(u32) -> Phases) -> Arc<Phases> {
         let made = {
             let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);

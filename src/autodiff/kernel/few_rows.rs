@@ -17,7 +17,7 @@ const RUNS: usize = 8;
 
 /// Computes the gradient of the input where there are few output rows.
 ///
-/// Then transposing the weight costs more than the product itself. Instead the product is turned round:
+/// Then transposing the weight costs more than the product itself. Instead the product is computed transposed:
 /// Gᵀ = W d_outᵀ, where the numbers of the weight are broadcast as they lie and 16 output rows share a
 /// vector; what comes out, \[taps · channels, rows\], is small and is transposed and gathered at the end.
 pub fn input_gradient_of_few<E: Element>(

@@ -19,7 +19,7 @@ use super::tile::{MAX_PANELS, MAX_ROWS, Tile};
 /// Channels of a block: 3 panels of it (72 kB of `f32`) stay in the second cache while rows pass.
 const BLOCK: usize = 384;
 
-/// Output rows up to which the product for the input's gradient is turned round.
+/// Output rows up to which the product for the input's gradient is computed transposed.
 const FEW_ROWS: usize = 64;
 
 /// A place to write from several tasks, each its own columns.

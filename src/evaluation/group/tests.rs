@@ -250,7 +250,7 @@ fn what_is_not_defined_is_none() {
     for bar_frames in [0.3, f64::NAN, 159.0, -5.0, f64::INFINITY] {
         assert_eq!(unison(&poses, bar_frames), None, "{bar_frames}");
     }
-    // Who does not move is in no unison.
+    // A dancer that does not move is in no unison.
     let still = Array3::from_shape_fn((2, 200, 25), |(_, _, i)| f32::from(u8::from(i == 9)));
     let still = measure(still.view(), 60.0, 0.35);
     assert_eq!((still.unison, still.gmc_correlation, still.tif), (None, None, Some(1.0)));

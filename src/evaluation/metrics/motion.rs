@@ -4,22 +4,22 @@ use std::collections::BTreeMap;
 
 use ndarray::{Array2, ArrayView2, Axis, concatenate};
 
-use super::super::consistency::Consistency;
-use super::super::control::{POSITION_THRESHOLDS_MM, ROTATION_THRESHOLDS_DEG, control_errors};
-use super::super::distribution::channel_distances;
-use super::super::diversity::{
+use super::{MotionWindow, Number, SEED, mean_over, staged};
+use crate::evaluation::consistency::Consistency;
+use crate::evaluation::control::{POSITION_THRESHOLDS_MM, ROTATION_THRESHOLDS_DEG, control_errors};
+use crate::evaluation::distribution::channel_distances;
+use crate::evaluation::diversity::{
     DIVERSITY_PAIRS, MULTIMODALITY_PAIRS, distance, diversity, mean_distance, multimodality,
 };
-use super::super::frechet::{Gaussian, frechet_distance};
-use super::super::interval::{
+use crate::evaluation::frechet::{Gaussian, frechet_distance};
+use crate::evaluation::interval::{
     Estimate, clustered_mean_estimate, clustered_share_estimate, jackknife_estimate, share_estimate,
 };
-use super::super::kinetic::CHUNK_FRAMES;
-use super::super::measured::WindowMeasures;
-use super::super::reference_statistics::{FeatureSet, ReferenceStatistics};
-use super::super::sanity::CheckSet;
-use super::super::window_range::Posture;
-use super::{MotionWindow, Number, SEED, mean_over, staged};
+use crate::evaluation::kinetic::CHUNK_FRAMES;
+use crate::evaluation::measured::WindowMeasures;
+use crate::evaluation::reference_statistics::{FeatureSet, ReferenceStatistics};
+use crate::evaluation::sanity::CheckSet;
+use crate::evaluation::window_range::Posture;
 use crate::motion::CHANNEL_NAMES;
 
 /// Windows, evenly among all, whose pairs are compared: every one with every other.

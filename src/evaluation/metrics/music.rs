@@ -3,16 +3,16 @@
 use std::collections::BTreeMap;
 use std::num::NonZeroUsize;
 
-use super::super::beats::{
+use super::{MotionWindow, MusicWindow, Number, SEED, mean_over, staged};
+use crate::evaluation::beats::{
     BeatAlignment, BeatScore, N_SHIFTS, WIDTHS_S, beat_alignment, phase_coherence, phase_error,
     rayleigh,
 };
-use super::super::coupling::{
+use crate::evaluation::coupling::{
     CoupledPassage, Coupling, CouplingSums, Harmonics, N_ROTATIONS, consistency_p, rotation_p,
 };
-use super::super::interval::{Estimate, clustered_mean_estimate, mean_estimate};
-use super::super::locking::{BarLocking, Passage, r2_at, wrong_tempi};
-use super::{MotionWindow, MusicWindow, Number, SEED, mean_over, staged};
+use crate::evaluation::interval::{Estimate, clustered_mean_estimate, mean_estimate};
+use crate::evaluation::locking::{BarLocking, Passage, r2_at, wrong_tempi};
 
 /// Wrong tempi that locking is held against.
 pub const N_WRONG_TEMPI: usize = 199;

@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use super::super::interval::{Estimate, mean_estimate};
 use super::Number;
+use crate::evaluation::interval::{Estimate, mean_estimate};
 
 /// Returns speeds and jerk over those of real motion.
 pub fn motion_ratios(own: &[Number], truth: &[Number]) -> Vec<Number> {

@@ -256,7 +256,7 @@ fn check_scales(normalizer: &Normalizer, feature_scale: &FeatureScale) -> Result
     Ok(())
 }
 
-/// Returns the bytes that a file of so many numbers may have.
+/// Returns the most bytes that a file of `n_values` numbers may have.
 pub fn most_bytes(n_values: usize) -> u64 {
     8 * n_values as u64 + MAX_GRAPH_BYTES
 }

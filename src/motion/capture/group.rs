@@ -4,14 +4,14 @@
 //! the pose that is cut off at the start, and the origin. The centre of the dancers' first positions comes over
 //! the origin, the lowest floor of any dancer to 0.
 
-use super::super::bvh::Bvh;
-use super::super::dancers::{Dancers, DancersError};
-use super::super::phase::Beats;
 use super::account::{CaptureAccount, CaptureNote};
 use super::take::Take;
 use super::track::{RigidTrack, up_of};
 use super::upright::Axis;
 use super::{CaptureError, trajectory_of};
+use crate::motion::bvh::Bvh;
+use crate::motion::dancers::{Dancers, DancersError};
+use crate::motion::phase::Beats;
 
 /// Units of length that differ by less than this share are one unit.
 const UNIT_TOLERANCE: f64 = 1e-6;

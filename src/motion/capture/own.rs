@@ -2,8 +2,8 @@
 //!
 //! They are motion already. What captures need (a low-pass, a floor, a unit) would only change them.
 
-use super::super::bvh::{Bvh, JointChannel};
-use super::super::exchange::{END_SITE_CM, ROOT_NAME};
+use crate::motion::bvh::{Bvh, JointChannel};
+use crate::motion::exchange::{END_SITE_CM, ROOT_NAME};
 
 /// Metres of a unit that this program writes.
 pub const OWN_UNIT_M: f64 = 0.01;

@@ -4,10 +4,10 @@
 //! every bone of it points along one axis (LAFAN1: +X), no rest pose stands, and the joint's axes are found
 //! from the pose instead: trunk and hips keep their place on the root.
 
-use super::super::bvh::Bvh;
-use super::super::quaternion::{Quaternion, conj, from_axis_angle, mul, rotate};
 use super::skeleton::{Body, Landmarks, Positions, at, sampled};
 use super::upright::Axis;
+use crate::motion::bvh::Bvh;
+use crate::motion::quaternion::{Quaternion, conj, from_axis_angle, mul, rotate};
 
 /// An axis is the body's where its share of the direction is at least this.
 const DECIDED: f64 = 0.7;

@@ -1,9 +1,9 @@
 //! One person in all the ways that people have their files: the same motion comes out.
 
-use super::super::exchange;
-use super::super::quaternion::from_axis_angle;
 use super::person::{Person, PersonAction};
 use super::*;
+use crate::motion::exchange;
+use crate::motion::quaternion::from_axis_angle;
 use ndarray::Array2;
 use proptest::prelude::*;
 

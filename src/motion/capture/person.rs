@@ -2,11 +2,11 @@
 
 use std::fmt::Write as _;
 
-use super::super::exchange::euler_zxy;
-use super::super::quaternion::{
+use super::Axis;
+use crate::motion::exchange::euler_zxy;
+use crate::motion::quaternion::{
     IDENTITY, Quaternion, conj, from_axis_angle, mul, normalize, rotate,
 };
-use super::Axis;
 
 type Vector = [f64; 3];
 

@@ -1,7 +1,7 @@
 //! The body in a skeleton: where it begins, what its head and feet are, how tall it is.
 
-use super::super::bvh::{Bvh, JointChannel};
-use super::super::quantile::{median, percentile};
+use crate::motion::bvh::{Bvh, JointChannel};
+use crate::motion::quantile::{median, percentile};
 
 /// Frames that are looked at for lengths and directions.
 const MAX_SAMPLED_FRAMES: usize = 256;

@@ -1,11 +1,5 @@
 //! A take in world coordinates, metres and +Y up, at its own sampling rate.
 
-use super::super::bvh::{Bvh, JointChannel};
-use super::super::lowpass::lowpass;
-use super::super::quantile::{median, percentile};
-use super::super::quaternion::{
-    IDENTITY, Quaternion, conj, from_axis_angle, make_sign_continuous, mul, normalize, rotate,
-};
 use super::account::{CaptureAccount, CaptureNote};
 use super::own::{OWN_UNIT_M, is_own};
 use super::own_axes::OwnAxes;
@@ -15,6 +9,12 @@ use super::upright::{Axis, UpAxis, UpEvidence, find_up, tilt};
 use super::{
     CaptureError, DIFFERENCED_FRAMES, MAX_NODE_POSITIONS, MAX_RESAMPLED_FRAMES,
     MIN_RESAMPLED_FRAMES, check_size,
+};
+use crate::motion::bvh::{Bvh, JointChannel};
+use crate::motion::lowpass::lowpass;
+use crate::motion::quantile::{median, percentile};
+use crate::motion::quaternion::{
+    IDENTITY, Quaternion, conj, from_axis_angle, make_sign_continuous, mul, normalize, rotate,
 };
 use crate::units::FPS;
 

@@ -1,6 +1,6 @@
-use super::super::quaternion::IDENTITY;
 use super::take::forward_kinematics;
 use super::*;
+use crate::motion::quaternion::IDENTITY;
 use proptest::prelude::*;
 use std::f64::consts::PI;
 

@@ -1,11 +1,11 @@
 //! One rigid body's track: what formats give that have no hierarchy of joints.
 
-use super::super::quaternion::{Quaternion, make_sign_continuous, mul, normalize, rotate};
 use super::account::{CaptureAccount, CaptureNote};
 use super::take::{Take, first_frame_after_pop, pop_floor_m, still_range};
 use super::unit::DEFAULT_HEIGHT_M;
 use super::upright::Axis;
 use super::{CaptureError, MAX_NODE_POSITIONS, check_size};
+use crate::motion::quaternion::{Quaternion, make_sign_continuous, mul, normalize, rotate};
 
 /// A body's mean direction of up tells the axis where its greatest component is at least this.
 const FOUND: f64 = 0.8;

@@ -3,10 +3,10 @@
 use std::f64::consts::FRAC_PI_2;
 use std::fmt;
 
-use super::super::quaternion::{IDENTITY, Quaternion, from_axis_angle, normalize, rotate};
-use super::super::vector::{inner, minus};
 use super::CaptureError;
 use super::skeleton::{Body, Landmarks, Positions, STANDING_RATIO, at, sampled};
+use crate::motion::quaternion::{IDENTITY, Quaternion, from_axis_angle, normalize, rotate};
+use crate::motion::vector::{inner, minus};
 
 /// A direction counts where its greatest component is at least this.
 const DECIDED: f64 = 0.7;

@@ -1,7 +1,7 @@
 //! Kinematic accents: the moments at which a body all but stops before it goes on.
 
-use super::super::quantile::percentile;
-use super::super::vector::norm;
+use crate::motion::quantile::percentile;
+use crate::motion::vector::norm;
 use crate::units::FPS;
 
 /// Lever arm that turns a rate of turning into a speed, m: about half the width of the hips and

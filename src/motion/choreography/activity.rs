@@ -1,6 +1,6 @@
 //! How active a song is at every frame, as a rank among its own frames.
 
-use super::super::style::{WINDOW_FRAMES, Window};
+use crate::motion::style::{WINDOW_FRAMES, Window};
 
 /// Returns the activity of every frame, in (0, 1).
 ///

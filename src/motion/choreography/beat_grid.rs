@@ -1,6 +1,6 @@
 //! Beats over a whole song and a little more, counted in bars.
 
-use super::super::phase::Beats;
+use crate::motion::phase::Beats;
 
 /// Fewest beats of a choreographic phrase.
 const MIN_PHRASE_BEATS: usize = 4;

@@ -3,11 +3,11 @@
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
-use super::super::kinematics::Poses;
-use super::super::quaternion::{from_axis_angle, make_sign_continuous, mul, rotate};
 use super::primitive::UP;
 use super::selection::DancePhrase;
 use crate::chance::Chance;
+use crate::motion::kinematics::Poses;
+use crate::motion::quaternion::{from_axis_angle, make_sign_continuous, mul, rotate};
 use crate::units::frames_to_s;
 
 /// Half the side of the square that the dance never leaves, m.

@@ -1,12 +1,12 @@
 //! Steps joined into one path: no jump in position, velocity or orientation.
 
-use super::super::kinematics::Poses;
-use super::super::lowpass::lowpass;
-use super::super::quaternion::{
-    Quaternion, from_axis_angle, make_sign_continuous, mul, rotate, slerp,
-};
 use super::primitive::{Repertoire, UP, lowpass_orientation};
 use super::selection::DanceStep;
+use crate::motion::kinematics::Poses;
+use crate::motion::lowpass::lowpass;
+use crate::motion::quaternion::{
+    Quaternion, from_axis_angle, make_sign_continuous, mul, rotate, slerp,
+};
 use crate::units::{FPS, frames_to_s};
 
 /// A join bends at most this much time on either side of its beat, s.

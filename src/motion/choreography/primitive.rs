@@ -2,20 +2,20 @@
 
 use thiserror::Error;
 
-use super::super::channels::Channel;
-use super::super::kinematics::Poses;
-use super::super::lowpass::lowpass;
-use super::super::placement::Placement;
-use super::super::quantile::median;
-use super::super::quaternion::{
+use super::accent::{cuts, effort, energy, held_differences};
+use super::activity::mid_rank;
+use crate::motion::channels::Channel;
+use crate::motion::kinematics::Poses;
+use crate::motion::lowpass::lowpass;
+use crate::motion::placement::Placement;
+use crate::motion::quantile::median;
+use crate::motion::quaternion::{
     Quaternion, angular_velocity, conj, from_axis_angle, make_sign_continuous, mul, normalize,
     rotate,
 };
-use super::super::spline::{CubicSpline, SplineError};
-use super::super::trajectory::Trajectory;
-use super::super::vector::norm;
-use super::accent::{cuts, effort, energy, held_differences};
-use super::activity::mid_rank;
+use crate::motion::spline::{CubicSpline, SplineError};
+use crate::motion::trajectory::Trajectory;
+use crate::motion::vector::norm;
 use crate::units::{FPS, frames_to_s};
 
 /// Shortest primitive, frames: 0.4 s.

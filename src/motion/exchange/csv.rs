@@ -360,7 +360,7 @@ mod tests {
         let mut rows = Vec::new();
         write_group_csv_rows(group.slice(s![.., 2.., ..]), 2, &mut rows).expect("memory");
         assert!(text.as_bytes().ends_with(&rows) && rows.starts_with(b"2,"));
-        // Who reads one motion is told of the column that tells of several.
+        // A reader of one motion names the column that tells of several.
         assert!(read_csv(&text).expect_err("a group").to_string().contains("has 28 values"));
     }
 

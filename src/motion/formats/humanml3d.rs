@@ -11,10 +11,10 @@ mod tests;
 
 use thiserror::Error;
 
-use super::super::capture::{Axis, RigidTrack};
-use super::super::npy::{self, NpyError};
-use super::super::quantile::median;
-use super::super::quaternion::{Quaternion, rotate};
+use crate::motion::capture::{Axis, RigidTrack};
+use crate::motion::npy::{self, NpyError};
+use crate::motion::quantile::median;
+use crate::motion::quaternion::{Quaternion, rotate};
 
 /// Numbers of a frame.
 pub const FEATURE_DIM: usize = 263;

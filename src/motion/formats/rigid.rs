@@ -5,11 +5,11 @@
 
 use thiserror::Error;
 
-use super::super::capture::RigidTrack;
-use super::super::group::MAX_DANCERS;
-use super::super::npy::NpyArray;
-use super::super::npz::{Npz, NpzError};
-use super::super::quaternion::from_rotation_vector;
+use crate::motion::capture::RigidTrack;
+use crate::motion::group::MAX_DANCERS;
+use crate::motion::npy::NpyArray;
+use crate::motion::npz::{Npz, NpzError};
+use crate::motion::quaternion::from_rotation_vector;
 use crate::units::FPS;
 
 const POSITION_KEY: &str = "positions";

@@ -12,11 +12,11 @@ mod tests;
 
 use thiserror::Error;
 
-use super::super::capture::{Axis, RigidTrack};
-use super::super::group::MAX_DANCERS;
-use super::super::npy::NpyArray;
-use super::super::npz::{Npz, NpzError};
-use super::super::quaternion::from_rotation_vector;
+use crate::motion::capture::{Axis, RigidTrack};
+use crate::motion::group::MAX_DANCERS;
+use crate::motion::npy::NpyArray;
+use crate::motion::npz::{Npz, NpzError};
+use crate::motion::quaternion::from_rotation_vector;
 
 /// Rest position of the root joint of SMPL's neutral mean shape, m, +Y up.
 pub const MEAN_PELVIS_M: [f64; 3] = [-0.001_795_06, -0.223_333_82, 0.028_219_18];

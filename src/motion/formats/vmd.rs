@@ -15,8 +15,8 @@ mod tests;
 
 use thiserror::Error;
 
-use super::super::capture::RigidTrack;
 use crate::excerpt::preview;
+use crate::motion::capture::RigidTrack;
 
 /// Frames per second of every file.
 pub const RATE_HZ: f64 = 30.0;

@@ -9,7 +9,7 @@ use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 
 use super::assignment::assign;
 use crate::motion::blend::{self, align_signs};
-use crate::motion::channels::Channel;
+use crate::motion::channels::{BODY, Channel};
 use crate::motion::choreography::accent::LEVER_ARM_M;
 use crate::motion::quaternion::{Quaternion, angular_velocity, normalize};
 
@@ -66,7 +66,7 @@ pub fn blend(left: ArrayView3<f32>, right: ArrayView3<f32>) -> Array3<f32> {
     {
         // Erratum: the published code turns from left to left (`quat_slerp(_left, _left, …)`), so that
         // orientations jump at the end of the overlap. Here they turn to the right piece's.
-        blended.assign(&blend::blend(left, right, weight));
+        blended.assign(&blend::blend(BODY, left, right, weight));
     }
     blended
 }
@@ -90,7 +90,7 @@ pub fn stitch(earlier: &mut Array3<f32>, later: &mut Array3<f32>, shift: usize) 
     for (both, mut after) in both.outer_iter().zip(later.outer_iter_mut()) {
         // One rotation has two quaternions: what comes after the shared frames goes on with theirs.
         let last = s![n_shared - 1.., ..];
-        align_signs(both.slice(last), &mut after.slice_mut(last));
+        align_signs(BODY, both.slice(last), &mut after.slice_mut(last));
     }
     earlier.slice_mut(shared).assign(&both);
     later.slice_mut(s![.., ..n_shared, ..]).assign(&both);

@@ -1,4 +1,5 @@
 use super::*;
+use crate::motion::channels::{Channel, MOTION_DIM};
 use crate::motion::quaternion::{angular_velocity, dot, from_axis_angle};
 use crate::motion::trajectory::ChannelLimits;
 use crate::units::FPS;
@@ -23,6 +24,10 @@ fn walk(n: usize, turn_rad: f64) -> Array2<f32> {
         }
     }
     frames
+}
+
+fn orientations(frames: &Array2<f32>) -> Vec<Quaternion> {
+    quaternions(frames, Channel::Quaternion.columns())
 }
 
 fn nothing_but(change: impl Fn(&mut PostProcessConfig)) -> PostProcessConfig {
@@ -93,7 +98,7 @@ fn signs_are_continuous_or_those_of_the_reference() {
     let per_frame = PostProcessConfig { hemisphere: Hemisphere::PerFrame, ..sequential };
     let found = processed(&per_frame, &flipped);
     assert!(found.column(W).iter().all(|&w| w >= 0.0));
-    let q = quaternions(&found);
+    let q = orientations(&found);
     assert!(q.windows(2).any(|q| dot(q[0], q[1]) < -0.9), "w ≥ 0 jumps where w crosses 0");
 }
 
@@ -205,7 +210,7 @@ fn what_is_derived_obeys_the_identities() {
             let size = at(t + 1, 3 + i).abs().max(at(t, 3 + i).abs());
             assert!(t == 25 || (at(t, 6 + i) - a).abs() <= 61.0 * f64::from(f32::EPSILON) * size);
         }
-        let q = quaternions(&frames);
+        let q = orientations(&frames);
         let omega = angular_velocity(q[t], q[t + 1], FPS);
         assert_eq!([13, 14, 15].map(|i| frames[[t, i]]), omega.map(|c| c as f32));
     }
@@ -247,7 +252,7 @@ fn polynomial_smoothing_keeps_parabolas_and_what_is_derived_follows() {
     }
     frames[[11, 1]] += 0.1;
     let found = processed(&config, &frames);
-    for (t, q) in quaternions(&found).into_iter().enumerate() {
+    for (t, q) in orientations(&found).into_iter().enumerate() {
         assert!((dot(q, q) - 1.0).abs() < 3e-7, "{t}");
     }
     let at = |t: usize, i: usize| f64::from(found[[t, i]]);
@@ -270,7 +275,7 @@ fn polynomial_smoothing_keeps_the_signs_that_it_meets() {
         config.savitzky_golay = Some(SavitzkyGolay { window: 5, order: 3 });
     });
     let found = processed(&config, &frames);
-    for (found, before) in quaternions(&found).into_iter().zip(quaternions(&frames)) {
+    for (found, before) in orientations(&found).into_iter().zip(orientations(&frames)) {
         // A cubic over five frames of a turn by 0.3 rad each misses it by less than 1e-3.
         assert!(dot(found, before) > 1.0 - 1e-6, "{found:?} against {before:?}");
     }
@@ -299,7 +304,7 @@ fn what_is_not_finite_stays_to_be_found() {
     assert!(found[[2, 3]].is_nan() && found[[3, 3]].is_nan() && found[[1, 6]].is_nan());
     assert!(found[[8, 13]].is_nan() && found[[9, 15]].is_nan());
     assert!((found[[10, 13]] - 0.6 * 18.0).abs() < 1e-4);
-    let q = quaternions(&found);
+    let q = orientations(&found);
     assert!(dot(q[8], q[10]) > 0.8 && dot(q[10], q[11]) > 0.9, "signs are continuous over the gap");
     assert!(found.column(PHASE).iter().enumerate().all(|(t, &x)| t == 13 || x == 0.5));
 }
@@ -424,7 +429,7 @@ proptest! {
         let once = frames.clone();
         process(&config, &mut frames, phase);
         prop_assert_eq!(&frames, &once);
-        for q in quaternions(&frames) {
+        for q in orientations(&frames) {
             prop_assert!((dot(q, q) - 1.0).abs() < 3e-7);
         }
         for channel in [Channel::Position, Channel::Phase] {

@@ -4,7 +4,7 @@ use ndarray::{Array2, ArrayView2};
 use serde::{Deserialize, Serialize};
 
 use super::fusion::FusionMeasurements;
-use crate::motion::channels::Channel;
+use crate::motion::layout::{BodyColumns, Columns};
 
 /// Horizontal and vertical variances of five channel groups.
 const N_GROUPS: usize = 10;
@@ -110,15 +110,20 @@ impl FusionVariances {
 }
 
 impl FusionMeasurements {
-    /// Takes frames, `[T, 25]`, as measurements.
-    pub fn of(frames: ArrayView2<f32>) -> Self {
+    /// Takes frames, `[T, columns]`, as measurements; those that a layout lacks are not numbers, which fusion leaves
+    /// out.
+    pub fn of(body: &BodyColumns, frames: ArrayView2<f32>) -> Self {
         let frames: Array2<f32> = frames.to_owned();
+        let vectors = |columns: Option<Columns>| match columns {
+            Some(columns) => super::vectors(&frames, columns),
+            None => vec![[f64::NAN; 3]; frames.nrows()],
+        };
         Self {
-            position: super::vectors(&frames, Channel::Position),
-            velocity: super::vectors(&frames, Channel::Velocity),
-            acceleration: super::vectors(&frames, Channel::Acceleration),
-            orientation: super::quaternions(&frames),
-            angular_velocity: super::vectors(&frames, Channel::AngularVelocity),
+            position: vectors(Some(body.position)),
+            velocity: vectors(body.velocity),
+            acceleration: vectors(body.acceleration),
+            orientation: super::quaternions(&frames, body.orientation),
+            angular_velocity: vectors(body.angular_velocity),
         }
     }
 }

@@ -1,7 +1,7 @@
 //! Styles of bands, in bars of four.
 
-use super::super::score::Voice::{ClosedHat, Kick, OpenHat, Ride, Rim, Shaker, Snare, Tom};
-use super::super::style::{
+use crate::music::score::Voice::{ClosedHat, Kick, OpenHat, Ride, Rim, Shaker, Snare, Tom};
+use crate::music::style::{
     Style,
     SwingGrid::{Eighths, Sixteenths},
 };

@@ -1,7 +1,7 @@
 //! Styles of machines, in bars of four.
 
-use super::super::score::Voice::{Clap, ClosedHat, Kick, OpenHat, Rim, Shaker, Snare, Tom};
-use super::super::style::{Style, SwingGrid::Sixteenths};
+use crate::music::score::Voice::{Clap, ClosedHat, Kick, OpenHat, Rim, Shaker, Snare, Tom};
+use crate::music::style::{Style, SwingGrid::Sixteenths};
 
 const MINOR: &[&str] = &[
     "Am F C G",

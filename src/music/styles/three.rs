@@ -1,7 +1,7 @@
 //! Styles in bars of three.
 
-use super::super::score::Voice::{Clap, ClosedHat, Kick, OpenHat, Ride, Rim, Shaker, Snare};
-use super::super::style::{
+use crate::music::score::Voice::{Clap, ClosedHat, Kick, OpenHat, Ride, Rim, Shaker, Snare};
+use crate::music::style::{
     Style,
     SwingGrid::{Eighths, Sixteenths},
 };

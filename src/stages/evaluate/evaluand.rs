@@ -76,7 +76,7 @@ impl Evaluand {
         }
     }
 
-    /// Reads what is known of the motions of a run, at most so many of them.
+    /// Reads what is known of the motions of a run, at most `most` of them.
     ///
     /// # Errors
     /// When the store cannot be read, or one sentence where there are no motions.

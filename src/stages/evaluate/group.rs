@@ -38,7 +38,7 @@ const MAX_REAL: usize = 400;
 
 /// What motions are held against, and they themselves.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-enum Subject {
+enum GroupSubject {
     Generated,
     /// Every dancer is one of another group, in the place of the one who was there.
     Independent,
@@ -48,7 +48,7 @@ enum Subject {
     TrainingTruth,
 }
 
-impl Subject {
+impl GroupSubject {
     fn name(self) -> &'static str {
         match self {
             Self::Generated => "generated",
@@ -145,7 +145,7 @@ struct GeneratedGroup {
 }
 
 /// Real groups with their music.
-type RealGroups = BTreeMap<Subject, Vec<(WindowMusic, Array3<f32>)>>;
+type RealGroups = BTreeMap<GroupSubject, Vec<(WindowMusic, Array3<f32>)>>;
 
 /// Returns whether all motions of a run are of groups.
 ///
@@ -293,7 +293,7 @@ pub fn run(
     Ok(Box::new(summary))
 }
 
-/// Returns the phrases of real groups, at most so many of each split, in order of the digests of their names.
+/// Returns the phrases of real groups, at most [`MAX_REAL`] of each split, in order of the digests of their names.
 fn real_groups(snapshot: &StoreSnapshot) -> Result<Vec<PhraseRow>, StoreError> {
     let mut rows: Vec<PhraseRow> = snapshot
         .table(PhraseRow::schema())?
@@ -319,8 +319,8 @@ fn real_windows(
     let mut found = RealGroups::new();
     snapshot.table(tables::motion())?.visit_groups(&wanted, |id, frames| {
         let subject = match phrases.row(id).map(|row| row.split.as_str()) {
-            Some("train") => Subject::TrainingTruth,
-            _ => Subject::HeldOutTruth,
+            Some("train") => GroupSubject::TrainingTruth,
+            _ => GroupSubject::HeldOutTruth,
         };
         // The bars of real motion are those of its own phase.
         let phase: Vec<f64> = frames
@@ -380,7 +380,7 @@ fn generated_groups(
 }
 
 /// Windows by split and subject.
-type Found = BTreeMap<(&'static str, Subject), Windows>;
+type SubjectWindows = BTreeMap<(&'static str, GroupSubject), Windows>;
 
 /// Measures windows of generated groups, of groups made up from them, and of real groups.
 fn measured(
@@ -388,8 +388,8 @@ fn measured(
     real: &RealGroups,
     window: usize,
     progress: &dyn Progress,
-) -> Found {
-    let mut found = Found::new();
+) -> SubjectWindows {
+    let mut found = SubjectWindows::new();
     for (i, group) in generated.iter().enumerate() {
         let n_frames = group.frames.dim().1;
         let other = (1..generated.len())
@@ -408,8 +408,8 @@ fn measured(
             let mut add = |subject, frames: ArrayView3<f32>| {
                 found.entry((group.split, subject)).or_default().add(frames, &music, other);
             };
-            add(Subject::Generated, frames.view());
-            add(Subject::Copied, copied(frames.view()).view());
+            add(GroupSubject::Generated, frames.view());
+            add(GroupSubject::Copied, copied(frames.view()).view());
             let others: Vec<Array3<f32>> = (0..generated.len())
                 .map(|k| &generated[(i + k) % generated.len()])
                 .filter(is_long)
@@ -417,7 +417,7 @@ fn measured(
                 .map(|group| cut(group).0)
                 .collect();
             if others.len() == frames.dim().0 {
-                add(Subject::Independent, independent(frames.view(), &others).view());
+                add(GroupSubject::Independent, independent(frames.view(), &others).view());
             }
         }
         progress.advance(1);
@@ -442,11 +442,11 @@ fn measured(
     found
 }
 
-fn metric_rows(run: &str, model: &str, window: usize, found: &Found) -> Vec<MetricRow> {
+fn metric_rows(run: &str, model: &str, window: usize, found: &SubjectWindows) -> Vec<MetricRow> {
     let time = TimestampUs::now();
     let protocol =
         format!("windows of {window} frames, bodies of {RADIUS_M} m, intervals over songs");
-    let truth = found.get(&("all", Subject::TrainingTruth)).and_then(Windows::gaussian);
+    let truth = found.get(&("all", GroupSubject::TrainingTruth)).and_then(Windows::gaussian);
     let mut rows = Vec::new();
     for ((split, subject), windows) in found {
         let mut row = |metric: &str, variant: &str, unit: &str, estimate: Estimate| {

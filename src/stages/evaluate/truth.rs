@@ -8,6 +8,7 @@ use crate::evaluation::baseline::mean_motion;
 use crate::evaluation::reference_statistics::ReferenceStatistics;
 use crate::evaluation::window::{window, window_frames, window_starts};
 use crate::generation::Retrieval;
+use crate::motion::BODY;
 use crate::stages::Progress;
 use crate::stages::retrieval::{dataset_of, index_of};
 use crate::store::{Location, StoreError, StoreSnapshot};
@@ -82,7 +83,7 @@ pub fn read(
         return Ok(None);
     };
     let retrieval = index_of(&dataset, length)?;
-    let mean = mean_motion(train().map(|phrase| phrase.motion.view()), length);
+    let mean = mean_motion(BODY, train().map(|phrase| phrase.motion.view()), length);
     let statistics = statistics(snapshot.store(), data_hash, train(), length)?;
     let (Some(mean_motion), Some(statistics)) = (mean, statistics) else {
         progress.note(too_little);

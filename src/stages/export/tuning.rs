@@ -124,7 +124,7 @@ fn variances_of(windows: &[Window], decoded: &[Array2<f32>]) -> FusionVariances 
     scaled(position, orientation)
 }
 
-/// Returns the guidance at which the locked amplitude is 1; 1 where it is so without guidance, or unknown.
+/// Returns the guidance at which the locked amplitude is 1; 1 where that holds without guidance, or where nothing was measured.
 fn guidance_of(tried: &[(f64, f64)]) -> f64 {
     let Some(&(last, locked)) = tried.last() else { return GUIDANCES[0] };
     let before = tried.len().checked_sub(2).map(|i| tried[i]);

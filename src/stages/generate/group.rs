@@ -308,9 +308,9 @@ impl GroupMaker<'_> {
     ) -> GenerationRow {
         let settings = self.settings;
         let (n_dancers, n_frames, _) = frames.dim();
-        let errors = decoded
-            .outer_iter()
-            .map(|dancer| derivative_error(dancer, Channel::Position, Channel::Velocity));
+        let errors = decoded.outer_iter().map(|dancer| {
+            derivative_error(dancer, Channel::Position.columns(), Channel::Velocity.columns())
+        });
         let velocity_error = errors.sum::<f64>() / n_dancers as f64;
         let limits = settings.postprocess.limits;
         let scores: Vec<_> =

@@ -157,8 +157,11 @@ impl SoloistMaker<'_> {
                 if candidate == 0 { &mut *watch } else { &mut unseen };
             let decoded =
                 self.sample(music, &heard, seed, constraints.as_ref(), priming.as_ref(), watcher)?;
-            let velocity_error =
-                derivative_error(decoded.view(), Channel::Position, Channel::Velocity);
+            let velocity_error = derivative_error(
+                decoded.view(),
+                Channel::Position.columns(),
+                Channel::Velocity.columns(),
+            );
             let mut frames = decoded.clone();
             let postprocess = &self.settings.postprocess;
             let displacement = process_holding(postprocess, &mut frames, bars, &held);

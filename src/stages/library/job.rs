@@ -204,7 +204,7 @@ impl LibraryJob<'_> {
             let music = {
                 let _share = budget.take(input.needed_bytes());
                 let input = match &song.files {
-                    SongFiles::Made { piece, seed, .. } => {
+                    SongFiles::Score { piece, seed, .. } => {
                         let performance = perform(song, piece, *seed, &self.band)?;
                         if let Some(folder) = &self.params.compose_audio
                             && let Err(e) = made::write(folder, song, &performance)

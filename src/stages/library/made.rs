@@ -56,7 +56,7 @@ pub fn composed(n: u32, seed: u64, band: &Band) -> impl Iterator<Item = Song> {
             split: TRAIN,
             is_unidentified: false,
             problem: None,
-            files: SongFiles::Made {
+            files: SongFiles::Score {
                 piece: Piece::Composed { seed, index },
                 seed: xxh3_64(url.as_bytes()),
                 duration_s: compose::MAX_SONG_S,
@@ -132,7 +132,7 @@ fn tune_song(file: &SourceFile, url: &str, i: usize, found: TuneEntry, seed: u64
         Ok(tune) => {
             let seed = xxh3_64_with_seed(text.as_bytes(), seed);
             let duration_s = music::arrange(&tune, seed).end_s();
-            let files = SongFiles::Made { piece: Piece::Tune(Arc::new(tune)), seed, duration_s };
+            let files = SongFiles::Score { piece: Piece::Tune(Arc::new(tune)), seed, duration_s };
             song_of_tune((id, url), &text, files, None)
         }
         Err(e) => {

@@ -116,7 +116,7 @@ pub fn read(song: &Song, input: SongInput) -> Result<SongMusic, Failure> {
             let list = list.map(|beats| (beats, BeatSource::BeatsFile));
             listen(song, audio, content, list, lines)
         }
-        (SongFiles::Made { .. }, SongInput::Performed(Performance { wav, beats, .. })) => {
+        (SongFiles::Score { .. }, SongInput::Performed(Performance { wav, beats, .. })) => {
             let size_bytes = wav.len() as u64;
             let (path, fingerprint) = (format!("{}.wav", song.id), String::new());
             let audio = SourceFile { path, size_bytes, fingerprint };

@@ -56,7 +56,7 @@ pub enum SongFiles {
     /// None that can be read.
     Missing,
     /// None: it is played from a score.
-    Made {
+    Score {
         piece: Piece,
         /// Chooses who plays it, and how.
         seed: u64,
@@ -199,7 +199,7 @@ impl Songs {
 impl Song {
     /// Returns whether the song is played here, and not read.
     pub fn is_made(&self) -> bool {
-        matches!(self.files, SongFiles::Made { .. })
+        matches!(self.files, SongFiles::Score { .. })
     }
 }
 
@@ -222,7 +222,7 @@ impl SongFeed {
             SongSource::Store(store) => send_features(store, self.read, sender)?,
         }
         for song in self.made {
-            let SongFiles::Made { duration_s, .. } = song.files else { continue };
+            let SongFiles::Score { duration_s, .. } = song.files else { continue };
             if sender.send((song, SongInput::Unplayed { duration_s })).is_err() {
                 break;
             }
@@ -234,7 +234,7 @@ impl SongFeed {
 fn send_files(source: &Source, songs: Vec<Song>, sender: &SyncSender<(Song, SongInput)>) {
     let files = songs.iter().flat_map(|song| match &song.files {
         SongFiles::Folder { audio, beat_list } => vec![Some(audio.clone()), beat_list.clone()],
-        SongFiles::Store { .. } | SongFiles::Made { .. } | SongFiles::Missing => Vec::new(),
+        SongFiles::Store { .. } | SongFiles::Score { .. } | SongFiles::Missing => Vec::new(),
     });
     let mut reader = source.read_in_order(files.flatten().collect());
     for song in songs {

@@ -70,7 +70,7 @@ impl SurveyedStage {
 pub enum MissingForm {
     /// Item by item.
     Items,
-    /// As the shards, of so many, that have work left.
+    /// The shards that have work left, of this number of shards.
     Shards(NonZeroU32),
 }
 

@@ -69,7 +69,7 @@ pub struct SavingParams {
     pub save_every_minutes: f64,
 }
 
-/// Returns so many minutes, or the longest time that there is.
+/// Returns `m` minutes, or the longest time that there is.
 pub fn minutes(m: f64) -> Duration {
     Duration::try_from_secs_f64(m * 60.0).unwrap_or(Duration::MAX)
 }

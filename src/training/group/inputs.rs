@@ -147,7 +147,8 @@ impl<'a> GroupBatch<'a> {
         let target = g.constant(&[rows, frames, MOTION_DIM], &self.batch.motion);
         let objective = &config.objective;
         let both = [&found.x0, &target];
-        let mut loss = objective.loss(g, schedule, &self.t_dancers, both, &self.mask)?;
+        let layout = normalizer.layout();
+        let mut loss = objective.loss(g, layout, schedule, &self.t_dancers, both, &self.mask)?;
         let mut losses = Losses { total: 0.0, parts: Vec::new() };
         losses.parts.push(("diffusion", loss.scalar().into()));
         let of_estimate = objective.estimate.loss(

@@ -3,7 +3,8 @@
 use crate::autodiff::op::binary::{Binary, Pair};
 use crate::autodiff::{Backward, Element, Interpreter, Operation, Run, Tensor};
 use crate::model::{Graph, GraphError, Result};
-use crate::motion::{Channel, Normalizer};
+use crate::motion::vector::{cross, inner};
+use crate::motion::{Columns, Normalizer};
 
 /// Points on a body of 0.35 m radius, in its own frame, m: sides, head and front.
 const MARKERS_M: [[f64; 3]; 4] =
@@ -16,14 +17,6 @@ const EPSILON: f64 = 1e-6;
 /// \[…, 4\] → \[…, 3 points\]
 struct RotatedPoints<E: Element> {
     q: Option<Tensor<E>>,
-}
-
-fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-}
-
-fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
 fn parts<E: Element>(q: &[E]) -> (f64, [f64; 3]) {
@@ -72,8 +65,8 @@ impl<E: Element> Operation<E> for RotatedPoints<E> {
                     for (d, m) in dy.chunks_exact(3).zip(MARKERS_M) {
                         let d = [d[0].to_f64(), d[1].to_f64(), d[2].to_f64()];
                         let c = cross(m, d);
-                        let (ud, um, md) = (dot(u, d), dot(u, m), dot(m, d));
-                        sum[0] += 2.0 * dot(d, cross(u, m));
+                        let (ud, um, md) = (inner(u, d), inner(u, m), inner(m, d));
+                        sum[0] += 2.0 * inner(d, cross(u, m));
                         for i in 0..3 {
                             sum[1 + i] +=
                                 2.0 * w * c[i] + 2.0 * (d[i] * um + m[i] * ud - 2.0 * u[i] * md);
@@ -86,25 +79,26 @@ impl<E: Element> Operation<E> for RotatedPoints<E> {
     }
 }
 
-/// Returns where markers of a normalised motion are, m. \[…, 25\] → \[…, 12\]
+/// Returns where markers of a normalised motion are, m. \[…, columns\] → \[…, 12\]
 pub fn markers<I: Interpreter>(
     g: &mut I,
     normalizer: &Normalizer,
     motion: &Tensor<I::Element>,
 ) -> Result<Tensor<I::Element>> {
-    let in_units = |g: &mut I, channel: Channel| -> Result<Tensor<I::Element>> {
-        let x = g.channels(motion, channel.range())?;
+    let in_units = |g: &mut I, columns: Columns| -> Result<Tensor<I::Element>> {
+        let x = g.channels(motion, columns.range())?;
         let constant = |g: &I, of: &[f32]| {
             let values: Vec<_> =
-                channel.range().map(|i| I::Element::from_f64(of[i].into())).collect();
+                columns.range().map(|i| I::Element::from_f64(of[i].into())).collect();
             g.constant(&[values.len()], &values)
         };
         let (scale, centre) = (constant(g, &normalizer.scale), constant(g, &normalizer.centre));
         let x = g.apply(Binary::new(Pair::Multiply), &[&x, &scale])?;
         g.apply(Binary::new(Pair::Add), &[&x, &centre])
     };
-    let p = in_units(g, Channel::Position)?;
-    let q = in_units(g, Channel::Quaternion)?;
+    let body = normalizer.layout().body();
+    let p = in_units(g, body.position)?;
+    let q = in_units(g, body.orientation)?;
     let q = g.normalize(&q, EPSILON)?;
     let around = g.apply(RotatedPoints { q: None }, &[&q])?;
     let places: Vec<&Tensor<I::Element>> = MARKERS_M.iter().map(|_| &p).collect();
@@ -118,15 +112,16 @@ mod tests {
     use crate::autodiff::op::reduce::{Over, Reduce};
     use crate::autodiff::{Arena, Eager, Gradients, Parameters, Tape};
     use crate::model::ParameterList;
-    use crate::motion::MOTION_DIM;
+    use crate::motion::layout::tests::ROOT;
     use crate::motion::quaternion::rotate;
+    use crate::motion::{BODY, Layout, MOTION_DIM};
 
-    fn motion() -> Vec<f64> {
-        (0..3 * MOTION_DIM).map(|i| ((i * 37 % 23) as f64 - 11.0) / 9.0).collect()
+    fn motion(width: usize) -> Vec<f64> {
+        (0..3 * width).map(|i| ((i * 37 % 23) as f64 - 11.0) / 9.0).collect()
     }
 
-    fn normalizer() -> Normalizer {
-        let mut normalizer = Normalizer::identity();
+    fn normalizer(layout: Layout) -> Normalizer {
+        let mut normalizer = Normalizer::identity_of(layout);
         for (i, (scale, centre)) in
             normalizer.scale.iter_mut().zip(&mut normalizer.centre).enumerate()
         {
@@ -139,21 +134,23 @@ mod tests {
     #[test]
     fn markers_stand_where_the_pose_puts_them() {
         let (parameters, arena) = (Parameters::new(ParameterList::default(), 0), Arena::default());
-        let mut g = Eager::new(&parameters, &arena);
-        let (values, normalizer) = (motion(), normalizer());
-        let x = g.input(&[1, 3, MOTION_DIM], &values);
-        let y = markers(&mut g, &normalizer, &x).expect("shapes fit");
-        for (row, found) in values.chunks(MOTION_DIM).zip(y.data().chunks(12)) {
-            let unnormalized = |i: usize| {
-                row[i] * f64::from(normalizer.scale[i]) + f64::from(normalizer.centre[i])
-            };
-            let q: [f64; 4] =
-                std::array::from_fn(|i| unnormalized(Channel::Quaternion.range().start + i));
-            let norm = q.iter().map(|x| x * x).sum::<f64>().sqrt();
-            for (found, m) in found.chunks(3).zip(MARKERS_M) {
-                let turned = rotate(q.map(|x| x / norm), m);
-                for i in 0..3 {
-                    assert!((found[i] - (unnormalized(i) + turned[i])).abs() < 1e-12, "{found:?}");
+        for (layout, first) in [(BODY, 9), (ROOT, 6)] {
+            let mut g = Eager::new(&parameters, &arena);
+            let (values, normalizer) = (motion(layout.width()), normalizer(layout));
+            let x = g.input(&[1, 3, layout.width()], &values);
+            let y = markers(&mut g, &normalizer, &x).expect("shapes fit");
+            for (row, found) in values.chunks(layout.width()).zip(y.data().chunks(12)) {
+                let unnormalized = |i: usize| {
+                    row[i] * f64::from(normalizer.scale[i]) + f64::from(normalizer.centre[i])
+                };
+                let q: [f64; 4] = std::array::from_fn(|i| unnormalized(first + i));
+                let norm = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+                for (found, m) in found.chunks(3).zip(MARKERS_M) {
+                    let turned = rotate(q.map(|x| x / norm), m);
+                    for i in 0..3 {
+                        let off = found[i] - (unnormalized(i) + turned[i]);
+                        assert!(off.abs() < 1e-12, "{found:?}");
+                    }
                 }
             }
         }
@@ -162,7 +159,7 @@ mod tests {
     #[test]
     fn gradients_are_those_of_central_differences() {
         let (parameters, arena) = (Parameters::new(ParameterList::default(), 0), Arena::default());
-        let normalizer = normalizer();
+        let normalizer = normalizer(BODY);
         let value = |values: &[f64]| {
             let mut tape = Tape::new(&parameters, &arena, None);
             let x = tape.input(&[1, 3, MOTION_DIM], values);
@@ -175,7 +172,7 @@ mod tests {
             let found = tape.backward(sum, &mut Gradients::new(&parameters)).expect("finite");
             (scalar, found.of(&x).expect("a gradient").data().to_vec())
         };
-        let values = motion();
+        let values = motion(MOTION_DIM);
         let (_, gradient) = value(&values);
         for i in 0..values.len() {
             let at = |by: f64| {

@@ -11,11 +11,9 @@ use std::sync::Arc;
 use crate::autodiff::{Arena, Eager, Gradients, Interpreter as _, Parameters, Tape, Threads};
 use crate::diffusion::Schedule;
 use crate::model::{GroupConfig, GroupNetworks};
-use crate::weights::{Archive, Section};
 
-use super::averaged::NetworkState;
+use super::averaged::{NetworkState, keeps_network};
 use super::batch::{Batch, PAIR};
-use super::checkpoint::Progress;
 use super::diffusion::tape_seed;
 use super::drive::{Learner, Losses, NoReduction, Reducer, StepResult, Validation};
 use super::error::TrainingError;
@@ -194,24 +192,5 @@ impl Learner for GroupLearner {
         Ok(Validation { losses, live: Some(live.total), distance: None })
     }
 
-    fn sections(&self) -> Vec<Section<'_, f32>> {
-        self.network.sections()
-    }
-
-    fn best(&self) -> Vec<Section<'_, f32>> {
-        self.network.best()
-    }
-
-    fn n_updates(&self) -> (u64, u64) {
-        self.network.n_updates()
-    }
-
-    fn restore(
-        &mut self,
-        archive: &Archive,
-        place: &str,
-        at: &Progress,
-    ) -> Result<(), TrainingError> {
-        self.network.restore(archive, place, at)
-    }
+    keeps_network!(network);
 }

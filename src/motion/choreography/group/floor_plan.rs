@@ -1,10 +1,10 @@
 //! Where every dancer's place is at every moment, and how far from it a dancer may step.
 
-use super::super::super::group::RADIUS_M;
-use super::super::super::placement::Placement;
-use super::super::super::style::Window;
 use super::formation::{least_distance_m, pairs};
 use super::plan::GroupSpan;
+use crate::motion::group::RADIUS_M;
+use crate::motion::placement::Placement;
+use crate::motion::style::Window;
 use crate::units::frames_to_s;
 
 /// Kept between two bodies beyond their radii, m.

@@ -2,8 +2,8 @@
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
-use super::super::super::placement::Placement;
 use crate::chance::Chance;
+use crate::motion::placement::Placement;
 
 /// Least distance between two places of a formation, m.
 pub const MIN_SPACING_M: f64 = 1.6;

@@ -20,17 +20,17 @@ use std::ops::RangeInclusive;
 
 use ndarray::{Array3, ArrayView2, Axis, s};
 
-use super::super::channels::{Channel, MOTION_DIM};
-use super::super::group::MAX_DANCERS;
-use super::super::kinematics::Poses;
-use super::super::phase::bar_phase;
-use super::super::placement::Placement;
-use super::super::quaternion::{
-    Quaternion, from_axis_angle, make_sign_continuous, mul, nearer, rotate, slerp_as_signed,
-};
 use super::primitive::UP;
 use super::{DIFFERENCED_FRAMES, Repertoire, STEPS_STREAM, Song, channels, floor, selection};
 use crate::chance::Chance;
+use crate::motion::channels::{Channel, MOTION_DIM};
+use crate::motion::group::MAX_DANCERS;
+use crate::motion::kinematics::Poses;
+use crate::motion::phase::bar_phase;
+use crate::motion::placement::Placement;
+use crate::motion::quaternion::{
+    Quaternion, from_axis_angle, make_sign_continuous, mul, nearer, rotate, slerp_as_signed,
+};
 use crate::units::frames_to_s;
 pub use formation::{Formation, MIN_SPACING_M};
 pub use plan::{GroupSpan, MIN_SPAN_S};

@@ -2,12 +2,12 @@
 
 use ndarray::Array2;
 
-use super::super::super::group::assign;
-use super::super::super::placement::Placement;
-use super::super::beat_grid::BeatGrid;
 use super::formation::{Formation, distance_m};
 use super::unison::{Part, Unison};
 use crate::chance::Chance;
+use crate::motion::choreography::beat_grid::BeatGrid;
+use crate::motion::group::assign;
+use crate::motion::placement::Placement;
 use crate::units::s_to_frames;
 
 /// Shortest span, s.

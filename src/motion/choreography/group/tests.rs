@@ -2,9 +2,9 @@
 
 use ndarray::Array2;
 
-use super::super::choreograph;
-use super::super::tests::{Music, SONGS, check_identities, column, repertoire};
 use super::*;
+use crate::motion::choreography::choreograph;
+use crate::motion::choreography::tests::{Music, SONGS, check_identities, column, repertoire};
 use crate::motion::group::RADIUS_M;
 use crate::motion::locking::bar_locking;
 use crate::units::FPS;

@@ -1,7 +1,7 @@
 //! Unison: how the steps of the dancers of a group belong together.
 
-use super::super::super::placement::Placement;
-use super::super::beat_grid::BeatGrid;
+use crate::motion::choreography::beat_grid::BeatGrid;
+use crate::motion::placement::Placement;
 
 /// Time that a dancer takes to come to rest, or to start, about a downbeat, s.
 const START_S: f64 = 0.3;

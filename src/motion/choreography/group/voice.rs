@@ -1,12 +1,12 @@
 //! Voices: choreographies that stay about one place and face forward, to be danced by several.
 
-use super::super::super::kinematics::Poses;
-use super::super::super::quaternion::{Quaternion, from_axis_angle, mul, normalize, rotate};
-use super::super::super::spline::CubicSpline;
-use super::super::super::style::Window;
-use super::super::joining;
-use super::super::primitive::{Repertoire, UP, headings};
-use super::super::selection::DanceStep;
+use crate::motion::choreography::joining;
+use crate::motion::choreography::primitive::{Repertoire, UP, headings};
+use crate::motion::choreography::selection::DanceStep;
+use crate::motion::kinematics::Poses;
+use crate::motion::quaternion::{Quaternion, from_axis_angle, mul, normalize, rotate};
+use crate::motion::spline::CubicSpline;
+use crate::motion::style::Window;
 use crate::units::frames_to_s;
 
 /// Length of the Hann window over which a dancer comes back to its place and heading, frames: 4 s. Odd, so

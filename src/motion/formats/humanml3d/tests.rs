@@ -1,7 +1,7 @@
 use proptest::prelude::*;
 
-use super::super::super::convert_track;
 use super::*;
+use crate::motion::convert_track;
 
 /// Joint positions of somebody who stands, in the root's frame: head, neck, spine and legs are enough.
 fn standing() -> Vec<f64> {

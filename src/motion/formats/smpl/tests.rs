@@ -2,10 +2,10 @@ use std::io::Cursor;
 
 use proptest::prelude::*;
 
-use super::super::super::npz::NpzWriter;
-use super::super::super::quaternion::{from_axis_angle, normalize};
-use super::super::super::{Capture, CaptureError, convert_track};
 use super::*;
+use crate::motion::npz::NpzWriter;
+use crate::motion::quaternion::{from_axis_angle, normalize};
+use crate::motion::{Capture, CaptureError, convert_track};
 
 type Member<'a> = (&'a str, &'a [usize], Vec<f64>);
 

@@ -2,10 +2,10 @@
 
 use std::f64::consts::PI;
 
-use super::super::super::capture::{Axis, RigidTrack};
-use super::super::super::quaternion::{Quaternion, from_axis_angle, mul, rotate};
 use super::curve::{Curve, Keyed, Keys};
 use super::{CAMERA_KEY_BYTES, RATE_HZ, UNIT_M, VmdError, f32_at, n_frames, position_m, u32_at};
+use crate::motion::capture::{Axis, RigidTrack};
+use crate::motion::quaternion::{Quaternion, from_axis_angle, mul, rotate};
 
 const X: [f64; 3] = [1.0, 0.0, 0.0];
 const Y: [f64; 3] = [0.0, 1.0, 0.0];

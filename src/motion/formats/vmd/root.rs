@@ -1,9 +1,9 @@
 //! The bones that carry a model: 全ての親 (root of all), センター (centre) on it, グルーブ (groove) on that.
 
-use super::super::super::capture::{Axis, RigidTrack};
-use super::super::super::quaternion::{IDENTITY, Quaternion, dot, mul, normalize, rotate, slerp};
 use super::curve::{Curve, Keyed, Keys};
 use super::{BONE_KEY_BYTES, RATE_HZ, UNIT_M, VmdError, f32_at, n_frames, position_m, u32_at};
+use crate::motion::capture::{Axis, RigidTrack};
+use crate::motion::quaternion::{IDENTITY, Quaternion, dot, mul, normalize, rotate, slerp};
 
 /// Length of a bone's name, padded with NUL.
 const NAME_BYTES: usize = 15;

@@ -1,7 +1,7 @@
 use proptest::prelude::*;
 
-use super::super::super::convert_track;
 use super::*;
+use crate::motion::convert_track;
 
 const CENTRE: &[u8] = &[0x83, 0x5a, 0x83, 0x93, 0x83, 0x5e, 0x81, 0x5b];
 /// Curves along the diagonal.

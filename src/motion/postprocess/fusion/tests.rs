@@ -4,7 +4,7 @@ use super::super::noise::{
     NONE, Noise, VARIANCES, exact, farthest, frames, fused, mean_square, noisy, truth,
 };
 use super::*;
-use crate::motion::channels::{Channel, MOTION_DIM};
+use crate::motion::channels::{BODY, Channel, MOTION_DIM};
 use crate::motion::kinematics::{Poses, forward_differences, frames_of};
 use crate::motion::npy;
 use crate::motion::postprocess::{
@@ -335,7 +335,7 @@ fn what_follows_from_fused_poses_is_derived_and_a_second_time_changes_little() {
         let mut found = decoded.clone();
         let moved = process_holding(&config, &mut found, None, &NONE).expect("fused");
         assert_eq!(moved.position_max_mm > 0.0, n > 1, "a single frame has nothing to agree with");
-        let measured = FusionMeasurements::of(found.view());
+        let measured = FusionMeasurements::of(&BODY.body(), found.view());
         let poses = Poses { position_m: measured.position, orientation: measured.orientation };
         let derived = frames_of(&poses, n);
         assert_eq!(found, derived);
@@ -368,7 +368,7 @@ fn a_capture_comes_out_of_noise_better_than_by_smoothing() {
             PostProcessConfig { coherence, savitzky_golay, ..PostProcessConfig::default() };
         let mut frames = decoded.clone();
         process(&config, &mut frames, None);
-        let found = FusionMeasurements::of(frames.view());
+        let found = FusionMeasurements::of(&BODY.body(), frames.view());
         let error: f64 =
             (0..3).map(|axis| mean_square(&found.position, &poses.position_m, axis)).sum();
         let d = forward_differences;
