@@ -10,5 +10,6 @@ mod operations;
 mod optimizer;
 mod outline;
 mod overfit;
+mod planner;
 mod state_dict;
 mod tokens;

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use crate::support::{Dir, finish, motiongen, run};
 
 /// Stages, and kinds of stages that take flags of their own.
-const COMMANDS: [&[&str]; 19] = [
+const COMMANDS: [&[&str]; 20] = [
     &["ingest"],
     &["extract"],
     &["library"],
@@ -20,6 +20,7 @@ const COMMANDS: [&[&str]; 19] = [
     &["plot", "features"],
     &["plot", "training"],
     &["plot", "motion"],
+    &["plot", "tokens"],
     &["view"],
     &["query"],
     &["status"],

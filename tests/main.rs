@@ -33,6 +33,7 @@ mod npy_files;
 mod object_store_conformance;
 mod onnx;
 mod outputs;
+mod planner;
 mod plot_features;
 mod plot_motion;
 mod plot_training;

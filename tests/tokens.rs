@@ -33,7 +33,7 @@ const SMALL: [&str; 9] = [
 const CODES: i32 = 16;
 
 /// Writes phrases of 29 to 61 frames of soloists, 13 to train and 3 to validate, and a group of two.
-fn make_store(dir: &Dir) -> PathBuf {
+pub fn make_store(dir: &Dir) -> PathBuf {
     let (source, store) = (dir.at("source"), dir.at("store"));
     let names = |split: &'static str, n: usize| {
         let all = (0..).map(|i| format!("phrase {i:03}"));
@@ -62,7 +62,7 @@ fn make_store(dir: &Dir) -> PathBuf {
     store
 }
 
-fn train_command(store: &Path, run: &str, more: &[&str]) -> Command {
+pub fn train_command(store: &Path, run: &str, more: &[&str]) -> Command {
     let mut command = motiongen();
     command.arg("train").arg("--store").arg(store).args(["--run", run, "--quiet"]);
     let flag = |argument: &str| argument.split('=').next().unwrap_or_default().to_owned();
@@ -71,7 +71,7 @@ fn train_command(store: &Path, run: &str, more: &[&str]) -> Command {
     command
 }
 
-fn train(store: &Path, run: &str, more: &[&str]) -> Output {
+pub fn train(store: &Path, run: &str, more: &[&str]) -> Output {
     finish(&mut train_command(store, run, more))
 }
 
@@ -350,8 +350,8 @@ fn mistakes_are_named() {
     assert_eq!(output.code, 2, "{output:?}");
     assert!(
         output.stderr.contains(
-            "run run has a tokenizer, and models of the family tokens are not exported; motiongen tokenize reads \
-             it from the store"
+            "run run has a tokenizer, which makes no motion for music; train a planner of its tokens (motiongen \
+             train --family tokens --tokenizer run --run NAME) and export that run"
         ),
         "{output:?}"
     );

@@ -158,6 +158,34 @@ pub enum DiffusionError {
          give it a number or take it out of the mask"
     )]
     KnownNotFinite { value: f32, index: [usize; 3] },
+    #[error(
+        "tokens are drawn in {n_iterations} iterations; it must be 1 to {most}, and 10 are usual"
+    )]
+    Iterations { n_iterations: usize, most: usize },
+    #[error(
+        "{what} is {temperature}; it must be a number of at least 0, and {} is usual",
+        usual_temperature(.what)
+    )]
+    Temperature { what: &'static str, temperature: f64 },
+    #[error(
+        "the share of tokens that may be drawn is {top_share}; it must lie above 0 and not above 1, and 0.1 is usual"
+    )]
+    TopShare { top_share: f64 },
+    #[error(
+        "token {token} is none of the {n_codes} that the planner knows, 0 to {}; give tokens of the tokenizer that it \
+         was trained with",
+        .n_codes.saturating_sub(1)
+    )]
+    Token { token: u32, n_codes: usize },
+    #[error(
+        "a planner says of a token what is no number; its weights are damaged, or its training went wrong"
+    )]
+    Logits,
+}
+
+/// Returns the temperature that most take.
+fn usual_temperature(what: &str) -> u8 {
+    u8::from(what == "temperature")
 }
 
 impl DiffusionError {

@@ -39,12 +39,14 @@
 //! - Lugmayr et al., "RePaint", CVPR 2022, arXiv 2201.09865: known values
 //! - Hang et al., "Efficient Diffusion Training via Min-SNR Weighting Strategy", ICCV 2023,
 //!   arXiv 2303.09556
+//! - those of tokens are in `discrete`
 //! - Lin et al., "Common Diffusion Noise Schedules and Sample Steps are Flawed", WACV 2024,
 //!   arXiv 2305.08891: spacing
 
 mod config;
 mod ddim;
 mod ddpm;
+mod discrete;
 mod dpm_solver;
 mod guidance;
 mod inpaint;
@@ -58,6 +60,7 @@ mod weighting;
 pub use config::{BetaSchedule, DiffusionConfig, DiffusionError, LossType, MAX_STEPS, Prediction};
 pub use ddim::{DdimCoefficients, ddim_linear, ddim_update};
 pub use ddpm::{Posterior, posterior};
+pub use discrete::{TokenSampling, n_masked, sample_autoregressive, sample_masked};
 pub use dpm_solver::{DpmCoefficients, dpm_solver_update};
 pub use guidance::{denoise_guided, guided};
 pub use inpaint::KnownValues;

@@ -30,6 +30,10 @@ pub mod file_names {
     /// Of a model of the family `group`.
     pub const DENOISER: &str = "denoiser.onnx";
     pub const SCORE: &str = "score.onnx";
+    /// Of a model of the family `tokens`, which has a denoiser too.
+    pub const ENCODER: &str = "encoder.onnx";
+    pub const SIGNAL: &str = "signal.onnx";
+    pub const PLANNER: &str = "planner.onnx";
 }
 
 /// The files that a model can have beside its card; a card can name no other.
@@ -41,17 +45,23 @@ pub enum ModelFileName {
     DecoderWeights,
     Denoiser,
     Score,
+    Encoder,
+    Signal,
+    Planner,
 }
 
 impl ModelFileName {
     /// Every name, in the order in which cards list them.
-    pub const ALL: [Self; 6] = [
+    pub const ALL: [Self; 9] = [
         Self::Unet,
         Self::UnetWeights,
         Self::Decoder,
         Self::DecoderWeights,
         Self::Denoiser,
         Self::Score,
+        Self::Encoder,
+        Self::Signal,
+        Self::Planner,
     ];
 
     /// Returns the name of the file.
@@ -63,6 +73,9 @@ impl ModelFileName {
             Self::DecoderWeights => file_names::DECODER_WEIGHTS,
             Self::Denoiser => file_names::DENOISER,
             Self::Score => file_names::SCORE,
+            Self::Encoder => file_names::ENCODER,
+            Self::Signal => file_names::SIGNAL,
+            Self::Planner => file_names::PLANNER,
         }
     }
 
@@ -213,7 +226,11 @@ impl FamilyCard for ModelCard {
             ModelFileName::Decoder | ModelFileName::DecoderWeights => {
                 Some(most_bytes(MotionDecoder::new(decoder).1.n_elements()))
             }
-            ModelFileName::Denoiser | ModelFileName::Score => None,
+            ModelFileName::Denoiser
+            | ModelFileName::Score
+            | ModelFileName::Encoder
+            | ModelFileName::Signal
+            | ModelFileName::Planner => None,
         }
     }
 }

@@ -238,6 +238,11 @@ impl Constraints {
 
     /// Returns how far a track's motion, `[T, 25]` in the world, is from each constraint.
     pub fn errors(&self, frames: ArrayView2<f32>) -> Vec<Miss> {
+        self.errors_from(frames, 0)
+    }
+
+    /// The same of a part of a track that begins at frame `first`.
+    pub(super) fn errors_from(&self, frames: ArrayView2<f32>, first: usize) -> Vec<Miss> {
         let error = |(t, wanted): (usize, WantedValue)| Miss {
             frame: t,
             what: wanted.what(),
@@ -251,11 +256,11 @@ impl Constraints {
                 }
             },
         };
-        self.in_range(0, frames.nrows()).map(error).collect()
+        self.in_range(first, frames.nrows()).map(error).collect()
     }
 
     /// The constraints of some frames, which are counted from `first`.
-    fn in_range(&self, first: usize, n: usize) -> impl Iterator<Item = (usize, WantedValue)> + '_ {
+    pub(super) fn in_range(&self, first: usize, n: usize) -> impl Iterator<Item = (usize, WantedValue)> + '_ {
         let inside = move |&(frame, wanted): &(usize, WantedValue)| {
             frame.checked_sub(first).filter(|t| *t < n).map(|t| (t, wanted))
         };
@@ -293,13 +298,13 @@ fn spread<const N: usize>(errors: &[(usize, [f64; N])], n_frames: usize) -> Vec<
     changes
 }
 
-fn orientation(frames: ArrayView2<f32>, t: usize) -> Quaternion {
+pub(super) fn orientation(frames: ArrayView2<f32>, t: usize) -> Quaternion {
     let first = Channel::Quaternion.range().start;
     normalize(std::array::from_fn(|i| f64::from(frames[[t, first + i]])))
 }
 
 /// The rotation that turns `from` into `to`, as its axis times its angle, along the shorter arc.
-fn rotation_vector(to: Quaternion, from: Quaternion) -> [f64; 3] {
+pub(super) fn rotation_vector(to: Quaternion, from: Quaternion) -> [f64; 3] {
     angular_velocity(from, to, 1.0)
 }
 

@@ -37,7 +37,10 @@ pub use pool::Pool;
 pub use retrieval::Retrieval;
 pub use runtime::{OnnxEngine, SessionPlan};
 pub use sampling::{Sampling, sample};
-pub use tokens::TokenEngine;
+pub use tokens::{
+    PlanRequest, PlannerEngine, TokenEngine, TokenGenerator, TokenTrack, TokensCard,
+    TokensNetworks, TokensProvenance, tokens_parameters,
+};
 pub use track::{
     Generator, OVERLAP_FRAMES, PrimingMotion, RUN_WINDOWS, Track, WeightedConstraints,
 };

@@ -266,7 +266,10 @@ impl Run<'_> {
 
 /// Gives each orientation the sign that is nearer to the one before, q and −q being one orientation; returns the
 /// last.
-fn continue_signs(frames: &mut Array2<f32>, before: Option<Quaternion>) -> Option<Quaternion> {
+pub(super) fn continue_signs(
+    frames: &mut Array2<f32>,
+    before: Option<Quaternion>,
+) -> Option<Quaternion> {
     let columns = Channel::Quaternion.range();
     let mut before = before;
     for mut row in frames.rows_mut() {
@@ -281,7 +284,7 @@ fn continue_signs(frames: &mut Array2<f32>, before: Option<Quaternion>) -> Optio
 }
 
 /// Returns where a motion stands at a frame.
-fn placement_at(motion: &Array2<f32>, frame: usize) -> Placement {
+pub(super) fn placement_at(motion: &Array2<f32>, frame: usize) -> Placement {
     Placement::of_first(motion.slice(s![frame.., ..])).unwrap_or_default()
 }
 

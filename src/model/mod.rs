@@ -2,8 +2,8 @@
 //!
 //! [`Graph`] is what an interpreter offers; [`UNet1D`] predicts noise from noisy motion, step and
 //! music; [`MotionDecoder`] turns what was sampled into the 25 channels; [`GroupDenoiser`] predicts the motion of a
-//! group, and [`GroupScore`] how well motion fits its group; [`Tokenizer`] turns motion into tokens and back. This room
-//! knows shapes and names, not numbers: values are the interpreter's.
+//! group, and [`GroupScore`] how well motion fits its group; [`Tokenizer`] turns motion into tokens and back, and a
+//! [`Planner`] music into tokens. This room knows shapes and names, not numbers: values are the interpreter's.
 
 mod condition;
 mod decoder;
@@ -30,5 +30,7 @@ pub use group::{
 pub use layers::{AttentionBlock, Conv1d, GroupNorm, LayerNorm, Linear, ResBlock};
 pub use outline::{ActivationCounts, Layer, Outline};
 pub use parameter::{Init, Parameter, ParameterId, ParameterList, Role, Scope};
-pub use tokens::{Quantized, Tokenizer, TokensConfig};
+pub use tokens::{
+    Planner, PlannerConfig, PlannerInputs, PlannerKind, Quantized, Tokenizer, TokensConfig,
+};
 pub use unet::{ConfigError, Preset, UNet1D, UNetConfig, UNetInputs};

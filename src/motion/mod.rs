@@ -21,6 +21,7 @@ pub mod capture;
 pub mod channels;
 pub mod choreography;
 pub mod clock;
+pub mod correction;
 mod dancers;
 pub mod exchange;
 pub mod formats;

@@ -89,6 +89,15 @@ pub struct Builder<'p> {
     label: String,
 }
 
+/// Names an axis of an input or output.
+fn name_axis(info: Option<&mut ValueInfo>, axis: usize, name: &str) {
+    let shape = info.and_then(|info| info.r#type.as_mut());
+    let shape = shape.and_then(|t| t.tensor_type.as_mut()).and_then(|t| t.shape.as_mut());
+    if let Some(dimension) = shape.and_then(|shape| shape.dim.get_mut(axis)) {
+        dimension.value = Some(Size::Name(name.to_owned()));
+    }
+}
+
 impl<'p> Builder<'p> {
     /// Begins with a network's parameters and where their values come from, in PyTorch's layout.
     pub fn new(
@@ -147,11 +156,12 @@ impl<'p> Builder<'p> {
 
     /// Names an axis of the input that was added last.
     pub(super) fn name_axis(&mut self, axis: usize, name: &str) {
-        let shape = self.inputs.last_mut().and_then(|info| info.r#type.as_mut());
-        let shape = shape.and_then(|t| t.tensor_type.as_mut()).and_then(|t| t.shape.as_mut());
-        if let Some(dimension) = shape.and_then(|shape| shape.dim.get_mut(axis)) {
-            dimension.value = Some(Size::Name(name.to_owned()));
-        }
+        name_axis(self.inputs.last_mut(), axis, name);
+    }
+
+    /// Names an axis of the output that was added last.
+    pub(super) fn name_output_axis(&mut self, axis: usize, name: &str) {
+        name_axis(self.outputs.last_mut(), axis, name);
     }
 
     /// Adds an input of whole numbers.
@@ -208,7 +218,8 @@ impl<'p> Builder<'p> {
             op_type: "Identity".to_owned(),
             ..Node::default()
         });
-        self.outputs.push(value_info(name, value.axes, value.channels, DataType::Float, meaning));
+        let data_type = if value.integer { DataType::Int64 } else { DataType::Float };
+        self.outputs.push(value_info(name, value.axes, value.channels, data_type, meaning));
         Ok(())
     }
 

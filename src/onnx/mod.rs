@@ -17,6 +17,7 @@ mod proto;
 mod runtime;
 mod session;
 mod storage;
+mod tokens;
 mod weights;
 
 pub use builder::{Axes, Builder, Form, Value};
@@ -31,4 +32,8 @@ pub use proto::{Graph, Model};
 pub use runtime::{Device, PINNED_VERSION, Runtime};
 pub use session::{NamedTensor, Numbers, Session, SessionOptions};
 pub use storage::Storage;
+pub use tokens::{
+    PlannerNames, SignalDenoiserNames, SignalNames, TokenEncoderNames, planner, token_denoiser,
+    token_encoder, token_signal,
+};
 pub use weights::values_of;

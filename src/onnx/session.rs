@@ -152,8 +152,13 @@ impl Session {
             let value: &DynValue = outputs
                 .get(output)
                 .ok_or_else(|| ort::Error::new(format!("there is no output {output}")))?;
+            let sizes = |shape: &[i64]| shape.iter().map(|&n| n.max(0) as usize).collect();
+            // Whole numbers that networks return are indices, which f32 holds.
+            if let Ok((shape, numbers)) = value.try_extract_tensor::<i64>() {
+                return Ok((sizes(shape), numbers.iter().map(|&x| x as f32).collect()));
+            }
             let (shape, numbers) = value.try_extract_tensor::<f32>()?;
-            Ok((shape.iter().map(|&n| n.max(0) as usize).collect(), numbers.to_vec()))
+            Ok((sizes(shape), numbers.to_vec()))
         };
         run().map_err(|e| OnnxError::Run { place: place.clone(), reason: one_line(e.message()) })
     }

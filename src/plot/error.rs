@@ -19,6 +19,9 @@ pub enum PlotError {
          dancers and frames"
     )]
     Group { n_dancers: usize, n_frames: usize, n_channels: usize, wanted: usize },
+    /// Codes of which none is used.
+    #[error("no tokens to plot; run motiongen tokenize first")]
+    NoTokens,
     /// Mel bands that give no axis.
     #[error(
         "{found} mel band frequencies; a plot needs {wanted} that are finite, above 0 Hz and rise"

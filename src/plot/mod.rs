@@ -29,6 +29,7 @@ mod style;
 mod svg;
 #[cfg(test)]
 mod tests;
+mod tokens;
 mod training;
 mod training_panel;
 mod value_axis;
@@ -39,6 +40,7 @@ pub use group::{GroupPlot, group};
 pub use motion::{MOTION_WIDTH_PX, MotionPlot, motion};
 pub use motion_panel::MotionPanel;
 pub use panel::Panel;
+pub use tokens::{TokensPlot, tokens};
 pub use training::{PanelCurves, StageCurves, TrainingPlot, training};
 pub use training_panel::{TrainingPanel, TrainingStage};
 

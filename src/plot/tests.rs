@@ -2,6 +2,7 @@
 
 mod group;
 mod motion;
+mod tokens;
 mod training;
 
 use ndarray::{Array2, ArrayView2};

@@ -2,7 +2,7 @@
 
 use bytes::Bytes;
 
-use super::generate::weights_digest;
+use super::generate::{weights_digest, weights_digest_of_tokens};
 use super::model_files::{current_folder, folder_of, is_model_name};
 use super::train::session::{MachineParams, ProgressWatch, read_phrases};
 use super::trained::{FinetuneData, TrainedRun};
@@ -10,7 +10,7 @@ use super::{Progress, Stage as _, finetune::Finetune, pretrained, train::Train};
 
 use crate::generation::{
     CardError, FamilyCard as _, GroupCard, LearnedFrom, MAX_CARD_BYTES, ModelCard, Purpose,
-    family_of, file_names,
+    TokensCard, family_of, file_names,
 };
 use crate::model::Family;
 use crate::store::{Location, Patience, StoreError};
@@ -117,6 +117,29 @@ pub fn of_group(
     of_command(store, run, Train::NAME, (data, None), machine, progress, is_dry_run)
 }
 
+/// Returns what the weights of a planner and of its tokenizer learned from.
+///
+/// # Errors
+/// When the store cannot be read.
+pub fn of_planner(
+    store: &Location,
+    runs: [(&str, &str); 2],
+    machine: &MachineParams,
+    progress: &dyn Progress,
+    is_dry_run: bool,
+) -> anyhow::Result<Option<LearnedFrom>> {
+    let learned_by = |(run, data): (&str, &str)| {
+        let machine = (machine, Family::Tokens);
+        of_command(store, run, Train::NAME, (data, None), machine, progress, is_dry_run)
+    };
+    let [planner, tokenizer] = runs;
+    let Some(of_planner) = learned_by(planner)? else { return Ok(None) };
+    if planner.1 == tokenizer.1 {
+        return Ok(Some(of_planner));
+    }
+    Ok(learned_by(tokenizer)?.map(|of_tokenizer| of_planner.and(of_tokenizer)))
+}
+
 /// Returns what a command learned from the data with a fingerprint: from its list, and where that is missing or has
 /// gaps from the store.
 fn of_command(
@@ -208,10 +231,13 @@ pub fn of_model(
 /// Returns the digest of a model's weights, and what it learned from, as the card of a model of any family says.
 fn weights_and_music(card: &[u8], place: &str) -> Result<(String, Option<LearnedFrom>), CardError> {
     Ok(match family_of(card, place)? {
-        // No model is exported of the family tokens yet: such a card is refused by name.
-        Family::Unet | Family::Tokens => {
+        Family::Unet => {
             let card = ModelCard::read(card, place)?;
             (weights_digest(&card), card.provenance.learned_from)
+        }
+        Family::Tokens => {
+            let card = TokensCard::read(card, place)?;
+            (weights_digest_of_tokens(&card), card.provenance.learned_from)
         }
         Family::Group => {
             let card = GroupCard::read(card, place)?;

@@ -11,7 +11,7 @@ use super::pretrained;
 pub use crate::generation::is_name as is_model_name;
 use crate::generation::{
     CardError, FamilyCard as _, FileEntry, GroupCard, MAX_CARD_BYTES, ModelCard, ModelFileName,
-    family_of, file_names,
+    TokensCard, family_of, file_names,
 };
 use crate::model::Family;
 use crate::store::{Location, StoreError, prepared};
@@ -190,7 +190,8 @@ impl ModelFolder {
     ) -> Result<Self, CardError> {
         let family = family_of(&card_bytes, &card_place)?;
         let entries = match family {
-            Family::Unet | Family::Tokens => ModelCard::read(&card_bytes, &card_place)?.files,
+            Family::Unet => ModelCard::read(&card_bytes, &card_place)?.files,
+            Family::Tokens => TokensCard::read(&card_bytes, &card_place)?.files,
             Family::Group => GroupCard::read(&card_bytes, &card_place)?.files,
         };
         Ok(Self { family, card_bytes, card_place, entries, source, place, is_verified: false })

@@ -5,6 +5,7 @@ mod features;
 mod motion;
 pub(super) mod nearest;
 mod output;
+mod tokens;
 mod training;
 
 use super::{Contract, Progress, Stage, Summary};
@@ -28,13 +29,15 @@ pub enum PlotKind {
     Training(training::Params),
     /// draw a motion: its channels over time, its path
     Motion(motion::Params),
+    /// draw how often each code of a tokenizer is used
+    Tokens(tokens::Params),
 }
 
 impl Stage for Plot {
     const NAME: &'static str = "plot";
-    const ABOUT: &'static str = "draw features, training and motion as PNG or SVG";
+    const ABOUT: &'static str = "draw features, training, motion and tokens as PNG or SVG";
     const CONTRACT: Contract = Contract {
-        reads: "an audio file, or features, extractions and beats; training_log; motion or generated, or a motion file",
+        reads: "an audio file, or features, extractions and beats; training_log; motion or generated, or a motion file; tokens and tokenizations",
         writes: "an image file",
     };
     type Params = Params;
@@ -44,6 +47,7 @@ impl Stage for Plot {
             PlotKind::Features(params) => features::run(&params),
             PlotKind::Training(params) => training::run(&params),
             PlotKind::Motion(params) => motion::run(&params),
+            PlotKind::Tokens(params) => tokens::run(&params),
         }
     }
 }

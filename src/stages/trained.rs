@@ -1,12 +1,15 @@
 //! What training left of a run: its configuration and the weights that validated best.
 
+mod tokens;
+
 use crate::autodiff::Parameters;
-use crate::model::{MotionDecoder, ParameterList, Tokenizer, UNet1D};
+use crate::model::{MotionDecoder, ParameterList, UNet1D};
 use crate::store::Location;
 use crate::training::{
     CheckpointKind, Checkpoints, DecoderLearner, DiffusionLearner, FinetuneLearner, Learner as _,
-    State, TOKENS, TokensLearner, TokensTrainConfig, TrainConfig, TrainingError,
+    State, TrainConfig, TrainingError,
 };
+pub use tokens::{TrainedPlanner, TrainedTokenizer};
 
 /// Which weights of a run.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
@@ -99,46 +102,6 @@ impl TrainedRun {
         let decoder = best(&stage, run, "decoder.", what, decoder)?;
         let loss = state.progress.best.map(|best| best.loss);
         Ok(Self { state, unet, decoder, stage: DiffusionLearner::STAGE, loss, tuned: None })
-    }
-}
-
-/// A tokenizer that was trained.
-pub struct TrainedTokenizer {
-    pub state: State<TokensTrainConfig>,
-    pub parameters: Parameters<f32>,
-}
-
-impl TrainedTokenizer {
-    /// Reads the weights of a run that validated best.
-    ///
-    /// # Errors
-    /// [`TrainingError::Missing`] with the command that makes what is missing.
-    pub fn read(store: &Location, run: &str) -> Result<Self, TrainingError> {
-        let checkpoints = Checkpoints::new(store, run, TokensLearner::STAGE);
-        let Some(&step) = checkpoints.steps(CheckpointKind::Best)?.last() else {
-            let way_out = format!("run motiongen train --family tokens --run {run} first");
-            let (run, what) = (run.to_owned(), "trained tokenizer");
-            return Err(TrainingError::Missing { run, what, way_out });
-        };
-        checkpoints.read(CheckpointKind::Best, step, |archive, place| {
-            let state: State<TokensTrainConfig> = State::of(archive, place)?;
-            state.config.network.check()?;
-            let (_, list) = Tokenizer::new(&state.config.network.tokens);
-            let place = place.to_owned();
-            let parameters = archive
-                .section(TOKENS, list)
-                .map_err(|source| TrainingError::Weights { place, source })?;
-            Ok(Self { state, parameters })
-        })
-    }
-
-    /// Returns whether a run has a tokenizer.
-    ///
-    /// # Errors
-    /// When the store cannot be listed.
-    pub fn is_of(store: &Location, run: &str) -> Result<bool, TrainingError> {
-        let checkpoints = Checkpoints::new(store, run, TokensLearner::STAGE);
-        Ok(!checkpoints.steps(CheckpointKind::Best)?.is_empty())
     }
 }
 

@@ -127,7 +127,7 @@ rows! {
     {
         segment: String, "", "The stretch of the log, from one checkpoint to the next: `run/stage/` and the steps done before it.";
         run: String, "", "Name of the run.";
-        stage: String, "", "`diffusion` (the UNet), `decoder`, `finetune` (both, end to end), `group` (denoiser and score of groups) or `tokens` (a tokenizer).";
+        stage: String, "", "`diffusion` (the UNet), `decoder`, `finetune` (both, end to end), `group` (denoiser and score of groups), `tokens` (a tokenizer) or `planner` (of its tokens).";
         kind: String, "", "`step`, `epoch` (means over its steps) or `validation`.";
         epoch: i32, "epochs", "Epoch, from 1.";
         step: i64, "steps", "Steps done, this one included.";

@@ -56,7 +56,8 @@ pub use objective::{ChannelWeights, Objective, Reconstruction, reconstruction};
 pub use sampling::{Condition, Denoiser};
 pub use temporal::{TemporalConfig, TemporalLosses, temporal_losses};
 pub use tokens::{
-    Codebook, CodebookConfig, TOKENS, TokensLearner, TokensNetworkConfig, TokensTrainConfig,
-    TokensTraining, perplexity,
+    Codebook, CodebookConfig, FrozenTokenizer, PLANNER, PlannerLearner, PlannerNetworkConfig,
+    PlannerTrainConfig, PlannerTraining, TOKENS, TokenizerSource, TokensLearner,
+    TokensNetworkConfig, TokensTrainConfig, TokensTraining, perplexity,
 };
 pub use window::{Augmentation, Scales, Windows, fit_scales};

@@ -219,8 +219,9 @@ impl Head {
 /// [`CardError`] for a text that is no card, or one of another format.
 pub fn family_of(bytes: &[u8], place: &str) -> Result<Family, CardError> {
     let head = Head::read(bytes, place)?;
-    let is_group = head.family.as_deref() == Some(Family::Group.name());
-    Ok(if is_group { Family::Group } else { Family::Unet })
+    let known = [Family::Group, Family::Tokens];
+    let found = known.into_iter().find(|family| head.family.as_deref() == Some(family.name()));
+    Ok(found.unwrap_or(Family::Unet))
 }
 
 /// Refuses other channels, features or frames than those of this program.

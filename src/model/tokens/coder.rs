@@ -37,12 +37,12 @@ impl ResidualBlock {
 }
 
 /// Residual blocks, the one that sees farthest first.
-fn residual_blocks(scope: &mut Scope, config: &TokensConfig) -> Vec<ResidualBlock> {
-    let dilations = (0..config.depth).rev().map(|i| DILATION_GROWTH.pow(i as u32));
+fn residual_blocks(scope: &mut Scope, channels: usize, depth: usize) -> Vec<ResidualBlock> {
+    let dilations = (0..depth).rev().map(|i| DILATION_GROWTH.pow(i as u32));
     dilations
         .enumerate()
         .map(|(i, dilation)| {
-            ResidualBlock::new(&mut scope.at(format!("res.{i}")), config.conv_width, dilation)
+            ResidualBlock::new(&mut scope.at(format!("res.{i}")), channels, dilation)
         })
         .collect()
 }
@@ -54,7 +54,34 @@ struct Level {
     res: Vec<ResidualBlock>,
 }
 
-/// E: motion to latents, one for ρ frames.
+/// The sizes of an [`Encoder`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct EncoderConfig {
+    /// Channels of a frame.
+    pub inputs: usize,
+    /// Channels of a latent.
+    pub outputs: usize,
+    /// Channels in between.
+    pub conv_width: usize,
+    /// Residual blocks of a level.
+    pub depth: usize,
+    /// ρ: frames that a latent stands for, a power of two.
+    pub frames_per_token: usize,
+}
+
+impl From<&TokensConfig> for EncoderConfig {
+    fn from(config: &TokensConfig) -> Self {
+        Self {
+            inputs: config.motion_dim,
+            outputs: config.width,
+            conv_width: config.conv_width,
+            depth: config.depth,
+            frames_per_token: config.frames_per_token,
+        }
+    }
+}
+
+/// E: frames to latents, one for ρ of them; of motion, or of the music that a planner hears.
 #[derive(Clone, Debug)]
 pub struct Encoder {
     first: Conv1d,
@@ -65,26 +92,27 @@ pub struct Encoder {
 
 impl Encoder {
     /// Makes the network as a part of another.
-    pub fn within(root: &mut Scope, config: &TokensConfig) -> Self {
+    pub fn within(root: &mut Scope, config: &EncoderConfig) -> Self {
         let c = config.conv_width;
+        let n_levels = config.frames_per_token.trailing_zeros();
         let halving = Convolution { taps: 4, stride: 2, padding: 1, dilation: 1 };
         Self {
-            first: Conv1d::new(&mut root.at("first"), config.motion_dim, c, 3, 1),
-            levels: (0..config.n_levels())
+            first: Conv1d::new(&mut root.at("first"), config.inputs, c, 3, 1),
+            levels: (0..n_levels)
                 .map(|i| {
                     let mut scope = root.at(format!("levels.{i}"));
                     let conv = Conv1d::stepping(&mut scope.at("conv"), c, c, halving);
-                    Level { conv, res: residual_blocks(&mut scope, config) }
+                    Level { conv, res: residual_blocks(&mut scope, c, config.depth) }
                 })
                 .collect(),
-            last: Conv1d::new(&mut root.at("last"), c, config.width, 3, 1),
+            last: Conv1d::new(&mut root.at("last"), c, config.outputs, 3, 1),
             frames_per_token: config.frames_per_token,
         }
     }
 
     /// Conv₃ → ReLU → levels of {Conv₄ of stride 2, residual blocks} → Conv₃; the last frame is held to whole tokens.
     ///
-    /// \[batch, T, motion_dim\] → \[batch, ⌈T / ρ⌉, d\]
+    /// \[batch, T, inputs\] → \[batch, ⌈T / ρ⌉, outputs\]
     pub fn forward<G: Graph>(&self, g: &mut G, x: &G::Tensor) -> Result<G::Tensor> {
         let x = g.hold_frames(x, self.frames_per_token)?;
         let h = self.first.forward(g, &x)?;
@@ -116,7 +144,7 @@ impl SignalDecoder {
         let first = Conv1d::new(&mut root.at("first"), config.width, c, 3, 1);
         for i in 0..config.n_levels() {
             let mut scope = root.at(format!("levels.{i}"));
-            let res = residual_blocks(&mut scope, config);
+            let res = residual_blocks(&mut scope, c, config.depth);
             levels.push(Level { conv: Conv1d::new(&mut scope.at("conv"), c, c, 3, 1), res });
         }
         Self {
@@ -137,6 +165,12 @@ impl SignalDecoder {
         q: &G::Tensor,
         like: &G::Tensor,
     ) -> Result<G::Tensor> {
+        let s = self.whole(g, q)?;
+        g.crop_frames(&s, like)
+    }
+
+    /// The same for all frames that the tokens stand for. \[batch, N, d\] → \[batch, ρ N, d\]
+    pub fn whole<G: Graph>(&self, g: &mut G, q: &G::Tensor) -> Result<G::Tensor> {
         let h = self.first.forward(g, q)?;
         let mut h = g.activation(&h, Activation::Relu)?;
         for level in &self.levels {
@@ -148,7 +182,6 @@ impl SignalDecoder {
         }
         let h = self.middle.forward(g, &h)?;
         let h = g.activation(&h, Activation::Relu)?;
-        let s = self.last.forward(g, &h)?;
-        g.crop_frames(&s, like)
+        self.last.forward(g, &h)
     }
 }

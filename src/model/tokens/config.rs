@@ -92,13 +92,7 @@ impl TokensConfig {
                 return refuse(format!("{name} is {value}; it must be at most {most}"));
             }
         }
-        if !FRAMES_PER_TOKEN.contains(&self.frames_per_token) {
-            return refuse(format!(
-                "a token stands for {} frames; it must be 1, 2, 4, 8 or 16, since each level of the encoder halves \
-                 them",
-                self.frames_per_token
-            ));
-        }
+        check_frames_per_token(self.frames_per_token)?;
         if !self.width.is_multiple_of(2) {
             return refuse(format!(
                 "width is {}; it must be even, since steps are embedded as pairs of a cosine and a sine",
@@ -126,8 +120,22 @@ impl TokensConfig {
     }
 }
 
+/// Refuses a number of frames that no token stands for.
+///
+/// # Errors
+/// One sentence.
+pub(super) fn check_frames_per_token(frames_per_token: usize) -> Result<(), ConfigError> {
+    if FRAMES_PER_TOKEN.contains(&frames_per_token) {
+        return Ok(());
+    }
+    Err(ConfigError(format!(
+        "a token stands for {frames_per_token} frames; it must be 1, 2, 4, 8 or 16, since each level of the encoder \
+         halves them"
+    )))
+}
+
 /// Dilations grow by three from block to block: the eighth of 8 sees 4,375 frames.
-const MAX_DEPTH: usize = 8;
+pub(super) const MAX_DEPTH: usize = 8;
 
 #[cfg(test)]
 mod tests {

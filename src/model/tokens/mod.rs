@@ -3,15 +3,17 @@
 //! Gu et al., arXiv 2603.19227, 2026, section 3.1. An encoder E makes a latent of every ρ frames; a codebook replaces it
 //! by the nearest of K rows, whose number is the token; a decoder D makes a signal for each frame of the rows; a
 //! denoiser f predicts clean motion from noisy motion and that signal. Tokens keep what is danced, and the diffusion
-//! the fine detail.
+//! the fine detail. A [`Planner`] says which tokens go with a piece of music.
 
 mod coder;
 mod config;
 mod denoiser;
+mod planner;
 
 pub use self::coder::{Encoder, SignalDecoder};
 pub use self::config::TokensConfig;
 pub use self::denoiser::SignalDenoiser;
+pub use self::planner::{Planner, PlannerConfig, PlannerInputs, PlannerKind};
 use super::graph::{Graph, Result};
 use super::parameter::{Init, ParameterId, ParameterList, Role, Scope};
 
@@ -41,7 +43,7 @@ impl Tokenizer {
         let mut root = Scope::root(&mut list);
         let deviation = 1.0 / (config.width as f64).sqrt();
         let tokenizer = Self {
-            encoder: Encoder::within(&mut root.at("encoder"), config),
+            encoder: Encoder::within(&mut root.at("encoder"), &config.into()),
             // Training begins with latents of its first batch instead.
             codebook: root.parameter(
                 "codebook",
@@ -70,6 +72,12 @@ impl Tokenizer {
         Ok(Quantized { latents, tokens, codes })
     }
 
+    /// z of [`Tokenizer::quantize`] alone. \[batch, T, motion_dim\] → \[batch, N\]
+    pub fn tokens<G: Graph>(&self, g: &mut G, x: &G::Tensor) -> Result<G::Tensor> {
+        let latents = self.encoder.forward(g, x)?;
+        g.nearest_row(&latents, self.codebook)
+    }
+
     /// Returns the rows of the codebook that tokens name: \[batch, N\] → \[batch, N, d\].
     pub fn codes<G: Graph>(&self, g: &mut G, tokens: &G::Tensor) -> Result<G::Tensor> {
         g.embedding(self.codebook, tokens)
@@ -85,6 +93,11 @@ impl Tokenizer {
         like: &G::Tensor,
     ) -> Result<G::Tensor> {
         self.decoder.forward(g, q, like)
+    }
+
+    /// s = D(q) for all frames that the tokens stand for. \[batch, N, d\] → \[batch, ρ N, d\]
+    pub fn whole_signal<G: Graph>(&self, g: &mut G, q: &G::Tensor) -> Result<G::Tensor> {
+        self.decoder.whole(g, q)
     }
 
     /// x̂0 = f(x_t, t, s); see `SignalDenoiser::forward`.

@@ -34,6 +34,13 @@ impl Evaluand {
         let most = params.baseline_windows;
         let (Some(row), true) = (self.generations.first(), most > 0) else { return Ok(None) };
         let is_there = learned::has_weights(store, &row.model, &row.weights)?;
+        if !is_there && learned::weights_now(store, &row.model)?.as_ref() == Some(&row.weights) {
+            self.notes.push(format!(
+                "Model \"{}\" is of a family whose untrained network is not sampled as a baseline.",
+                row.model
+            ));
+            return Ok(None);
+        }
         if !is_there {
             self.notes.push(format!(
                 "Store {store} has no model \"{}\" with the weights that the motions were made with, so that its \

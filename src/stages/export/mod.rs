@@ -4,6 +4,7 @@ mod checks;
 mod files;
 mod group;
 mod report;
+mod tokens;
 mod tuning;
 
 use std::path::PathBuf;
@@ -18,7 +19,7 @@ use self::report::{ExportDryRun, ExportSummary};
 use super::learned;
 use super::model_files::{POINTER, current_folder, folder_of, is_model_name, pointer_to, sha256};
 use super::train::session::{MachineParams, ProgressWatch, check_run_name, read_phrases};
-use super::trained::{TrainedRun, TrainedTokenizer, WeightsChoice};
+use super::trained::{TrainedPlanner, TrainedRun, TrainedTokenizer, WeightsChoice};
 use super::{ClientParams, Contract, Progress, RARE, Stage, Summary, lease};
 use crate::generation::{ModelFileName, file_names};
 use crate::model::Family;
@@ -96,11 +97,14 @@ impl Stage for Export {
         if group::is_of_group(&store, &params.run)? {
             return group::run(&params, &store, progress);
         }
+        if TrainedPlanner::is_of(&store, &params.run)? {
+            return tokens::run(&params, &store, progress);
+        }
         ensure!(
             !TrainedTokenizer::is_of(&store, &params.run)?,
-            "run {} has a tokenizer, and models of the family tokens are not exported; motiongen tokenize reads it \
-             from the store",
-            params.run
+            "run {run} has a tokenizer, which makes no motion for music; train a planner of its tokens (motiongen train \
+             --family tokens --tokenizer {run} --run NAME) and export that run",
+            run = params.run
         );
         let mut trained = TrainedRun::read(&store, &params.run, params.weights)?;
         let machine = &params.machine;

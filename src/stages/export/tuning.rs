@@ -35,7 +35,7 @@ const MULTIPLES: [f64; 17] =
 /// the moments of turning do not see: with 2^8 17 of 160 motions were not upright.
 const MAX_ORIENTATION_MULTIPLE: f64 = 5.0;
 /// Seed of the noise.
-const SEED: u64 = 17;
+pub(super) const SEED: u64 = 17;
 
 /// Measures how a model is best sampled; none without validation phrases as long as a window.
 ///
@@ -56,7 +56,7 @@ pub fn sampling_defaults(
 }
 
 /// Measures how a model is best sampled whose motion for the windows `decoded` makes, with some guidance.
-fn tuned(
+pub(super) fn tuned(
     windows: &[Window],
     dataset: &Dataset,
     progress: &dyn Progress,

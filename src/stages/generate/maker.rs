@@ -8,7 +8,7 @@ use super::music::{HeardMusic, PhraseMusic};
 use super::params::Settings;
 use crate::evaluation::{Score, derivative_error, score};
 use crate::generation::{
-    Constraints, EngineError, Generator, ModelCard, PrimingMotion, Track, WeightedConstraints,
+    Constraints, EngineError, Generator, Miss, ModelCard, PrimingMotion, Track, WeightedConstraints,
 };
 use crate::motion::postprocess::{Displacement, process, process_holding};
 use crate::motion::{Channel, MOTION_DIM};
@@ -177,11 +177,6 @@ impl SoloistMaker<'_> {
                 velocity_error,
             );
             let misses = constraints.as_ref().map(|c| c.errors(frames.view())).unwrap_or_default();
-            let worst = |group: Channel, factor: f64| {
-                let misses_of_group =
-                    misses.iter().filter(|miss| miss.what.starts_with(group.name()));
-                misses_of_group.map(|miss| miss.error * factor).reduce(f64::max)
-            };
             let generate_s = begun.elapsed().as_secs_f64();
             let found = CandidateFindings {
                 sample,
@@ -190,10 +185,7 @@ impl SoloistMaker<'_> {
                 primed_by: priming.as_ref().map(|priming| priming.names.join(",")),
                 score: &score,
                 velocity_error,
-                control: [
-                    worst(Channel::Position, 1e3),
-                    worst(Channel::Quaternion, 1.0_f64.to_degrees()),
-                ],
+                control: worst_misses(&misses),
                 generate_s,
             };
             rows.push(self.row(music, n_frames, &found));
@@ -260,14 +252,7 @@ impl SoloistMaker<'_> {
                 parts.push(frames);
                 Ok(())
             })
-            .map_err(|stop| match stop {
-                StopReason::Engine(e) => Failure::new(FailureKind::Engine, music.source, e),
-                StopReason::Watcher(e) => Failure::new(
-                    FailureKind::Unwritable,
-                    music.source,
-                    format!("frames could not be streamed: {e}"),
-                ),
-            })?;
+            .map_err(|stop| stop.of(music.source))?;
         let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
         let mut frames =
             concatenate(Axis(0), &views).unwrap_or_else(|_| Array2::zeros((0, MOTION_DIM)));
@@ -321,6 +306,16 @@ impl SoloistMaker<'_> {
     }
 }
 
+/// Returns the largest misses of positions, mm, and of orientations, degrees, where such are asked for.
+pub fn worst_misses(misses: &[Miss]) -> [Option<f64>; 2] {
+    [(Channel::Position, 1e3), (Channel::Quaternion, 1.0_f64.to_degrees())].map(
+        |(group, factor)| {
+            let of_group = misses.iter().filter(|miss| miss.what.starts_with(group.name()));
+            of_group.map(|miss| miss.error * factor).reduce(f64::max)
+        },
+    )
+}
+
 /// The best candidate so far.
 struct Candidate {
     value: f64,
@@ -344,9 +339,23 @@ struct CandidateFindings<'a> {
 }
 
 /// Why sampling stopped.
-enum StopReason {
+pub enum StopReason {
     Engine(EngineError),
     Watcher(std::io::Error),
+}
+
+impl StopReason {
+    /// Returns the failure of the music that was danced to.
+    pub fn of(self, source: &str) -> Failure {
+        match self {
+            Self::Engine(e) => Failure::new(FailureKind::Engine, source, e),
+            Self::Watcher(e) => Failure::new(
+                FailureKind::Unwritable,
+                source,
+                format!("frames could not be streamed: {e}"),
+            ),
+        }
+    }
 }
 
 impl From<EngineError> for StopReason {

@@ -11,6 +11,7 @@ mod receipt;
 mod report;
 mod settings;
 mod survey;
+mod tokens;
 mod tracks;
 
 use std::collections::BTreeMap;
@@ -27,7 +28,7 @@ use super::model_files::{
 use super::retrieval::Primer;
 use super::{Contract, Progress, Stage, Summary};
 use crate::diffusion::Schedule;
-use crate::generation::{Engine, Generator, ModelCard, Sampling, file_names};
+use crate::generation::{Engine, Generator, ModelCard, Sampling, TokensCard, file_names};
 use crate::model::Family;
 use crate::store::{Location, Shard};
 use crate::units::frames_to_s;
@@ -69,6 +70,9 @@ impl Stage for Generate {
         let files = open_model(&params, store.as_ref())?;
         if files.family() == Family::Group {
             return group::run(&params, store.as_ref(), files, progress);
+        }
+        if files.family() == Family::Tokens {
+            return tokens::run(&params, store.as_ref(), files, progress);
         }
         let model = OpenModel::of(files)?;
         group::refuse_for_soloists(&params, &model.card.name)?;
@@ -227,6 +231,12 @@ fn name_of_model(params: &Params, name_of_card: &str) -> String {
 /// Returns one digest for both networks of a model.
 pub(in crate::stages) fn weights_digest(card: &ModelCard) -> String {
     let both = format!("{}\n{}\n", card.weights_sha256.unet, card.weights_sha256.decoder);
+    sha256(both.as_bytes())
+}
+
+/// Returns one digest for both networks of a model of tokens.
+pub(in crate::stages) fn weights_digest_of_tokens(card: &TokensCard) -> String {
+    let both = format!("{}\n{}\n", card.weights_sha256.tokenizer, card.weights_sha256.planner);
     sha256(both.as_bytes())
 }
 

@@ -1,27 +1,26 @@
 //! What the user asks of generate, and what follows from it.
 
+mod postprocess;
+
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
 use anyhow::{bail, ensure};
-use clap::{Args as _, FromArgMatches as _};
 use serde::{Deserialize, Serialize};
 
 use super::constraints_file::ConstraintsRequest;
 use super::outputs::MotionFormat;
 use super::settings::{MotionSettings, OUTPUT_VERSION};
-use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
+use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing, TokenSampling};
 use crate::generation::{ConsistencyForm, FamilyCard, ModelCard, OVERLAP_FRAMES};
-use crate::motion::postprocess::{
-    Coherence, FusionVariances, Hemisphere, PostProcessConfig, SavitzkyGolay,
-};
-use crate::motion::rates::MotionRange;
+use crate::motion::postprocess::PostProcessConfig;
 use crate::motion::style::STYLE_DIM;
-use crate::motion::{Channel, ChannelLimits};
+use crate::motion::{Channel, Normalizer};
 use crate::stages::model_files::EngineParams;
 use crate::stages::motion_source::read_motion;
 use crate::stages::{ClientParams, RARE};
 use crate::store::{Shard, digest};
+pub use postprocess::PostProcessParams;
 
 /// The samplers by the names of the flag.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
@@ -119,7 +118,7 @@ pub struct Params {
     #[arg(long, value_enum, default_value_t = SamplerName::DpmSolver, help_heading = "Sampling",
           hide_short_help = RARE)]
     pub sampler: SamplerName,
-    /// Steps of the sampler [default: 20; all of ddpm]
+    /// Steps of the sampler [default: 20; all of ddpm; 27 of ddpm for a model of the family tokens]
     #[arg(long, value_name = "N", help_heading = "Sampling", hide_short_help = RARE)]
     pub steps: Option<usize>,
     /// Which steps of the diffusion are visited.
@@ -171,6 +170,18 @@ pub struct Params {
     #[arg(long, value_name = "N", default_value_t = OVERLAP_FRAMES, help_heading = "Sampling",
           hide_short_help = RARE)]
     pub overlap: usize,
+    /// Iterations in which a model of the family tokens plans a window; of one that plans token by token no matter.
+    #[arg(long, value_name = "N", default_value_t = TokenSampling::default().n_iterations,
+          help_heading = "Tokens", hide_short_help = RARE)]
+    pub plan_iterations: usize,
+    /// How evenly tokens are drawn: 1 as the planner says, 0 always the likeliest.
+    #[arg(long, value_name = "X", default_value_t = TokenSampling::default().temperature,
+          help_heading = "Tokens", hide_short_help = RARE)]
+    pub plan_temperature: f64,
+    /// Share of the tokens, the most probable ones, that may be drawn.
+    #[arg(long, value_name = "SHARE", default_value_t = TokenSampling::default().top_share,
+          help_heading = "Tokens", hide_short_help = RARE)]
+    pub plan_top: f64,
     /// TOML or JSON file of poses and values that the motion must have (docs/generate.md).
     #[arg(long, value_name = "FILE", help_heading = "Control", hide_short_help = RARE)]
     pub constraints: Option<PathBuf>,
@@ -193,98 +204,6 @@ pub struct Params {
     /// Make every motion again, made or not.
     #[arg(long)]
     pub force: bool,
-}
-
-/// What is done to decoded motion.
-#[derive(Clone, Debug, clap::Args)]
-pub struct PostProcessParams {
-    /// Leave decoded motion as it is.
-    #[arg(long, help_heading = "Post-processing", hide_short_help = RARE)]
-    pub raw: bool,
-    /// How far each channel may go.
-    #[arg(long, value_enum, default_value_t = ChannelLimits::Wide, help_heading = "Post-processing",
-          hide_short_help = RARE)]
-    pub limits: ChannelLimits,
-    /// Let motion be faster than nearly all that the model was trained on (99.9 % of its frames).
-    #[arg(long, help_heading = "Post-processing", hide_short_help = RARE)]
-    pub any_speed: bool,
-    /// Signs of quaternions: continuous in time, or w ≥ 0 in every frame as in the reference.
-    #[arg(long, value_enum, default_value_t = Hemisphere::Sequential,
-          help_heading = "Post-processing", hide_short_help = RARE)]
-    pub hemisphere: Hemisphere,
-    /// Frames of a weighted mean of the orientations; an odd number [default: none]
-    #[arg(long, value_name = "N", help_heading = "Post-processing", hide_short_help = RARE)]
-    pub smooth_quaternions: Option<usize>,
-    /// Never let the phase fall within a bar.
-    #[arg(long, help_heading = "Post-processing", hide_short_help = RARE)]
-    pub monotonic_phase: bool,
-    /// Leave the phase as it was decoded, instead of the phase of the music's bars.
-    #[arg(long, help_heading = "Post-processing", hide_short_help = RARE)]
-    pub decoded_phase: bool,
-    /// Velocities, accelerations and angular velocities: as decoded, half of each as in the reference, derived
-    /// from positions and orientations, or fused with them by least squares and then
-    /// derived [default: fuse, by the errors that the model's card has; derive for one of release 0.1]
-    #[arg(long, value_enum, help_heading = "Post-processing", hide_short_help = RARE)]
-    pub coherence: Option<Coherence>,
-    /// Frames of the reference's moving average; an odd number [default: none]
-    #[arg(long, value_name = "N", help_heading = "Post-processing", hide_short_help = RARE)]
-    pub moving_average: Option<usize>,
-    /// Smooths by polynomials of an order over a window of frames; 0 for none; with --coherence derive or
-    /// fuse [default: 11,3 with derive]
-    #[arg(long, value_name = "WINDOW,ORDER", value_delimiter = ',', num_args = 1..,
-          help_heading = "Post-processing", hide_short_help = RARE)]
-    pub savitzky_golay: Vec<usize>,
-}
-
-impl PostProcessParams {
-    /// Returns what is done unless the user says otherwise.
-    pub fn usual() -> Self {
-        let command = Self::augment_args(clap::Command::new("usual"));
-        Self::from_arg_matches(&command.get_matches_from(["usual"]))
-            .expect("invariant: every flag of post-processing has a default")
-    }
-
-    /// Returns the configuration for a model.
-    ///
-    /// # Errors
-    /// A window that is even or an order that is too high, in a sentence.
-    pub fn config(
-        &self,
-        (range, measured): (Option<MotionRange>, Option<FusionVariances>),
-    ) -> anyhow::Result<PostProcessConfig> {
-        // Of a model whose errors were not measured, as those of release 0.1, velocities are derived.
-        let usual = if measured.is_some() { Coherence::Fuse } else { Coherence::Derive };
-        let coherence = self.coherence.unwrap_or(usual);
-        let mut config = PostProcessConfig {
-            limits: self.limits,
-            hemisphere: self.hemisphere,
-            smooth_quaternions: self.smooth_quaternions.is_some(),
-            enforce_phase_monotonic: self.monotonic_phase,
-            relock_phase: !self.decoded_phase,
-            coherence,
-            apply_smoothing: self.moving_average.is_some(),
-            savitzky_golay: match self.savitzky_golay[..] {
-                [] if coherence == Coherence::Derive => Some(SavitzkyGolay::default()),
-                [] | [0] | [0, _] => None,
-                [window, order] => Some(SavitzkyGolay { window, order }),
-                _ => bail!("--savitzky-golay takes two numbers: WINDOW,ORDER, such as 7,3"),
-            },
-            fusion_variances: (coherence == Coherence::Fuse).then(|| measured.unwrap_or_default()),
-            range: range.filter(|range| range.is_sound() && !self.any_speed),
-            ..PostProcessConfig::default()
-        };
-        if let Some(window) = self.smooth_quaternions {
-            config.quat_smooth_window = window;
-        }
-        if let Some(size) = self.moving_average {
-            config.smoothing_kernel_size = size;
-        }
-        if self.raw {
-            config = PostProcessConfig { limits: self.limits, ..PostProcessConfig::nothing() };
-        }
-        config.check()?;
-        Ok(config)
-    }
 }
 
 /// How windows are sampled, by a model of any family.
@@ -326,6 +245,29 @@ impl Params {
         );
         Ok(SamplingSettings { sampler, guidance, overlap_frames })
     }
+
+    /// Returns the share of the way to a constraint that every step goes.
+    ///
+    /// # Errors
+    /// A number that is no share.
+    pub fn checked_constraint_strength(&self) -> anyhow::Result<f64> {
+        let strength = self.constraint_strength;
+        ensure!(
+            (0.0..=1.0).contains(&strength),
+            "--constraint-strength {strength} is no share; give a number from 0 to 1"
+        );
+        Ok(strength)
+    }
+
+    /// Reads the constraints, where there are any.
+    ///
+    /// # Errors
+    /// A file that cannot be read, or says what nobody can do.
+    pub fn constraints_asked(&self) -> anyhow::Result<Option<ConstraintsRequest>> {
+        let read =
+            |path| ConstraintsRequest::read(path, |path| Ok(read_motion(path)?.into_array()));
+        self.constraints.as_deref().map(read).transpose()
+    }
 }
 
 /// How sampling begins from the library's motion.
@@ -363,23 +305,14 @@ impl Settings {
     /// One sentence for what this model or any sampler cannot do.
     pub fn new(params: &Params, card: &ModelCard) -> anyhow::Result<Self> {
         let SamplingSettings { sampler, guidance, overlap_frames } = params.sampling(card)?;
-        let strength = params.constraint_strength;
-        ensure!(
-            (0.0..=1.0).contains(&strength),
-            "--constraint-strength {strength} is no share; give a number from 0 to 1"
-        );
-        let constraints = match &params.constraints {
-            Some(path) => {
-                Some(ConstraintsRequest::read(path, |path| Ok(read_motion(path)?.into_array()))?)
-            }
-            None => None,
-        };
+        let strength = params.checked_constraint_strength()?;
+        let constraints = params.constraints_asked()?;
         Ok(Self {
             sampler,
             guidance,
             seed: params.seed,
             best_of: params.best_of.get(),
-            style: style(&params.style, card)?,
+            style: style(&params.style, (&card.name, card.unet.style_dim > 0), &card.normalizer)?,
             overlap_frames,
             prime: None,
             postprocess: params.postprocess.config((card.motion_range, card.fusion_variances()))?,
@@ -460,21 +393,24 @@ impl Settings {
 }
 
 /// Returns a style in the model's units.
-fn style(values: &[f32], card: &ModelCard) -> anyhow::Result<Option<[f32; STYLE_DIM]>> {
+pub fn style(
+    values: &[f32],
+    (model, takes_style): (&str, bool),
+    normalizer: &Normalizer,
+) -> anyhow::Result<Option<[f32; STYLE_DIM]>> {
     if values.is_empty() {
         return Ok(None);
     }
     ensure!(
-        card.unet.style_dim > 0,
-        "model {} takes no style; leave --style out, or train one with --style",
-        card.name
+        takes_style,
+        "model {model} takes no style; leave --style out, or train one with --style"
     );
     let Ok(mut style) = <[f32; STYLE_DIM]>::try_from(values) else {
         bail!("--style has {} values; give {STYLE_DIM}, from -1 to 1", values.len());
     };
     for (i, x) in Channel::Style.range().zip(&mut style) {
         ensure!((-1.0..=1.0).contains(x), "--style has {x}; give values from -1 to 1");
-        *x = (*x - card.normalizer.centre[i]) / card.normalizer.scale[i];
+        *x = (*x - normalizer.centre[i]) / normalizer.scale[i];
     }
     Ok(Some(style))
 }

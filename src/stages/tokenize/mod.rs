@@ -88,7 +88,7 @@ impl Stage for Tokenize {
             trained.parameters,
             &scales.motion,
             network.window_frames,
-            params.workers,
+            (params.workers, NonZeroUsize::MIN),
         )
         .context("while starting threads")?;
         let settings = |reconstruction: Option<u64>| {

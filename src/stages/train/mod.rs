@@ -4,6 +4,7 @@ pub mod budget;
 mod group;
 mod judge;
 mod params;
+mod planner;
 pub mod session;
 mod summary;
 pub(in crate::stages) mod survey;
@@ -24,8 +25,8 @@ use crate::motion::Normalizer;
 use crate::store::{Lease, Location};
 use crate::training::{
     Augmentation, CheckpointKind, Checkpoints, DecoderLearner, Denoiser, DiffusionLearner, Drive,
-    GroupLearner, Journal, Learner, Loader, State, TokensLearner, TrainConfig, TrainingEnd,
-    TrainingError, Windows,
+    GroupLearner, Journal, Learner, Loader, PlannerLearner, State, TokensLearner, TrainConfig,
+    TrainingEnd, TrainingError, Windows,
 };
 use budget::{BudgetParams, KeptCheckpoint, StageBudget};
 use judge::ValidationJudge;
@@ -36,8 +37,13 @@ use session::{
 pub use summary::{StageSummary, TrainDryRun, TrainSummary};
 
 /// What this command trains, of any family.
-const STAGES: [&str; 4] =
-    [DiffusionLearner::STAGE, DecoderLearner::STAGE, GroupLearner::STAGE, TokensLearner::STAGE];
+const STAGES: [&str; 5] = [
+    DiffusionLearner::STAGE,
+    DecoderLearner::STAGE,
+    GroupLearner::STAGE,
+    TokensLearner::STAGE,
+    PlannerLearner::STAGE,
+];
 
 /// The stage.
 pub struct Train;
@@ -87,6 +93,9 @@ impl Stage for Train {
         match params.config.network.family {
             Family::Unet => {}
             Family::Group => return group::run(&params, progress),
+            Family::Tokens if params.config.tokens.tokenizer.is_some() => {
+                return planner::run(&params, progress);
+            }
             Family::Tokens => return tokens::run(&params, progress),
         }
         let config = params.config.config(params.seed);

@@ -20,7 +20,8 @@ pub use tokens::TokensParams;
 #[derive(Clone, Debug, clap::Args)]
 pub struct NetworkParams {
     /// Kind of the networks: a UNet and a decoder for one dancer; a transformer and a score for groups of dancers,
-    /// which learns from phrases of two dancers and more (docs/groups.md); or a tokenizer of motion (docs/tokens.md).
+    /// which learns from phrases of two dancers and more (docs/groups.md); or a tokenizer of motion and, with
+    /// --tokenizer, a planner of its tokens (docs/tokens.md).
     #[arg(long, value_enum, default_value_t = Family::Unet, help_heading = "Networks")]
     pub family: Family,
     /// Size of the networks.

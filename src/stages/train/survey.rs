@@ -9,7 +9,7 @@ use crate::stages::item_state::ItemState;
 use crate::store::{Location, StoreError};
 use crate::training::{
     CheckpointKind, Checkpoints, DecoderLearner, DiffusionLearner, FinetuneLearner, GroupLearner,
-    Learner as _, State, TrainingError,
+    Learner as _, PlannerLearner, State, TokensLearner, TrainingError,
 };
 
 /// How far one network of a run is trained.
@@ -48,8 +48,10 @@ pub fn survey(store: &Location, run: &str) -> Result<Vec<TrainedNetwork>, Traini
     let mut networks = Vec::new();
     if let Some(claim) = store.read_if_there(&claim_path(run, Train::NAME))? {
         let config: serde_json::Value = serde_json::from_slice(&claim).unwrap_or_default();
-        if config.get(GroupLearner::STAGE).is_some() {
-            networks.push(network(store, run, GroupLearner::STAGE)?);
+        // Configurations of other families name what is trained as checkpoints do.
+        let families = [GroupLearner::STAGE, TokensLearner::STAGE, PlannerLearner::STAGE];
+        if let Some(stage) = families.into_iter().find(|stage| config.get(stage).is_some()) {
+            networks.push(network(store, run, stage)?);
         } else {
             let decoder = network(store, run, DecoderLearner::STAGE)?;
             let mut diffusion = network(store, run, DiffusionLearner::STAGE)?;

@@ -10,6 +10,7 @@ use super::{Params, Run, TrainDryRun, TrainSummary, resume_command};
 use crate::model::{Family, Tokenizer};
 use crate::motion::Normalizer;
 use crate::stages::train::Train;
+use crate::stages::trained::TrainedPlanner;
 use crate::stages::{Progress, Stage as _, Summary};
 use crate::store::Location;
 use crate::training::{
@@ -46,6 +47,11 @@ pub fn run(params: &Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn S
     if params.dry_run {
         return run.dry_run_of_tokens(&config, progress);
     }
+    ensure!(
+        !TrainedPlanner::is_of(&store, &params.run)?,
+        "run {} is a planner; give the tokenizer a name of its own with --run",
+        params.run
+    );
     store.sweep();
     run.train_tokens(&config, progress)
 }

@@ -1,8 +1,10 @@
-//! Training of a tokenizer: its networks by gradients, its codebook by averages of latents.
+//! Training of a tokenizer: its networks by gradients, its codebook by averages of latents; and of a planner of its
+//! tokens (`planner`).
 
 mod codebook;
 mod config;
 mod inputs;
+mod planner;
 
 use std::sync::Arc;
 
@@ -25,6 +27,10 @@ pub use codebook::{Codebook, CodebookConfig, perplexity};
 use codebook::{candidates, counts};
 pub use config::{TokensNetworkConfig, TokensTrainConfig, TokensTraining};
 use inputs::{Latents, TokensBatch};
+pub use planner::{
+    FrozenTokenizer, PLANNER, PlannerLearner, PlannerNetworkConfig, PlannerTrainConfig,
+    PlannerTraining, TokenizerSource,
+};
 
 /// Windows of a validation: all of them, or these many with noise and steps of their own.
 const MIN_VALIDATION_WINDOWS: usize = 96;

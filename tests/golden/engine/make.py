@@ -19,6 +19,7 @@ import group
 import network
 import numpy as np
 import ops
+import planner
 import tokens
 import torch
 import weights
@@ -142,6 +143,36 @@ def tokens_case(frames_per_token: int, taps: int) -> TokensCase:
     }
     # A step may pass the kink of a ReLU, which costs up to its length.
     return TokensCase(made, inputs, torch.zeros(()), tolerance=1e-6)
+
+
+class PlannerCase(Case):
+    """A planner with the cross-entropy that training makes small."""
+
+    def loss(self) -> tuple[Tensor, Tensor]:
+        """Returns logits and loss."""
+        return self.network(*self.inputs.values())
+
+
+def planner_case(*, is_causal: bool) -> PlannerCase:
+    config = planner.PlannerConfig(is_causal=is_causal)
+    made = planner.Planner(config).double().eval()
+    weights.fill(made)
+    batch, frames, n_tokens = 3, 22, 6
+    labels = torch.arange(batch * n_tokens).reshape(batch, n_tokens) * 7 % config.codes
+    # The third has seventeen frames, of which the fifth token has the last.
+    mask = (torch.arange(n_tokens) < torch.tensor([6, 6, 5])[:, None]).double()
+    hidden = mask * (torch.arange(batch * n_tokens).reshape(batch, n_tokens) % 3 != 1)
+    inputs = {
+        "tokens": labels if is_causal else torch.where(hidden > 0, config.codes, labels),
+        "audio": drawn("input.audio", batch, frames, config.condition_dim),
+        "drop": torch.tensor([0.0, 1.0, 0.0]).double(),
+        "style": drawn("input.style", batch, config.style_dim),
+        "mask": mask,
+        "labels": labels,
+        "weights": mask if is_causal else hidden,
+    }
+    # A step may pass the kink of a ReLU, which costs up to its length.
+    return PlannerCase(made, inputs, torch.zeros(()), tolerance=1e-6)
 
 
 def probe(name: str, tensor: Tensor) -> Tensor:
@@ -287,6 +318,8 @@ def main() -> None:
         "group_tiny": group_case,
         "tokens_tiny": lambda: tokens_case(4, 5),
         "tokens_halves": lambda: tokens_case(2, 7),
+        "planner_masked": lambda: planner_case(is_causal=False),
+        "planner_autoregressive": lambda: planner_case(is_causal=True),
     }
     asked = sys.argv[1:]
     for name, make in cases.items():

@@ -1,16 +1,26 @@
 //! The flags of the family tokens, and the configuration that they make.
 
 use super::ConfigParams;
-use crate::model::TokensConfig;
+use crate::model::{PlannerConfig, PlannerKind, TokensConfig};
+use crate::motion::style::STYLE_DIM;
 use crate::stages::RARE;
 use crate::training::{
-    Augmentation, CodebookConfig, TokensNetworkConfig, TokensTrainConfig, TokensTraining,
-    TrainConfig,
+    Augmentation, CodebookConfig, PlannerNetworkConfig, PlannerTrainConfig, PlannerTraining,
+    TokenizerSource, TokensNetworkConfig, TokensTrainConfig, TokensTraining, TrainConfig,
 };
 
-/// The tokens of a tokenizer, and how its codebook is learned.
+/// The tokens of a tokenizer, how its codebook is learned, and how its tokens are planned.
 #[derive(Clone, Debug, clap::Args)]
 pub struct TokensParams {
+    /// Run of a tokenizer whose tokens are planned: what is trained is a planner, which makes tokens for music.
+    #[arg(long, value_name = "RUN", help_heading = "Tokens", hide_short_help = RARE)]
+    pub tokenizer: Option<String>,
+    /// How a planner makes tokens: all at once, the surest first, or one after the other.
+    #[arg(long, value_enum, default_value_t = PlannerKind::Masked, help_heading = "Tokens", hide_short_help = RARE)]
+    pub planner: PlannerKind,
+    /// Probability that a token which a planner sees is replaced by any other [default: 0.1 masked, 0.2 autoregressive]
+    #[arg(long, value_name = "P", help_heading = "Tokens", hide_short_help = RARE)]
+    pub token_replacement: Option<f64>,
     /// Frames that a token stands for: 1, 2, 4, 8 or 16.
     #[arg(long, value_name = "N", default_value_t = 4, help_heading = "Tokens", hide_short_help = RARE)]
     pub frames_per_token: usize,
@@ -36,8 +46,14 @@ impl ConfigParams {
     pub fn tokens_config(&self, seed: u64) -> Option<TokensTrainConfig> {
         let sizes = TokensConfig::of(self.network.preset)?;
         let TrainConfig { network, diffusion, .. } = self.config(seed);
-        let TokensParams { frames_per_token, codes, commitment_loss, codebook_decay, least_usage } =
-            self.tokens;
+        let TokensParams {
+            frames_per_token,
+            codes,
+            commitment_loss,
+            codebook_decay,
+            least_usage,
+            ..
+        } = self.tokens;
         Some(TokensTrainConfig {
             seed,
             network: TokensNetworkConfig {
@@ -56,6 +72,46 @@ impl ConfigParams {
                 codebook: CodebookConfig { decay: codebook_decay, least_usage },
                 // No music is heard, so that none is made noisy.
                 augmentation: Augmentation { condition_noise: 0.0, ..diffusion.augmentation },
+                batch_size: diffusion.batch_size,
+                accumulate: diffusion.accumulate,
+                side_by_side: diffusion.side_by_side,
+                learning_rate: diffusion.learning_rate,
+                optimizer: diffusion.optimizer,
+                ema: diffusion.ema,
+            },
+        })
+    }
+
+    /// Returns the configuration of a planner that the flags make, for the tokens of a tokenizer; none for a preset that
+    /// it does not have.
+    pub fn planner_config(
+        &self,
+        seed: u64,
+        tokenizer: TokenizerSource,
+        network: &TokensNetworkConfig,
+    ) -> Option<PlannerTrainConfig> {
+        let kind = self.tokens.planner;
+        let sizes = PlannerConfig::of(self.network.preset, kind, &network.tokens)?;
+        let TrainConfig { diffusion, .. } = self.config(seed);
+        let usual = PlannerTraining::usual_replacement(kind);
+        Some(PlannerTrainConfig {
+            seed,
+            tokenizer,
+            network: PlannerNetworkConfig {
+                planner: PlannerConfig {
+                    clock: !self.network.no_clock,
+                    style_dim: if self.network.style { STYLE_DIM } else { 0 },
+                    dropout: self.network.dropout.unwrap_or(sizes.dropout),
+                    ..sizes
+                },
+                window_frames: network.window_frames,
+            },
+            planner: PlannerTraining {
+                replacement: self.tokens.token_replacement.unwrap_or(usual),
+                condition_dropout: diffusion.condition_dropout,
+                clock_dropout: diffusion.clock_dropout,
+                style_dropout: diffusion.style_dropout,
+                augmentation: diffusion.augmentation,
                 batch_size: diffusion.batch_size,
                 accumulate: diffusion.accumulate,
                 side_by_side: diffusion.side_by_side,

@@ -4,10 +4,10 @@ use std::num::NonZeroUsize;
 
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, concatenate, s};
 
-use super::engine::EngineError;
-use super::pool::Pool;
 use crate::autodiff::{Arena, Eager, Interpreter as _, Parameters, Stream, Tensor, Threads};
-use crate::diffusion::{SamplerConfig, Schedule, sample};
+use crate::diffusion::{Refine, SamplerConfig, Schedule, sample, sample_refined};
+use crate::generation::engine::EngineError;
+use crate::generation::pool::Pool;
 use crate::model::{Tokenizer, TokensConfig};
 use crate::motion::{MOTION_DIM, Normalizer, Placement};
 
@@ -34,7 +34,7 @@ struct TokenWorker {
 }
 
 impl TokenEngine {
-    /// Makes an engine of so many workers, of one thread each; `parameters` are those of [`Tokenizer`].
+    /// Makes an engine of so many workers of so many threads each; `parameters` are those of [`Tokenizer`].
     ///
     /// # Errors
     /// When the system gives no threads.
@@ -43,10 +43,10 @@ impl TokenEngine {
         parameters: Parameters<f32>,
         normalizer: &Normalizer,
         window_frames: usize,
-        n_workers: NonZeroUsize,
+        (n_workers, n_threads): (NonZeroUsize, NonZeroUsize),
     ) -> std::io::Result<Self> {
         let worker = |_| {
-            let threads = Threads::start(NonZeroUsize::MIN)?;
+            let threads = Threads::start(n_threads)?;
             Ok(TokenWorker { threads, arena: Arena::default() })
         };
         let workers = (0..n_workers.get()).map(worker).collect::<std::io::Result<Vec<_>>>()?;
@@ -58,6 +58,26 @@ impl TokenEngine {
             window_frames,
             workers: Pool::new(workers),
         })
+    }
+
+    /// Returns the sizes of the tokenizer.
+    pub fn sizes(&self) -> &TokensConfig {
+        &self.config
+    }
+
+    /// Returns the units of the networks.
+    pub fn normalizer(&self) -> &Normalizer {
+        &self.normalizer
+    }
+
+    /// Returns the frames of a window.
+    pub fn window_frames(&self) -> usize {
+        self.window_frames
+    }
+
+    /// Returns how many calls run at once.
+    pub fn n_workers(&self) -> usize {
+        self.workers.len()
     }
 
     /// Returns the windows of a motion, each over the origin and facing +Z in its first frame.
@@ -117,21 +137,10 @@ impl TokenEngine {
         let (mut found, mut first) = (Vec::new(), 0);
         for (number, group) in runs(n_frames).enumerate() {
             let (n, frames) = (group.len(), group[0]);
-            let n_tokens = self.config.n_tokens(frames);
-            let own: Vec<f32> =
-                tokens[first..][..n * n_tokens].iter().map(|&token| token as f32).collect();
-            first += n * n_tokens;
+            let n_tokens = n * self.config.n_tokens(frames);
+            let signal = self.signal(&tokens[first..][..n_tokens], (n, frames))?;
+            first += n_tokens;
             let shape = [n, frames, MOTION_DIM];
-            let signal = self.workers.with(|TokenWorker { threads, arena }| {
-                threads.run(|| {
-                    let mut g = Eager::new(&self.parameters, arena);
-                    let like = g.constant(&shape, &vec![0.0; n * frames * MOTION_DIM]);
-                    let own = g.constant(&[n, n_tokens], &own);
-                    let q = self.tokenizer.codes(&mut g, &own)?;
-                    let s = self.tokenizer.signal(&mut g, &q, &like)?;
-                    Ok::<_, EngineError>(array(&s))
-                })
-            })?;
             // Every group of windows has draws of its own; the first is where sampling begins.
             let noise = |draw: usize, z: &mut [f32]| {
                 Stream::new(seed, ((number as u64) << 32) + draw as u64 + 1).normal(0, z);
@@ -148,6 +157,51 @@ impl TokenEngine {
             }
         }
         Ok(found)
+    }
+
+    /// Decodes a window with noise and changes of one's own: \[1, n, 25\] in units of spread.
+    ///
+    /// - `x`: where sampling begins, \[1, n, 25\]
+    /// - `noise`, `refine`: as for [`sample_refined`]
+    ///
+    /// # Errors
+    /// A token that the codebook does not have, and what the sampler refuses.
+    ///
+    /// # Panics
+    /// When there are not as many tokens as the window has.
+    pub fn decode(
+        &self,
+        tokens: &[u32],
+        x: Array3<f32>,
+        (sampler, schedule): (&SamplerConfig, &Schedule),
+        noise: impl FnMut(usize, &mut [f32]),
+        refine: Option<Refine>,
+    ) -> Result<Array3<f32>, EngineError> {
+        let signal = self.signal(tokens, (1, x.len_of(Axis(1))))?;
+        let denoise = |x: ArrayView3<f32>, t: usize| self.denoise(x, t, signal.view());
+        let start = (x, schedule.len());
+        sample_refined(sampler, schedule, start, denoise, noise, None, refine)
+    }
+
+    /// Returns the signal of the tokens of n windows of so many frames, \[n, frames, d\].
+    fn signal(
+        &self,
+        tokens: &[u32],
+        (n, frames): (usize, usize),
+    ) -> Result<Array3<f32>, EngineError> {
+        let n_tokens = self.config.n_tokens(frames);
+        let tokens: Vec<f32> = tokens.iter().map(|&token| token as f32).collect();
+        self.workers.with(|TokenWorker { threads, arena }| {
+            threads.run(|| {
+                let mut g = Eager::new(&self.parameters, arena);
+                let shape = [n, frames, MOTION_DIM];
+                let like = g.constant(&shape, &vec![0.0; n * frames * MOTION_DIM]);
+                let tokens = g.constant(&[n, n_tokens], &tokens);
+                let q = self.tokenizer.codes(&mut g, &tokens)?;
+                let s = self.tokenizer.signal(&mut g, &q, &like)?;
+                Ok::<_, EngineError>(array(&s))
+            })
+        })
     }
 
     fn denoise(
@@ -214,10 +268,9 @@ mod tests {
         let (_, list) = Tokenizer::new(&config);
         // Layers that begin at zero would say the same of all tokens.
         let parameters = Parameters::new(list.without_zero_layers(), 3);
-        let n_workers = NonZeroUsize::new(n_workers).expect("not 0");
+        let workers = (NonZeroUsize::new(n_workers).expect("not 0"), NonZeroUsize::MIN);
         let normalizer = Normalizer::identity();
-        TokenEngine::new(&config, parameters, &normalizer, WINDOW_FRAMES, n_workers)
-            .expect("threads")
+        TokenEngine::new(&config, parameters, &normalizer, WINDOW_FRAMES, workers).expect("threads")
     }
 
     fn schedule() -> Schedule {

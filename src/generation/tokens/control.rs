@@ -1,0 +1,185 @@
+//! Constraints in decoding: the estimate of every step is moved to where they are met.
+//!
+//! As the paper, whose decoder descends L_ctrl(x̂0, c) at every step of the diffusion (section 3.3, after InterControl,
+//! Wang et al., NeurIPS 2024). There poses are sums of velocities, so that the gradient of a constraint reaches all
+//! frames before it; here positions are channels of their own, and the gradient of (p_t − p*_t)² moves one frame and
+//! makes it a spike. L_ctrl therefore has terms for the size and the jerk of what is moved, and velocities and
+//! accelerations go along ([`crate::motion::correction`]). Since it is quadratic, a step goes along H⁻¹ ∇L instead of ∇L,
+//! with which one step of length 1 is at its least.
+
+use ndarray::Array2;
+
+use crate::generation::control::{Constraints, WantedValue, orientation, rotation_vector};
+use crate::motion::correction::{Missing, rates, smoothest};
+use crate::motion::quaternion::{from_rotation_vector, make_sign_continuous, mul};
+use crate::motion::{Channel, MOTION_DIM};
+
+/// Moves frames a share of the way to where constraints are met: x̂0 ← x̂0 − η H⁻¹ ∇L_ctrl(x̂0).
+///
+/// The first `n_pinned` frames stay where they are, but for what is asked of themselves.
+///
+/// # Shapes
+/// `frames`: \[T, 25\] in the world, of which the first is frame `first` of the track
+pub fn steer(
+    constraints: &Constraints,
+    frames: &mut Array2<f32>,
+    first: usize,
+    n_pinned: usize,
+    share: f64,
+) {
+    let n = frames.nrows();
+    let asked: Vec<(usize, WantedValue)> = constraints.in_range(first, n).collect();
+    for axis in 0..3 {
+        let groups = [Channel::Position, Channel::Velocity, Channel::Acceleration];
+        let columns = groups.map(|group| group.range().start + axis);
+        let missing = asked.iter().filter_map(|&(frame, wanted)| match wanted {
+            WantedValue::Value { channel, value } => {
+                let derivative = columns.iter().position(|&column| column == channel)?;
+                let value = value - f64::from(frames[[frame, channel]]);
+                Some(Missing { frame, derivative, value })
+            }
+            WantedValue::Orientation(_) => None,
+        });
+        let Some(u) = correction(n, missing.collect(), n_pinned) else { continue };
+        let v = rates(&u);
+        let a = rates(&v);
+        for (column, change) in columns.into_iter().zip([u, v, a]) {
+            move_column(frames, column, &change, share);
+        }
+    }
+    turn(&asked, frames, n_pinned, share);
+    let with_others = [Channel::AngularVelocity, Channel::Phase, Channel::Style];
+    for channel in with_others.into_iter().flat_map(|group| group.range()) {
+        debug_assert!(channel < MOTION_DIM);
+        let missing = asked.iter().filter_map(|&(frame, wanted)| match wanted {
+            WantedValue::Value { channel: of, value } if of == channel => {
+                let value = value - f64::from(frames[[frame, channel]]);
+                Some(Missing { frame, derivative: 0, value })
+            }
+            _ => None,
+        });
+        let Some(u) = correction(n, missing.collect(), n_pinned) else { continue };
+        move_column(frames, channel, &u, share);
+    }
+}
+
+/// Turns frames to the orientations that are asked for, and their angular velocities with them.
+fn turn(asked: &[(usize, WantedValue)], frames: &mut Array2<f32>, n_pinned: usize, share: f64) {
+    let n = frames.nrows();
+    let missing: Vec<(usize, [f64; 3])> = asked
+        .iter()
+        .filter_map(|&(t, wanted)| match wanted {
+            WantedValue::Orientation(q) => {
+                Some((t, rotation_vector(q, orientation(frames.view(), t))))
+            }
+            WantedValue::Value { .. } => None,
+        })
+        .collect();
+    let turns: Option<Vec<Vec<f64>>> = (0..3)
+        .map(|axis| {
+            let of_axis = missing.iter();
+            let of_axis =
+                of_axis.map(|&(frame, v)| Missing { frame, derivative: 0, value: v[axis] });
+            correction(n, of_axis.collect(), n_pinned)
+        })
+        .collect();
+    let Some(turns) = turns else { return };
+    let mut turned: Vec<_> = (0..n)
+        .map(|t| {
+            let v = [0, 1, 2].map(|axis| share * turns[axis][t]);
+            mul(from_rotation_vector(v), orientation(frames.view(), t))
+        })
+        .collect();
+    make_sign_continuous(&mut turned);
+    for (mut row, q) in frames.rows_mut().into_iter().zip(turned) {
+        for (i, x) in Channel::Quaternion.range().zip(q) {
+            row[i] = x as f32;
+        }
+    }
+    for (column, turns) in Channel::AngularVelocity.range().zip(&turns) {
+        move_column(frames, column, &rates(turns), share);
+    }
+}
+
+/// Returns the smoothest correction of an axis; none where nothing is asked of it.
+fn correction(n: usize, mut missing: Vec<Missing>, n_pinned: usize) -> Option<Vec<f64>> {
+    if missing.is_empty() {
+        return None;
+    }
+    for frame in 0..n_pinned.min(n) {
+        if !missing.iter().any(|of| of.frame == frame && of.derivative == 0) {
+            missing.push(Missing { frame, derivative: 0, value: 0.0 });
+        }
+    }
+    Some(smoothest(n, &missing))
+}
+
+fn move_column(frames: &mut Array2<f32>, column: usize, change: &[f64], share: f64) {
+    for (x, change) in frames.column_mut(column).into_iter().zip(change) {
+        *x = (f64::from(*x) + share * change) as f32;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::generation::control::facing;
+    use crate::generation::walk::walk;
+    use crate::motion::ChannelLimits;
+
+    fn value(channel: usize, value: f64) -> WantedValue {
+        WantedValue::Value { channel, value }
+    }
+
+    fn constraints(wanted: Vec<(usize, WantedValue)>) -> Constraints {
+        Constraints::new(wanted, 400, ChannelLimits::Wide).expect("sound constraints")
+    }
+
+    #[test]
+    fn a_step_of_length_one_meets_what_is_asked_and_a_shorter_one_goes_its_share() {
+        let before = walk(121);
+        let (x, z) = (f64::from(before[[50, 0]]) + 0.3, f64::from(before[[90, 2]]) - 0.2);
+        let asked = constraints(vec![
+            (250, value(0, x)),
+            (290, value(2, z)),
+            (260, value(1, 1.1)),
+            (270, WantedValue::Orientation(facing(0.4))),
+            (280, value(16, 0.25)),
+            // Beyond these frames.
+            (350, value(0, 2.0)),
+        ]);
+        let mut moved = before.clone();
+        steer(&asked, &mut moved, 200, 3, 1.0);
+        for miss in asked.errors_from(moved.view(), 200) {
+            assert!(miss.error < 2e-4, "{miss:?}");
+        }
+        for t in 0..3 {
+            for channel in 0..3 {
+                let apart = (moved[[t, channel]] - before[[t, channel]]).abs();
+                assert!(apart < 2e-4, "frame {t}: {apart}");
+            }
+        }
+        let mut half = before.clone();
+        steer(&asked, &mut half, 200, 3, 0.5);
+        assert!((half[[50, 0]] - before[[50, 0]] - 0.15).abs() < 1e-3);
+        let mut none = before.clone();
+        steer(&asked, &mut none, 0, 3, 1.0);
+        assert_eq!(none, before, "nothing is asked of these frames");
+    }
+
+    #[test]
+    fn velocities_and_accelerations_go_along() {
+        let before = walk(121);
+        let x = f64::from(before[[60, 0]]) + 0.4;
+        let mut moved = before.clone();
+        steer(&constraints(vec![(60, value(0, x))]), &mut moved, 0, 1, 1.0);
+        let change =
+            |t: usize, channel: usize| f64::from(moved[[t, channel]] - before[[t, channel]]);
+        for t in 0..119 {
+            let v = 30.0 * (change(t + 1, 0) - change(t, 0));
+            assert!((change(t, 3) - v).abs() < 1e-3, "velocity at {t}");
+            let a = 30.0 * (change(t + 1, 3) - change(t, 3));
+            assert!((change(t, 6) - a).abs() < 2e-2, "acceleration at {t}");
+        }
+    }
+}

@@ -1,0 +1,15 @@
+//! Motion by tokens: the card of a model of the family `tokens`, the engines that run its networks, and motion for a
+//! track of any length.
+
+mod card;
+mod control;
+mod engine;
+mod planner;
+mod track;
+mod weights;
+
+pub use card::{TokensCard, TokensNetworks, TokensProvenance};
+pub use engine::TokenEngine;
+pub use planner::{PlanRequest, PlannerEngine};
+pub use track::{TokenGenerator, TokenTrack};
+pub use weights::tokens_parameters;

@@ -1,0 +1,173 @@
+//! The engine of a planner: which tokens go with a window of music.
+
+use std::num::NonZeroUsize;
+
+use ndarray::{Array2, ArrayView2, Axis};
+
+use crate::audio::FeatureScale;
+use crate::autodiff::{Arena, Eager, Interpreter as _, Parameters, Stream, Threads};
+use crate::diffusion::{TokenSampling, sample_autoregressive, sample_masked};
+use crate::generation::engine::EngineError;
+use crate::generation::pool::Pool;
+use crate::model::{Planner, PlannerConfig, PlannerInputs, PlannerKind, condition_scale};
+use crate::motion::style::STYLE_DIM;
+
+/// Runs a planner by the interpreter that trains it.
+pub struct PlannerEngine {
+    config: PlannerConfig,
+    planner: Planner,
+    parameters: Parameters<f32>,
+    /// Of the condition.
+    scale: FeatureScale,
+    workers: Pool<PlannerWorker>,
+}
+
+struct PlannerWorker {
+    threads: Threads,
+    arena: Arena<f32>,
+}
+
+/// A window whose tokens are asked for.
+#[derive(Clone, Copy, Debug)]
+pub struct PlanRequest<'a> {
+    /// Features as the table has them, then the clock of a network that hears it, \[T, condition_dim\].
+    pub condition: ArrayView2<'a, f32>,
+    /// Normalised style, for a network that takes one.
+    pub style: Option<[f32; STYLE_DIM]>,
+    /// The first tokens, where they are known.
+    pub given: &'a [u32],
+    /// 1 follows the music, more exaggerates it, 0 ignores it.
+    pub guidance: f64,
+    pub seed: u64,
+    /// Number of the window among those of the seed.
+    pub window: u64,
+}
+
+/// Streams of random numbers of plans, apart from those of the noise that motion is made of; 2^20 draws for each window.
+const PLANS: u64 = 1 << 62;
+const DRAWS_OF_A_WINDOW: u64 = 1 << 20;
+
+impl PlannerEngine {
+    /// Makes an engine of so many workers of so many threads each; `parameters` are those of [`Planner`].
+    ///
+    /// # Errors
+    /// When the system gives no threads.
+    pub fn new(
+        config: &PlannerConfig,
+        parameters: Parameters<f32>,
+        feature_scale: &FeatureScale,
+        (n_workers, n_threads): (NonZeroUsize, NonZeroUsize),
+    ) -> std::io::Result<Self> {
+        let worker =
+            |_| Ok(PlannerWorker { threads: Threads::start(n_threads)?, arena: Arena::default() });
+        let workers = (0..n_workers.get()).map(worker).collect::<std::io::Result<Vec<_>>>()?;
+        Ok(Self {
+            config: config.clone(),
+            planner: Planner::new(config).0,
+            parameters,
+            scale: condition_scale(config.condition(), feature_scale),
+            workers: Pool::new(workers),
+        })
+    }
+
+    /// Returns the sizes of the planner.
+    pub fn config(&self) -> &PlannerConfig {
+        &self.config
+    }
+
+    /// Draws the tokens of a window; same request, same tokens.
+    ///
+    /// # Errors
+    /// Shapes that do not fit, a token that is given and does not exist, and settings that nothing can be drawn by.
+    pub fn plan(
+        &self,
+        sampling: &TokenSampling,
+        request: &PlanRequest,
+    ) -> Result<Vec<u32>, EngineError> {
+        let mut condition = request.condition.to_owned();
+        self.scale.apply(condition.view_mut());
+        let (codes, n) = (self.config.codes, self.config.n_tokens(condition.nrows()));
+        let first = PLANS + request.window * DRAWS_OF_A_WINDOW;
+        let stream = |draw: usize| Stream::new(request.seed, first + draw as u64);
+        match self.config.kind {
+            PlannerKind::Masked => {
+                let mut given: Vec<Option<u32>> = request.given.iter().copied().map(Some).collect();
+                given.resize(n, None);
+                let logits = |tokens: &[u32]| self.logits(tokens, &condition, request);
+                let uniform = |draw: usize, numbers: &mut [f64]| stream(draw).uniform(0, numbers);
+                sample_masked(sampling, &given, codes, logits, uniform)
+            }
+            PlannerKind::Autoregressive => {
+                // The network is run over the whole window for every token: no state is kept from one to the next.
+                let logits = |tokens: &[u32]| {
+                    let mut padded = tokens.to_vec();
+                    padded.resize(n, 0);
+                    let logits = self.logits(&padded, &condition, request)?;
+                    Ok(logits.row(tokens.len()).to_vec())
+                };
+                let uniform = |draw: usize| {
+                    let mut number = [0.0_f64];
+                    stream(draw).uniform(0, &mut number);
+                    number[0]
+                };
+                sample_autoregressive(sampling, request.given, n, codes, logits, uniform)
+            }
+        }
+    }
+
+    /// Returns what the planner says of each position, guided: u + s (c − u), \[N, K\].
+    ///
+    /// `condition`: in units of its spread
+    ///
+    /// # Errors
+    /// Shapes that do not fit.
+    pub fn logits(
+        &self,
+        tokens: &[u32],
+        condition: &Array2<f32>,
+        request: &PlanRequest,
+    ) -> Result<Array2<f32>, EngineError> {
+        let s = request.guidance;
+        let dropped: &[f32] = match s {
+            1.0 => &[0.0],
+            0.0 => &[1.0],
+            _ => &[0.0, 1.0],
+        };
+        let n = dropped.len();
+        let repeated = |values: &mut dyn Iterator<Item = f32>| -> Vec<f32> {
+            let one: Vec<f32> = values.collect();
+            one.repeat(n)
+        };
+        let tokens_of = repeated(&mut tokens.iter().map(|&token| token as f32));
+        let audio = repeated(&mut condition.iter().copied());
+        let style = (self.config.style_dim > 0)
+            .then(|| repeated(&mut request.style.unwrap_or_default().into_iter()));
+        let logits = self.workers.with(|PlannerWorker { threads, arena }| {
+            threads.run(|| {
+                let mut g = Eager::new(&self.parameters, arena);
+                let tokens = g.constant(&[n, tokens.len()], &tokens_of);
+                let audio = g.constant(&[n, condition.nrows(), condition.ncols()], &audio);
+                let drop_audio = g.constant(&[n], dropped);
+                let style = style.as_ref().map(|style| g.constant(&[n, STYLE_DIM], style));
+                let inputs = PlannerInputs {
+                    tokens: &tokens,
+                    audio: &audio,
+                    drop_audio: Some(&drop_audio),
+                    style: style.as_ref(),
+                    mask: None,
+                };
+                let logits = self.planner.forward(&mut g, &inputs)?;
+                Ok::<_, EngineError>(logits.data().to_vec())
+            })
+        })?;
+        let shape = (n * tokens.len(), self.config.codes);
+        let all = Array2::from_shape_vec(shape, logits)
+            .expect("invariant: a row of codes for each token");
+        let (with, without) = all.view().split_at(Axis(0), tokens.len());
+        if n == 1 {
+            return Ok(with.to_owned());
+        }
+        let (to, away) = (s as f32, (1.0 - s) as f32);
+        Ok(&with * to + &without * away)
+    }
+}

@@ -1,0 +1,49 @@
+use super::*;
+use crate::model::outline::Outline;
+use crate::model::tokens::TokensConfig;
+use crate::model::unet::Preset;
+
+fn config(kind: PlannerKind, frames_per_token: usize, style_dim: usize) -> PlannerConfig {
+    let tokens = TokensConfig::of(Preset::Tiny).expect("a preset of the family");
+    let tiny = PlannerConfig::of(Preset::Tiny, kind, &tokens).expect("a preset of the family");
+    PlannerConfig { frames_per_token, style_dim, ..tiny }
+}
+
+#[test]
+fn shapes_are_followed_at_every_rate_and_every_parameter_is_met() {
+    for kind in [PlannerKind::Masked, PlannerKind::Autoregressive] {
+        for frames_per_token in [1, 2, 4, 8, 16] {
+            let config = config(kind, frames_per_token, 8);
+            let (planner, list) = Planner::new(&config);
+            let mut g = Outline::new(&list);
+            let (batch, frames) = (3, 37);
+            let n_tokens = config.n_tokens(frames);
+            let tokens = g.input(&[batch, n_tokens]);
+            let audio = g.input(&[batch, frames, config.condition().dim()]);
+            let (drop_audio, style) = (g.input(&[batch]), g.input(&[batch, 8]));
+            let inputs = PlannerInputs {
+                tokens: &tokens,
+                audio: &audio,
+                drop_audio: Some(&drop_audio),
+                style: Some(&style),
+                mask: Some(&tokens),
+            };
+            let logits = planner.forward(&mut g, &inputs).expect("shapes fit");
+            assert_eq!(logits, [batch, n_tokens, 32], "{} ρ = {frames_per_token}", kind.name());
+            let met: usize = g.layers().iter().map(|layer| layer.n_parameters).sum();
+            assert_eq!(met, list.n_elements(), "ρ = {frames_per_token}");
+        }
+    }
+}
+
+#[test]
+fn a_network_without_a_style_has_no_place_for_one() {
+    let names = |style_dim| -> Vec<String> {
+        let (_, list) = Planner::new(&config(PlannerKind::Masked, 4, style_dim));
+        list.iter().map(|(_, parameter)| parameter.name.clone()).collect()
+    };
+    let with = names(8);
+    let without: Vec<_> = with.iter().filter(|name| !name.starts_with("style.")).cloned().collect();
+    assert_eq!(with.len(), without.len() + 2);
+    assert_eq!(names(0), without);
+}

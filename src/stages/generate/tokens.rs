@@ -1,0 +1,342 @@
+//! Motion by tokens: a model of the family `tokens`, its settings, and how its motions are made.
+
+use std::num::NonZeroUsize;
+use std::time::Instant;
+
+use anyhow::{Context as _, bail};
+use ndarray::{Array2, ArrayView2, Axis, concatenate};
+use serde::{Deserialize, Serialize};
+
+use super::constraints_file::ConstraintsRequest;
+use super::maker::{
+    GeneratedMotion, MotionMaker, StopReason, generation_id, seed_of, worst_misses,
+};
+use super::music::PhraseMusic;
+use super::params::{Params, SamplingSettings, style};
+use super::report::GenerateSummary;
+use super::settings::OUTPUT_VERSION;
+use super::{make_all, name_of_model, weights_digest_of_tokens};
+use crate::diffusion::{SamplerConfig, Schedule, TokenSampling};
+use crate::evaluation::{derivative_error, score};
+use crate::generation::{
+    FamilyCard as _, PlannerEngine, TokenEngine, TokenGenerator, TokenTrack, TokensCard,
+    WeightedConstraints, tokens_parameters,
+};
+use crate::motion::postprocess::{PostProcessConfig, process, process_holding};
+use crate::motion::style::STYLE_DIM;
+use crate::motion::{Channel, MOTION_DIM};
+use crate::onnx::Model;
+use crate::stages::failure::{Failure, FailureKind, guarded};
+use crate::stages::model_folder::ModelFolder;
+use crate::stages::train::session::check_run_name;
+use crate::stages::{Progress, Summary};
+use crate::store::tables::GenerationRow;
+use crate::store::{Location, TimestampUs, digest};
+use crate::units::frames_to_s;
+
+/// The settings that determine a motion beside its music and its sample: the column `settings` of `generations`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct TokensSettings {
+    /// The version of what generate writes.
+    output_version: u32,
+    /// How tokens are drawn.
+    plan: TokenSampling,
+    /// How motion is made of them.
+    sampler: SamplerConfig,
+    /// Of the plan: 1 follows the music, more exaggerates it, 0 ignores it.
+    guidance: f64,
+    /// Style in the model's units.
+    style: Option<[f32; STYLE_DIM]>,
+    /// Tokens that neighbouring windows share.
+    overlap_tokens: usize,
+    postprocess: PostProcessConfig,
+    /// Digest of the constraints.
+    constraints: Option<String>,
+    /// Length of the steps by which the decoder is steered to constraints.
+    constraint_strength: f64,
+    /// Whether the rest of the way to constraints is left.
+    soft: bool,
+    /// Whether the clock is withheld from a network that hears it.
+    no_clock: bool,
+}
+
+impl TokensSettings {
+    fn new(
+        params: &Params,
+        card: &TokensCard,
+        constraints: Option<&ConstraintsRequest>,
+    ) -> anyhow::Result<Self> {
+        let only_others = [
+            ("--prime", params.prime.is_some(), "unet"),
+            ("--best-of", params.best_of.get() > 1, "unet"),
+            ("--dancers", params.dancers.is_some_and(|n| n != 1), "group"),
+            ("--consistency", params.consistency.is_some(), "group"),
+        ];
+        if let Some((flag, _, family)) = only_others.into_iter().find(|(_, is_given, _)| *is_given)
+        {
+            bail!(
+                "{flag}: model {} is of the family tokens, which does not know it; leave it out, or name a model of \
+                 the family {family}",
+                card.name
+            );
+        }
+        let SamplingSettings { sampler, guidance, overlap_frames } = params.sampling(card)?;
+        // Unless steps are asked for, motion is made as in the paper.
+        let sampler = if params.steps.is_none() { SamplerConfig::fast27() } else { sampler };
+        sampler.check(Schedule::new(&card.diffusion)?.len())?;
+        let plan = TokenSampling {
+            n_iterations: params.plan_iterations,
+            temperature: params.plan_temperature,
+            top_share: params.plan_top,
+            ..TokenSampling::default()
+        };
+        plan.check()?;
+        Ok(Self {
+            output_version: OUTPUT_VERSION,
+            plan,
+            sampler,
+            guidance,
+            style: style(
+                &params.style,
+                (&card.name, card.planner.style_dim > 0),
+                &card.normalizer,
+            )?,
+            // A window goes on from one token at least.
+            overlap_tokens: (overlap_frames / card.tokens.frames_per_token).max(1),
+            postprocess: params.postprocess.config((card.motion_range, card.fusion_variances()))?,
+            constraints: constraints.map(|asked| digest(format!("{asked:?}").as_bytes())),
+            constraint_strength: params.checked_constraint_strength()?,
+            soft: params.soft,
+            no_clock: params.no_clock,
+        })
+    }
+
+    /// Returns the settings as JSON in the order of these fields, the same in every build.
+    fn text(&self) -> String {
+        serde_json::to_string(self).expect("invariant: numbers and texts become JSON")
+    }
+}
+
+/// Runs the stage with a model of tokens.
+///
+/// # Errors
+/// Settings that the model does not know, and what files or the store say.
+pub fn run(
+    params: &Params,
+    store: Option<&Location>,
+    files: ModelFolder,
+    progress: &dyn Progress,
+) -> anyhow::Result<Box<dyn Summary>> {
+    let started = Instant::now();
+    let card = TokensCard::read(files.card_bytes(), files.card_place())?;
+    let constraints = params.constraints_asked()?;
+    let settings = TokensSettings::new(params, &card, constraints.as_ref())?;
+    let name = name_of_model(params, &card.name);
+    let run = params.run.clone().unwrap_or_else(|| name.clone());
+    check_run_name(&run)?;
+    let is_single = params.audio.len() == 1 || params.phrase.len() == 1;
+    let threads = params.engine.threads;
+    let n_workers = if is_single { NonZeroUsize::MIN } else { threads };
+    let n_threads = NonZeroUsize::new(threads.get() / n_workers.get()).unwrap_or(NonZeroUsize::MIN);
+    let workers = (n_workers, n_threads);
+    let (of_tokenizer, of_planner) = tokens_parameters(&card, |name| -> anyhow::Result<_> {
+        let place = files.place_of(name);
+        Ok((Model::read(files.read(name)?, None, &place)?, place))
+    })?;
+    let tokens =
+        TokenEngine::new(&card.tokens, of_tokenizer, &card.normalizer, card.window_frames, workers)
+            .context("while starting threads")?;
+    let planner = PlannerEngine::new(&card.planner, of_planner, &card.feature_scale, workers)
+        .context("while starting threads")?;
+    let schedule = Schedule::new(&card.diffusion)?;
+    let maker = TokensMaker {
+        generator: TokenGenerator {
+            tokens: &tokens,
+            planner: &planner,
+            plan: &settings.plan,
+            sampler: &settings.sampler,
+            schedule: &schedule,
+            guidance: settings.guidance,
+            overlap_tokens: settings.overlap_tokens,
+        },
+        card: &card,
+        weights: weights_digest_of_tokens(&card),
+        model: &name,
+        run: &run,
+        seed: params.seed,
+        settings: &settings,
+        constraints: constraints.as_ref(),
+    };
+    let (place, done) = make_all(params, store, &maker, tokens.n_workers(), progress)?;
+    let made_with = format!(
+        "model {name} (family tokens, {}), {ENGINE} ({}), plans in {} iterations, {} in {} steps, guidance {}",
+        card.planner.kind.name(),
+        tokens.n_workers(),
+        settings.plan.n_iterations,
+        settings.sampler.sampler.name(),
+        settings.sampler.n_steps,
+        settings.guidance
+    );
+    let (dry_run, took_s) = (params.dry_run, started.elapsed().as_secs_f64());
+    Ok(Box::new(GenerateSummary { place, done, model: name, made_with, dry_run, took_s }))
+}
+
+/// Name of the one engine that runs models of tokens: the interpreter that trains them.
+const ENGINE: &str = "eager";
+
+/// Generates motions by tokens.
+struct TokensMaker<'a> {
+    generator: TokenGenerator<'a>,
+    card: &'a TokensCard,
+    weights: String,
+    model: &'a str,
+    run: &'a str,
+    seed: u64,
+    settings: &'a TokensSettings,
+    constraints: Option<&'a ConstraintsRequest>,
+}
+
+impl MotionMaker for TokensMaker<'_> {
+    fn model(&self) -> &str {
+        self.model
+    }
+
+    fn weights(&self) -> &str {
+        &self.weights
+    }
+
+    fn run(&self) -> &str {
+        self.run
+    }
+
+    fn seed(&self) -> u64 {
+        self.seed
+    }
+
+    fn settings(&self) -> serde_json::Value {
+        serde_json::to_value(self.settings).expect("invariant: numbers and texts become JSON")
+    }
+
+    fn settings_digest(&self) -> String {
+        let text = format!("{}\n{}\n{}", self.settings.text(), self.weights, self.seed);
+        digest(text.as_bytes())
+    }
+
+    fn make(
+        &self,
+        music: &PhraseMusic,
+        sample: usize,
+        watch: &mut dyn FnMut(ArrayView2<f32>) -> std::io::Result<()>,
+    ) -> Result<GeneratedMotion, Failure> {
+        guarded(music.source, || self.sample(music, sample, watch))
+    }
+}
+
+impl TokensMaker<'_> {
+    fn sample(
+        &self,
+        music: &PhraseMusic,
+        sample: usize,
+        watch: &mut dyn FnMut(ArrayView2<f32>) -> std::io::Result<()>,
+    ) -> Result<GeneratedMotion, Failure> {
+        let started = Instant::now();
+        let heard = music.heard_by(self.card.planner.condition(), self.settings.no_clock);
+        let bars = heard.bars();
+        let n_frames = music.features.nrows();
+        let (limits, strength) =
+            (self.settings.postprocess.limits, self.settings.constraint_strength);
+        let constraints = match self.constraints.map(|asked| asked.of_track(n_frames, limits)) {
+            Some(Err(e)) => return Err(Failure::new(FailureKind::Constraint, music.source, e)),
+            Some(Ok(constraints)) => Some(constraints),
+            None => None,
+        };
+        let kept = constraints.as_ref().filter(|_| !self.settings.soft);
+        let held = kept.map(|constraints| constraints.held(n_frames)).unwrap_or_default();
+        let seed = seed_of(self.seed, music.phrase_id, sample, 0);
+        let track = TokenTrack {
+            condition: heard.condition.view(),
+            phase: heard.clock_phase(),
+            style: self.settings.style,
+            constraints: constraints
+                .as_ref()
+                .map(|constraints| WeightedConstraints { constraints, strength }),
+            seed,
+        };
+        let mut parts: Vec<Array2<f32>> = Vec::new();
+        let emit = |frames: Array2<f32>| -> Result<(), StopReason> {
+            watch(frames.view()).map_err(StopReason::Watcher)?;
+            parts.push(frames);
+            Ok(())
+        };
+        self.generator.run(&track, emit).map_err(|stop| stop.of(music.source))?;
+        let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
+        let mut decoded =
+            concatenate(Axis(0), &views).unwrap_or_else(|_| Array2::zeros((0, MOTION_DIM)));
+        if let Some(constraints) = kept {
+            // What blending of windows has moved.
+            constraints.bend(&mut decoded, 0, 1.0);
+        }
+        let mut frames = decoded.clone();
+        let postprocess = &self.settings.postprocess;
+        let displacement = process_holding(postprocess, &mut frames, bars, &held);
+        if let Some(constraints) = kept {
+            // Smoothing and limits have moved it, by millimetres; what follows from poses follows again.
+            constraints.bend(&mut frames, 0, 1.0);
+            process(&postprocess.without_smoothing(), &mut frames, bars);
+        }
+        let seconds = started.elapsed().as_secs_f64();
+        let mut row =
+            self.row(music, (sample, seed), (&frames, &decoded), heard.phase.as_deref(), seconds);
+        let misses = constraints.as_ref().map(|c| c.errors(frames.view())).unwrap_or_default();
+        [row.control_error_mm, row.control_error_deg] = worst_misses(&misses);
+        let [frames, decoded] = [frames, decoded].map(|motion| motion.insert_axis(Axis(0)));
+        Ok(GeneratedMotion { frames, decoded, rows: vec![row], displacement, seconds })
+    }
+
+    fn row(
+        &self,
+        music: &PhraseMusic,
+        (sample, seed): (usize, u64),
+        (frames, decoded): (&Array2<f32>, &Array2<f32>),
+        phase: Option<&[f64]>,
+        generate_s: f64,
+    ) -> GenerationRow {
+        let settings = self.settings;
+        let n_frames = frames.nrows();
+        let velocity_error = derivative_error(decoded.view(), Channel::Position, Channel::Velocity);
+        let score = score(frames.view(), settings.postprocess.limits, phase, velocity_error);
+        GenerationRow {
+            generation: generation_id(self.run, music.phrase_id, sample),
+            run: self.run.to_owned(),
+            phrase_id: music.phrase_id.to_owned(),
+            sample: sample as i32,
+            candidate: 0,
+            selected: true,
+            seed: seed as i64,
+            model: self.model.to_owned(),
+            weights: self.weights.clone(),
+            engine: ENGINE.to_owned(),
+            sampler: settings.sampler.sampler.name().to_owned(),
+            n_steps: settings.sampler.n_steps as i32,
+            guidance: settings.guidance,
+            eta: settings.sampler.sampler.eta(),
+            primed_by: None,
+            n_frames: n_frames as i64,
+            n_windows: self.generator.n_windows(n_frames) as i32,
+            score: score.total,
+            checks_passed: score.n_passed as i32,
+            n_checks: score.n_checks as i32,
+            locking: score.locking,
+            velocity_error,
+            control_error_mm: None,
+            control_error_deg: None,
+            generate_s,
+            real_time_factor: generate_s / frames_to_s(n_frames).max(f64::MIN_POSITIVE),
+            settings: Some(settings.text()),
+            content_hash: Some(music.content_hash.to_owned()),
+            n_dancers: Some(1),
+            consistency: None,
+            time: TimestampUs::now(),
+        }
+    }
+}

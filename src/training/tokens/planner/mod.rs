@@ -1,0 +1,233 @@
+//! Training of a planner: the tokens of a tokenizer that does not change any more, from the music.
+//!
+//! Windows are cut, changed and placed as for the tokenizer, and become tokens when they are learned from, so that
+//! motion that is mirrored or stretched has tokens of its own.
+
+mod config;
+mod inputs;
+
+use std::sync::Arc;
+
+use crate::autodiff::{Arena, Eager, Gradients, Interpreter as _, Parameters, Tape, Threads};
+use crate::model::{Planner, PlannerConfig, Tokenizer, TokensConfig};
+use crate::motion::MOTION_DIM;
+use crate::training::averaged::NetworkState;
+use crate::training::batch::Batch;
+use crate::training::checkpoint::Progress;
+use crate::training::diffusion::tape_seed;
+use crate::training::drive::{Learner, Losses, NoReduction, Reducer, StepResult, Validation};
+use crate::training::error::TrainingError;
+use crate::training::window::Windows;
+use crate::weights::{Archive, Section};
+
+use super::{MAX_VALIDATION_WINDOWS, MIN_VALIDATION_WINDOWS, VALIDATION_BATCH};
+pub use config::{PlannerNetworkConfig, PlannerTrainConfig, PlannerTraining, TokenizerSource};
+use inputs::{PlannerBatch, PlannerChances};
+
+/// Numbers of the seeds of masks, apart from those of tapes.
+const MASKS: u64 = 1 << 62;
+
+/// Name of the section of the weights.
+pub const PLANNER: &str = "planner.";
+
+/// A tokenizer that does not change any more.
+#[derive(Clone, Debug)]
+pub struct FrozenTokenizer {
+    tokenizer: Tokenizer,
+    sizes: TokensConfig,
+    parameters: Parameters<f32>,
+}
+
+impl FrozenTokenizer {
+    /// Holds a tokenizer; `parameters` are those of [`Tokenizer`].
+    pub fn new(sizes: &TokensConfig, parameters: Parameters<f32>) -> Self {
+        Self { tokenizer: Tokenizer::new(sizes).0, sizes: sizes.clone(), parameters }
+    }
+
+    /// Returns the sizes of the tokenizer.
+    pub fn sizes(&self) -> &TokensConfig {
+        &self.sizes
+    }
+
+    /// Returns the tokens of the windows of a batch, \[B, N\], window after window.
+    fn tokens(&self, batch: &Batch, arena: &Arena<f32>) -> Result<Vec<u32>, TrainingError> {
+        let mut g = Eager::new(&self.parameters, arena);
+        let motion = g.constant(&[batch.n_windows, batch.n_frames, MOTION_DIM], &batch.motion);
+        let found = self.tokenizer.quantize(&mut g, &motion)?;
+        Ok(found.tokens.data().iter().map(|&token| token as u32).collect())
+    }
+}
+
+/// Trains a planner.
+pub struct PlannerLearner {
+    planner: Arc<Planner>,
+    network: NetworkState,
+    tokenizer: FrozenTokenizer,
+    /// Of the parts that are done side by side; the first gathers all.
+    gradients: Vec<Gradients<f32>>,
+    arenas: Vec<Arena<f32>>,
+    threads: Arc<Threads>,
+    sizes: PlannerConfig,
+    config: PlannerTraining,
+    seed: u64,
+    windows: Arc<Windows>,
+    reducer: Box<dyn Reducer>,
+}
+
+impl PlannerLearner {
+    /// Begins with weights that depend on the seed; `windows` are in the scales of the tokenizer.
+    ///
+    /// # Errors
+    /// A configuration that makes no network, or that does not fit the tokenizer.
+    pub fn new(
+        network: &PlannerNetworkConfig,
+        config: &PlannerTraining,
+        tokenizer: FrozenTokenizer,
+        windows: &Arc<Windows>,
+        seed: u64,
+    ) -> Result<Self, TrainingError> {
+        network.check(tokenizer.sizes())?;
+        let sizes = network.planner.clone();
+        let (planner, list) = Planner::new(&sizes);
+        let parameters = Parameters::new(list, seed);
+        let n_parts = config.side_by_side.max(1);
+        Ok(Self {
+            planner: Arc::new(planner),
+            gradients: (0..n_parts).map(|_| Gradients::new(&parameters)).collect(),
+            network: NetworkState::new(PLANNER, parameters, &config.optimizer, config.ema),
+            tokenizer,
+            arenas: (0..n_parts).map(|_| Arena::default()).collect(),
+            threads: Arc::new(Threads::of_process()),
+            sizes,
+            config: config.clone(),
+            seed,
+            windows: Arc::clone(windows),
+            reducer: Box::new(NoReduction),
+        })
+    }
+
+    /// Has steps run on threads; the results are the same on any.
+    pub fn on(mut self, threads: &Arc<Threads>) -> Self {
+        self.threads = Arc::clone(threads);
+        self
+    }
+
+    /// Computes the gradients of a batch, part by part; returns its loss.
+    fn differentiate(&mut self, batch: &Batch, step: u64) -> Result<f64, TrainingError> {
+        let side_by_side = self.gradients.len();
+        let n_parts = (self.config.accumulate * side_by_side).clamp(1, batch.n_windows);
+        let at = |part: usize| part * batch.n_windows / n_parts;
+        let seed = self.seed;
+        let Self { gradients, arenas, network, planner, tokenizer, sizes, config, threads, .. } =
+            &mut *self;
+        let parameters = network.live();
+        gradients.iter_mut().for_each(Gradients::clear);
+        let tokens = threads.run(|| tokenizer.tokens(batch, &arenas[0]))?;
+        // Of the whole batch, so that masks do not depend on how it is parted.
+        let masks = tape_seed(seed, MASKS + step);
+        let given = PlannerBatch::of(batch, &tokens, sizes, (&*config).into(), masks);
+        let all = given.weight(0..batch.n_windows);
+        let mut loss = 0.0;
+        for first in (0..n_parts).step_by(side_by_side) {
+            let numbers = first..(first + side_by_side).min(n_parts);
+            let parts: Vec<_> = numbers.zip(gradients.iter_mut().zip(arenas.iter())).collect();
+            let found = threads.side_by_side(parts, |(part, (gradients, arena))| {
+                let windows = at(part)..at(part + 1);
+                let share = given.weight(windows.clone()) / all.max(1.0);
+                let seed = tape_seed(seed, step * n_parts as u64 + part as u64);
+                let mut tape = Tape::new(parameters, arena, Some(seed));
+                let loss = given.loss(&mut tape, planner, windows)?;
+                let value = f64::from(loss.scalar());
+                let weight = tape.constant(&[], &[share as f32]);
+                tape.backward_from(loss, weight, gradients)?;
+                Ok::<_, TrainingError>(share * value)
+            });
+            for part in found {
+                loss += part?;
+            }
+        }
+        let (whole, others) = gradients.split_first_mut().expect("at least one");
+        threads.run(|| others.iter_mut().for_each(|other| whole.add_all(other)));
+        self.reducer.reduce(&mut self.gradients[0]);
+        Ok(loss)
+    }
+
+    /// Returns the mean loss of the validation windows with some weights.
+    ///
+    /// Shares that are masked are spread evenly, and all that is asked for is hidden.
+    fn validation_loss(&self, parameters: &Parameters<f32>) -> Result<f64, TrainingError> {
+        let n = self.windows.n_validation();
+        let n_wanted = n.clamp(MIN_VALIDATION_WINDOWS, MAX_VALIDATION_WINDOWS);
+        let (mut sum, mut weight) = (0.0, 0.0);
+        for first in (0..n_wanted).step_by(VALIDATION_BATCH) {
+            let range = first..(first + VALIDATION_BATCH).min(n_wanted);
+            let batch = self.windows.validation(range)?;
+            let chances = PlannerChances::default();
+            let of_batch = self.threads.run(|| {
+                let tokens = self.tokenizer.tokens(&batch, &self.arenas[0])?;
+                let given = PlannerBatch::of(&batch, &tokens, &self.sizes, chances, first as u64);
+                let mut g = Eager::new(parameters, &self.arenas[0]);
+                let windows = 0..batch.n_windows;
+                let loss = given.loss(&mut g, &self.planner, windows.clone())?;
+                Ok::<_, TrainingError>((f64::from(loss.scalar()), given.weight(windows)))
+            })?;
+            sum += of_batch.0 * of_batch.1;
+            weight += of_batch.1;
+        }
+        Ok(sum / weight.max(1.0))
+    }
+}
+
+/// Returns a loss that has no parts.
+fn whole(total: f64) -> Losses {
+    Losses { total, parts: Vec::new() }
+}
+
+impl Learner for PlannerLearner {
+    const STAGE: &'static str = "planner";
+
+    fn step(
+        &mut self,
+        batch: &Batch,
+        step: u64,
+        n_steps: u64,
+    ) -> Result<StepResult, TrainingError> {
+        let loss = self.differentiate(batch, step)?;
+        let learning_rate = self.config.learning_rate.at(step, n_steps);
+        let Self { network, gradients, threads, .. } = self;
+        let gradient_norm =
+            threads.run(|| network.step(&mut gradients[0], loss, learning_rate, step));
+        Ok(StepResult { losses: whole(loss), gradient_norm, learning_rate, lr_decoder: None })
+    }
+
+    fn rehearse(&mut self, batch: &Batch) -> Result<(), TrainingError> {
+        self.differentiate(batch, 0).map(|_| ())
+    }
+
+    fn validate(&mut self) -> Result<Validation, TrainingError> {
+        let loss = self.validation_loss(self.network.average())?;
+        let live = self.validation_loss(self.network.live())?;
+        Ok(Validation { losses: whole(loss), live: Some(live), distance: None })
+    }
+
+    fn sections(&self) -> Vec<Section<'_, f32>> {
+        self.network.sections()
+    }
+
+    fn best(&self) -> Vec<Section<'_, f32>> {
+        self.network.best()
+    }
+
+    fn n_updates(&self) -> (u64, u64) {
+        self.network.n_updates()
+    }
+
+    fn restore(
+        &mut self,
+        archive: &Archive,
+        place: &str,
+        at: &Progress,
+    ) -> Result<(), TrainingError> {
+        self.network.restore(archive, place, at)
+    }
+}
