@@ -122,7 +122,7 @@ impl TokenGenerator<'_> {
             n_given += frames.nrows();
             emit(frames)
         };
-        let mut joiner = Joiner::new();
+        let mut joiner = Joiner::new(self.tokens.normalizer().layout());
         let mut before: Option<Window> = None;
         for i in 0..windows.of_tokens.len() {
             let place = match &before {
@@ -174,7 +174,7 @@ impl TokenGenerator<'_> {
             let mut motion = x0.index_axis(Axis(0), 0).to_owned();
             normalizer.denormalize(motion.view_mut());
             if let Some(before) = before {
-                follow(before.view(), &mut motion, shift);
+                follow(normalizer.layout(), before.view(), &mut motion, shift);
             }
             if let Some(WeightedConstraints { constraints, strength }) = steered {
                 let n_pinned = PINNED_FRAMES[usize::from(before.is_some())];

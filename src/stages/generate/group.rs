@@ -104,7 +104,9 @@ impl GroupSettings {
             "--consistency {consistency} is not from -1 to 1; give -1 for dancers who go each a way of their own, 1 \
              for unison"
         );
-        let consistency_scale = params.consistency_scale.unwrap_or(1.0);
+        let consistency_form = ConsistencyForm::from(params.consistency_form);
+        let usual_scale = consistency_form.usual_scale();
+        let consistency_scale = params.consistency_scale.unwrap_or(usual_scale);
         ensure!(
             consistency_scale.is_finite() && consistency_scale >= 0.0,
             "--consistency-scale {consistency_scale} is no factor; give a number from 0 up"
@@ -114,7 +116,7 @@ impl GroupSettings {
             output_version: OUTPUT_VERSION,
             n_dancers,
             consistency,
-            consistency_form: params.consistency_form.into(),
+            consistency_form,
             consistency_scale,
             sampler,
             guidance,

@@ -38,6 +38,7 @@ pub enum SamplerName {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum ConsistencyFormName {
     #[default]
+    Direction,
     Estimate,
     Noise,
     Mean,
@@ -46,6 +47,7 @@ pub enum ConsistencyFormName {
 impl From<ConsistencyFormName> for ConsistencyForm {
     fn from(name: ConsistencyFormName) -> Self {
         match name {
+            ConsistencyFormName::Direction => Self::Direction,
             ConsistencyFormName::Estimate => Self::Estimate,
             ConsistencyFormName::Noise => Self::Noise,
             ConsistencyFormName::Mean => Self::Mean,
@@ -155,12 +157,14 @@ pub struct Params {
     #[arg(long, value_name = "GAMMA", allow_hyphen_values = true, help_heading = "Groups",
           hide_short_help = RARE)]
     pub consistency: Option<f64>,
-    /// What --consistency moves at every step: the estimate, by its own gradient; or, more slowly, the noise
-    /// that is predicted (Dhariwal and Nichol) or the mean of the step (the paper), by the gradient through the network.
+    /// What --consistency moves at every step: the estimate, by a set length along the gradient, or by the gradient as it
+    /// is; or, more slowly, the noise that is predicted (Dhariwal and Nichol) or the mean of the step (the paper), by the
+    /// gradient through the network.
     #[arg(long, value_name = "FORM", value_enum, default_value_t, help_heading = "Groups",
           hide_short_help = RARE)]
     pub consistency_form: ConsistencyFormName,
-    /// How far --consistency 1 or -1 goes, as a factor of the gradient [default: what the model's card says, or 1].
+    /// How far --consistency 1 or -1 goes, as a factor of the gradient [default: 0.1
+    /// of a direction, 1 of the other forms].
     #[arg(long, value_name = "S", help_heading = "Groups", hide_short_help = RARE)]
     pub consistency_scale: Option<f64>,
     /// Let bodies touch where they were sampled so, instead of moving them apart.

@@ -303,7 +303,11 @@ impl TokensMaker<'_> {
     ) -> GenerationRow {
         let settings = self.settings;
         let n_frames = frames.nrows();
-        let velocity_error = derivative_error(decoded.view(), Channel::Position, Channel::Velocity);
+        let velocity_error = derivative_error(
+            decoded.view(),
+            Channel::Position.columns(),
+            Channel::Velocity.columns(),
+        );
         let score = score(frames.view(), settings.postprocess.limits, phase, velocity_error);
         GenerationRow {
             generation: generation_id(self.run, music.phrase_id, sample),

@@ -104,6 +104,7 @@ fn every_form_has_the_factor_of_its_formula() {
             let alpha_bar = |t: usize| schedule.alpha_bar(t);
             let before = if t == 0 { 1.0 } else { alpha_bar(t - 1) };
             for (form, expected) in [
+                (ConsistencyForm::Direction, (1.0 - alpha_bar(t)).sqrt()),
                 (ConsistencyForm::Estimate, 1.0 - alpha_bar(t)),
                 (ConsistencyForm::Noise, (1.0 - alpha_bar(t)) / alpha_bar(t).sqrt()),
                 (ConsistencyForm::Mean, (1.0 - before) / before.sqrt()),
@@ -132,6 +133,31 @@ fn the_estimate_moves_along_the_gradient_of_the_score_at_the_estimate() {
             let scores = engine.score(&case.inputs(x0, (ConsistencyForm::Estimate, 0.0)));
             scores.expect("shapes fit").iter().map(|s| f64::from(s.agreement)).sum()
         });
+    }
+}
+
+#[test]
+fn a_direction_is_that_of_the_estimate_and_has_the_same_length_for_every_group() {
+    let (engine, case) = (engine(), Case::new());
+    let predict =
+        |form, factor| engine.predict(&case.inputs(&case.x, (form, factor))).expect("shapes fit");
+    let x0 = predict(ConsistencyForm::Estimate, 0.0);
+    let by_gradient = predict(ConsistencyForm::Estimate, 1.0) - &x0;
+    for factor in [0.5, -0.25] {
+        let added = predict(ConsistencyForm::Direction, factor) - &x0;
+        for group in 0..N_GROUPS {
+            let rows = ndarray::s![group * N_DANCERS..(group + 1) * N_DANCERS, .., ..];
+            let (added, gradient) = (added.slice(rows), by_gradient.slice(rows));
+            let dot = |a: ndarray::ArrayView3<f32>, b: ndarray::ArrayView3<f32>| -> f64 {
+                a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
+            };
+            let rms = (dot(added, added) / added.len() as f64).sqrt();
+            assert!((rms - factor.abs()).abs() < 1e-3, "group {group}: {rms}");
+            let cosine =
+                dot(added, gradient) / (dot(added, added) * dot(gradient, gradient)).sqrt();
+            // A difference of estimates near 1 keeps five digits of a gradient of 1e-3.
+            assert!((cosine - factor.signum()).abs() < 1e-3, "group {group}: {cosine}");
+        }
     }
 }
 
