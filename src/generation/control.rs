@@ -260,7 +260,11 @@ impl Constraints {
     }
 
     /// The constraints of some frames, which are counted from `first`.
-    pub(super) fn in_range(&self, first: usize, n: usize) -> impl Iterator<Item = (usize, WantedValue)> + '_ {
+    pub(super) fn in_range(
+        &self,
+        first: usize,
+        n: usize,
+    ) -> impl Iterator<Item = (usize, WantedValue)> + '_ {
         let inside = move |&(frame, wanted): &(usize, WantedValue)| {
             frame.checked_sub(first).filter(|t| *t < n).map(|t| (t, wanted))
         };

@@ -58,8 +58,7 @@ pub fn sampling_defaults(
         };
         let made = windows.iter().enumerate().map(|(i, window)| {
             let (condition, seed) = (window.heard.view(), SEED + i as u64);
-            let track =
-                TokenTrack { condition, phase: None, style: None, constraints: None, seed };
+            let track = TokenTrack { condition, phase: None, style: None, constraints: None, seed };
             let mut parts: Vec<Array2<f32>> = Vec::new();
             generator.run(&track, |frames| -> Result<(), EngineError> {
                 parts.push(frames);
