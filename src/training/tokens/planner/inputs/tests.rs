@@ -63,7 +63,7 @@ fn masked_tokens_are_as_many_as_the_cosine_says_and_never_beyond_a_phrase() {
         (hidden - 0.9 * 0.88).abs() < 5.0 * (0.79 * 0.21 / seen.len() as f64).sqrt(),
         "{hidden}"
     );
-    assert!(seen.iter().all(|&z| z <= 32.0 && z >= 0.0));
+    assert!(seen.iter().all(|z| (0.0..=32.0).contains(z)));
 }
 
 #[test]
