@@ -93,7 +93,8 @@ fn a_card_in_a_bucket_names_no_file_outside_the_cache() {
     assert_eq!((output.code, output.stdout.as_str()), (2, ""), "{}", output.stderr);
     let start = format!(
         "error: {}: is no description of a model (a model has no file {absolute:?}, only unet.onnx, \
-         unet.weights.bin, decoder.onnx, decoder.weights.bin, denoiser.onnx, score.onnx at line 1 column ",
+         unet.weights.bin, decoder.onnx, decoder.weights.bin, denoiser.onnx, score.onnx, encoder.onnx, signal.onnx, \
+         planner.onnx at line 1 column ",
         stores.url(&bucket, "st/models/m/model.json")
     );
     assert!(output.stderr.starts_with(&start), "{}", output.stderr);

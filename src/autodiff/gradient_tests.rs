@@ -441,9 +441,14 @@ fn dancers_are_folded_without_moving_a_number_and_refused_where_they_do_not_fit(
     // Groups of 3: dancers 0 to 2 and 3 to 5, of whom 1 is not there, and nobody of a third mask.
     let there = g.input(&[2, 3], &[1.0, 0.0, 1.0, 1.0, 1.0, 1.0]);
     let mean = g.mean_dancers(&x, &two, Some(&there)).expect("shapes fit");
-    assert_eq!((mean.shape(), mean.data()), (&[2, 2, 1][..], &[2.0, 3.0, 8.0, 9.0][..]));
-    let mean = g.mean_dancers(&x, &two, None).expect("shapes fit");
-    assert_eq!(mean.data(), &[2.0, 3.0, 8.0, 9.0]);
+    assert_eq!(mean.shape(), [2, 2, 1]);
+    let all = g.mean_dancers(&x, &two, None).expect("shapes fit");
+    for (found, expected) in
+        mean.data().iter().chain(all.data()).zip([2.0, 3.0, 8.0, 9.0].repeat(2))
+    {
+        // Thirds are rounded.
+        assert!((found - expected).abs() < 1e-14 * expected, "{found}, {expected}");
+    }
     let nobody = g.input(&[2, 3], &[0.0; 6]);
     let mean = g.mean_dancers(&x, &two, Some(&nobody)).expect("shapes fit");
     assert_eq!(mean.data(), &[0.0; 4]);

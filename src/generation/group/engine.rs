@@ -59,8 +59,8 @@ pub enum ConsistencyForm {
     /// x̂0' = x̂0 + γ s √(1−ᾱ_t) ∇/rms(∇), ∇ by x̂0 and its root mean square over the numbers of a group.
     ///
     /// A step of γ s standard deviations of what the noise leaves open, uphill. The length of a score's gradient
-    /// is nothing that its training fixes: that of a model of 300 steps was some 1e-4 for each number, so that the
-    /// other forms moved nothing at s = 1 (docs/groups.md). Yang et al., "Guidance with Spherical Gaussian
+    /// is nothing that its training fixes: a model of 300 steps moved nothing at s = 1 and 300 by the form `Estimate`, so that the
+    /// strength would be another for every model (docs/groups.md). Yang et al., "Guidance with Spherical Gaussian
     /// Constraint for Conditional Diffusion", ICML 2024, fix the length likewise.
     #[default]
     Direction,
@@ -99,14 +99,6 @@ impl ConsistencyForm {
 }
 
 impl ConsistencyForm {
-    /// Returns s, unless the user says otherwise.
-    pub fn usual_scale(self) -> f64 {
-        match self {
-            Self::Direction => 0.1,
-            Self::Estimate | Self::Noise | Self::Mean => 1.0,
-        }
-    }
-
     /// Returns whether the gradient is by x_t, through the denoiser.
     fn is_by_noisy_motion(self) -> bool {
         matches!(self, Self::Noise | Self::Mean)

@@ -105,8 +105,7 @@ impl GroupSettings {
              for unison"
         );
         let consistency_form = ConsistencyForm::from(params.consistency_form);
-        let usual_scale = consistency_form.usual_scale();
-        let consistency_scale = params.consistency_scale.unwrap_or(usual_scale);
+        let consistency_scale = params.consistency_scale;
         ensure!(
             consistency_scale.is_finite() && consistency_scale >= 0.0,
             "--consistency-scale {consistency_scale} is no factor; give a number from 0 up"

@@ -163,10 +163,10 @@ pub struct Params {
     #[arg(long, value_name = "FORM", value_enum, default_value_t, help_heading = "Groups",
           hide_short_help = RARE)]
     pub consistency_form: ConsistencyFormName,
-    /// How far --consistency 1 or -1 goes, as a factor of the gradient [default: 0.1
-    /// of a direction, 1 of the other forms].
-    #[arg(long, value_name = "S", help_heading = "Groups", hide_short_help = RARE)]
-    pub consistency_scale: Option<f64>,
+    /// How far --consistency 1 or -1 goes: standard deviations of what is open yet a step, by a direction; a factor of the
+    /// gradient, by the other forms.
+    #[arg(long, value_name = "S", default_value_t = 1.0, help_heading = "Groups", hide_short_help = RARE)]
+    pub consistency_scale: f64,
     /// Let bodies touch where they were sampled so, instead of moving them apart.
     #[arg(long, help_heading = "Groups", hide_short_help = RARE)]
     pub no_separation: bool,
