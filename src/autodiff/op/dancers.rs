@@ -150,7 +150,7 @@ impl<E: Element> Operation<E> for MeanDancers {
             for (i, (x, &share)) in x.data().chunks_exact(size).zip(&self.shares).enumerate() {
                 let share = E::from_f64(share);
                 let y = &mut y[i / n_dancers * size..][..size];
-                y.iter_mut().zip(x).for_each(|(y, &x)| *y = *y + share * x);
+                y.iter_mut().zip(x).for_each(|(y, &x)| *y += share * x);
             }
         }))
     }
