@@ -59,9 +59,9 @@ pub enum ConsistencyForm {
     /// x̂0' = x̂0 + γ s √(1−ᾱ_t) ∇/rms(∇), ∇ by x̂0 and its root mean square over the numbers of a group.
     ///
     /// A step of γ s standard deviations of what the noise leaves open, uphill. The length of a score's gradient
-    /// is nothing that its training fixes: a model of 300 steps moved nothing at s = 1 and 300 by the form `Estimate`, so that the
-    /// strength would be another for every model (docs/groups.md). Yang et al., "Guidance with Spherical Gaussian
-    /// Constraint for Conditional Diffusion", ICML 2024, fix the length likewise.
+    /// is nothing that its training fixes: a model of 300 steps moved nothing by the form `Estimate` at s = 300, and
+    /// far at 10,000 (docs/groups.md). Yang et al., "Guidance with Spherical Gaussian Constraint for Conditional
+    /// Diffusion", ICML 2024, fix the length likewise.
     #[default]
     Direction,
     /// ∇ is by x̂0, k_t = 1 − ᾱ_t.

@@ -40,16 +40,17 @@ pub fn tokens_parameters<E: From<OnnxError>>(
         let found = OF_TOKENIZER.iter().find(|(start, _)| parameter.name.starts_with(start));
         found.map_or(ModelFileName::Encoder, |(_, file)| *file)
     };
-    let of = |list: ParameterList, file_of: &(dyn Fn(&Parameter) -> ModelFileName + Sync)| {
-        // Looked up first, since filling cannot fail.
-        for (_, parameter) in list.iter() {
-            values(file_of(parameter), parameter)?;
-        }
-        Ok::<_, OnnxError>(Parameters::from_fn(list, |parameter| {
-            values(file_of(parameter), parameter).expect("looked up before")
-        }))
-    };
-    let tokenizer = of(Tokenizer::new(&card.tokens).1, &file_of)?;
-    let planner = of(Planner::new(&card.planner).1, &|_| ModelFileName::Planner)?;
+    let parameters_of =
+        |list: ParameterList, file_of: &(dyn Fn(&Parameter) -> ModelFileName + Sync)| {
+            // Looked up first, since filling cannot fail.
+            for (_, parameter) in list.iter() {
+                values(file_of(parameter), parameter)?;
+            }
+            Ok::<_, OnnxError>(Parameters::from_fn(list, |parameter| {
+                values(file_of(parameter), parameter).expect("looked up before")
+            }))
+        };
+    let tokenizer = parameters_of(Tokenizer::new(&card.tokens).1, &file_of)?;
+    let planner = parameters_of(Planner::new(&card.planner).1, &|_| ModelFileName::Planner)?;
     Ok((tokenizer, planner))
 }

@@ -209,9 +209,9 @@ mod tests {
             assert_eq!(PlannerConfig::of(Preset::Large, kind, &tokens()), None);
         }
         let base = |kind| PlannerConfig::of(Preset::Base, kind, &tokens()).expect("a preset");
-        let of = |config: PlannerConfig| (config.width, config.layers);
-        assert_eq!(of(base(PlannerKind::Masked)), (384, 6));
-        assert_eq!(of(base(PlannerKind::Autoregressive)), (768, 9));
+        let sizes = |config: PlannerConfig| (config.width, config.layers);
+        assert_eq!(sizes(base(PlannerKind::Masked)), (384, 6));
+        assert_eq!(sizes(base(PlannerKind::Autoregressive)), (768, 9));
     }
 
     #[test]
