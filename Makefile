@@ -160,6 +160,12 @@ bench-inference: build/engine-venv/ready setup ## measure inference beside PyTor
 	build/engine-venv/bin/python benches/inference.py \
 	  --bin $(TARGET)/release/examples/inference-bench $(BENCH_ARGS)
 
+.PHONY: bench-tokens
+bench-tokens: build/engine-venv/ready setup ## measure motion by tokens beside PyTorch [BENCH_ARGS='--presets small']
+	$(CARGO) build --locked --release --no-default-features --example tokens-bench
+	build/engine-venv/bin/python benches/tokens.py \
+	  --bin $(TARGET)/release/examples/tokens-bench $(BENCH_ARGS)
+
 .PHONY: bench-generation
 bench-generation: build/bench-venv/ready setup ## measure generation, whole songs and in bulk [BENCH_ARGS='--model DIR']
 	$(CARGO) build --locked --release --no-default-features --bin motiongen

@@ -46,6 +46,7 @@ mod shell;
 mod status;
 mod store_suite;
 mod support;
+mod token_engines;
 mod tokens;
 mod train;
 mod training;

@@ -14,10 +14,10 @@ use crate::support::{Dir, Output, finish, motiongen, rows};
 use crate::tokens::{make_store, train, train_command};
 
 /// A planner of the tokens of the run `tok`.
-const MASKED: [&str; 1] = ["--tokenizer=tok"];
-const AUTOREGRESSIVE: [&str; 3] = ["--tokenizer=tok", "--planner=autoregressive", "--style"];
+pub const MASKED: [&str; 1] = ["--tokenizer=tok"];
+pub const AUTOREGRESSIVE: [&str; 3] = ["--tokenizer=tok", "--planner=autoregressive", "--style"];
 
-fn store_with_tokenizer(dir: &Dir) -> PathBuf {
+pub fn store_with_tokenizer(dir: &Dir) -> PathBuf {
     let store = make_store(dir);
     // Until it has learned something, a decoder makes the same of all tokens and all noise: nothing.
     let output = train(&store, "tok", &["--steps=60"]);
@@ -25,7 +25,7 @@ fn store_with_tokenizer(dir: &Dir) -> PathBuf {
     store
 }
 
-fn export(store: &Path, run: &str, model: &str) -> Output {
+pub fn export(store: &Path, run: &str, model: &str) -> Output {
     let mut command = motiongen();
     command.arg("export").arg("--store").arg(store);
     command.args(["--run", run, "--model", model, "--quiet"]);
@@ -33,12 +33,12 @@ fn export(store: &Path, run: &str, model: &str) -> Output {
 }
 
 /// A song of 7 s with its beats.
-fn song(dir: &Dir) -> PathBuf {
+pub fn song(dir: &Dir) -> PathBuf {
     dir.write("songs/song.beats.txt", beats(14, 120.0, Some(4)));
     dir.write("songs/song.wav", wav(7.0))
 }
 
-fn generate(store: &Path, model: &str, audio: &Path, into: &Path, more: &[&str]) -> Output {
+pub fn generate(store: &Path, model: &str, audio: &Path, into: &Path, more: &[&str]) -> Output {
     let mut command = motiongen();
     command.arg("generate").arg("--model").arg(store.join("models").join(model));
     command.arg("--audio").arg(audio).arg("--output").arg(into);
@@ -78,7 +78,8 @@ fn planners_of_both_kinds_are_trained_exported_and_danced_in_files() {
         let output = export(&store, run, run);
         assert_eq!(output.code, 0, "{output:?}");
         let checks: Vec<OnnxCheckRow> = rows(&store);
-        for name in ["tokens", "signal", "forward", "planner"] {
+        let of_steps = if run == "next" { &["planner_step"][..] } else { &[] };
+        for name in [&["tokens", "signal", "forward", "planner"], of_steps].concat() {
             let found = checks.iter().filter(|row| row.model == run && row.check == name);
             let found: Vec<_> = found.collect();
             assert_eq!(found.len(), 3, "{name}");

@@ -283,8 +283,15 @@ proptest! {
             check(&[x()], &none(), |g, x| g.apply(Reduce::sum(over), &[&x[0]]));
             check(&[x()], &none(), |g, x| g.apply(Reduce::mean(over), &[&x[0]]));
         }
-        check(&[input(&[batch, frames, 2 * channels], 2)], &none(), |g, x| g.rotary(&x[0], channels));
-        check(&[input(&[batch, frames, 4 * channels], 2)], &none(), |g, x| g.rotary(&x[0], channels));
+        check(&[input(&[batch, frames, 2 * channels], 2)], &none(), |g, x| g.rotary(&x[0], channels, None));
+        check(&[input(&[batch, frames, 4 * channels], 2)], &none(), |g, x| g.rotary(&x[0], channels, None));
+        let past = || fixed(&[batch, 3, 1], vec![0.0; 3 * batch]);
+        check(&[input(&[batch, frames, 4 * channels], 2), past()], &none(), |g, x| {
+            g.rotary(&x[0], channels, Some(&x[1]))
+        });
+        check(&[input(&[batch, frames + 3, channels], 3), past()], &none(), |g, x| {
+            g.frames_behind(&x[0], &x[1])
+        });
     }
 
     #[test]

@@ -174,8 +174,13 @@ impl<I: Interpreter> Graph for I {
         self.apply(Normalize::new(epsilon), &[x])
     }
 
-    fn rotary(&mut self, x: &Self::Tensor, heads: usize) -> Result<Self::Tensor> {
-        self.apply(Rotary { heads }, &[x])
+    fn rotary(
+        &mut self,
+        x: &Self::Tensor,
+        heads: usize,
+        past: Option<&Self::Tensor>,
+    ) -> Result<Self::Tensor> {
+        self.apply(Rotary::new(heads), &with(&[x], past))
     }
 
     fn hold_frames(&mut self, x: &Self::Tensor, multiple: usize) -> Result<Self::Tensor> {
@@ -187,6 +192,10 @@ impl<I: Interpreter> Graph for I {
     fn crop_frames(&mut self, x: &Self::Tensor, like: &Self::Tensor) -> Result<Self::Tensor> {
         let alike = x.shape().len() == 3 && x.shape().get(1) == like.shape().get(1);
         if alike { Ok(x.clone()) } else { self.apply(TakeFrames::crop(), &[x, like]) }
+    }
+
+    fn frames_behind(&mut self, x: &Self::Tensor, past: &Self::Tensor) -> Result<Self::Tensor> {
+        self.apply(TakeFrames::behind(), &[x, past])
     }
 
     fn shift_frames(

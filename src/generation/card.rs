@@ -34,6 +34,9 @@ pub mod file_names {
     pub const ENCODER: &str = "encoder.onnx";
     pub const SIGNAL: &str = "signal.onnx";
     pub const PLANNER: &str = "planner.onnx";
+    /// Of a planner that plans token by token: what it hears, and a step of it.
+    pub const PLANNER_MUSIC: &str = "planner_music.onnx";
+    pub const PLANNER_STEP: &str = "planner_step.onnx";
 }
 
 /// The files that a model can have beside its card; a card can name no other.
@@ -48,11 +51,13 @@ pub enum ModelFileName {
     Encoder,
     Signal,
     Planner,
+    PlannerMusic,
+    PlannerStep,
 }
 
 impl ModelFileName {
     /// Every name, in the order in which cards list them.
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 11] = [
         Self::Unet,
         Self::UnetWeights,
         Self::Decoder,
@@ -62,6 +67,8 @@ impl ModelFileName {
         Self::Encoder,
         Self::Signal,
         Self::Planner,
+        Self::PlannerMusic,
+        Self::PlannerStep,
     ];
 
     /// Returns the name of the file.
@@ -76,6 +83,8 @@ impl ModelFileName {
             Self::Encoder => file_names::ENCODER,
             Self::Signal => file_names::SIGNAL,
             Self::Planner => file_names::PLANNER,
+            Self::PlannerMusic => file_names::PLANNER_MUSIC,
+            Self::PlannerStep => file_names::PLANNER_STEP,
         }
     }
 
@@ -230,7 +239,9 @@ impl FamilyCard for ModelCard {
             | ModelFileName::Score
             | ModelFileName::Encoder
             | ModelFileName::Signal
-            | ModelFileName::Planner => None,
+            | ModelFileName::Planner
+            | ModelFileName::PlannerMusic
+            | ModelFileName::PlannerStep => None,
         }
     }
 }

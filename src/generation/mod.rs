@@ -38,8 +38,9 @@ pub use retrieval::Retrieval;
 pub use runtime::{OnnxEngine, SessionPlan};
 pub use sampling::{Sampling, sample};
 pub use tokens::{
-    PlanRequest, PlannerEngine, TokenEngine, TokenGenerator, TokenTrack, TokensCard,
-    TokensNetworks, TokensProvenance, tokens_parameters,
+    OnnxPlanner, OnnxTokenizer, PlanRequest, PlanWindow, PlannerEngine, PlannerNetworks,
+    TokenEngine, TokenGenerator, TokenTrack, TokenizerNetworks, TokensCard, TokensNetworks,
+    TokensProvenance, WindowPlan, tokens_parameters,
 };
 pub use track::{
     Generator, OVERLAP_FRAMES, PrimingMotion, RUN_WINDOWS, Track, WeightedConstraints,

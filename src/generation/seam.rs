@@ -61,40 +61,32 @@ pub fn cross_fade(layout: Layout, a: ArrayView2<f32>, b: ArrayView2<f32>) -> Arr
 #[derive(Debug)]
 pub struct Joiner {
     layout: Layout,
-    /// The frames of the latest window where it lies in the world; those before are given out.
-    latest: Option<Array2<f32>>,
+    /// The frames of the latest window that the next one has too, where they lie in the world.
+    shared: Option<Array2<f32>>,
 }
 
 impl Joiner {
     /// Begins with a track that stands at the origin and faces +Z.
     pub fn new(layout: Layout) -> Self {
-        Self { layout, latest: None }
+        Self { layout, shared: None }
     }
 
-    /// Takes the next window, `shift` frames behind the one before; returns the frames that no later window
-    /// changes, in the world.
-    pub fn push(&mut self, mut window: Array2<f32>, shift: usize) -> Array2<f32> {
-        let Some(before) = self.latest.take() else {
-            self.latest = Some(window);
-            return Array2::zeros((0, self.layout.width()));
-        };
-        let layout = self.layout;
-        let shared = before.slice(s![shift.., ..]);
-        let own = Placement::of_first_in(layout, window.view()).unwrap_or_default();
-        own.remove_in(layout, &mut window);
-        let place = Placement::of_first_in(layout, shared).unwrap_or_default();
-        place.restore_in(layout, &mut window);
-        align_signs(layout, shared, &mut window.view_mut());
-        let n = shared.nrows().min(window.nrows());
-        let blend = cross_fade(layout, shared.slice(s![..n, ..]), window.slice(s![..n, ..]));
-        window.slice_mut(s![..n, ..]).assign(&blend);
-        self.latest = Some(window);
-        before.slice(s![..shift, ..]).to_owned()
-    }
-
-    /// Returns the frames of the last window.
-    pub fn finish(self) -> Array2<f32> {
-        self.latest.unwrap_or_else(|| Array2::zeros((0, self.layout.width())))
+    /// Takes the next window; returns its first `n_final` frames, which no later window changes, in the world: those
+    /// before the first of the window behind it, or all of the last window.
+    pub fn push(&mut self, mut window: Array2<f32>, n_final: usize) -> Array2<f32> {
+        if let Some(shared) = self.shared.take() {
+            let layout = self.layout;
+            let own = Placement::of_first_in(layout, window.view()).unwrap_or_default();
+            own.remove_in(layout, &mut window);
+            let place = Placement::of_first_in(layout, shared.view()).unwrap_or_default();
+            place.restore_in(layout, &mut window);
+            align_signs(layout, shared.view(), &mut window.view_mut());
+            let n = shared.nrows().min(window.nrows());
+            let blend = cross_fade(layout, shared.slice(s![..n, ..]), window.slice(s![..n, ..]));
+            window.slice_mut(s![..n, ..]).assign(&blend);
+        }
+        self.shared = Some(window.slice(s![n_final.., ..]).to_owned());
+        window.slice(s![..n_final, ..]).to_owned()
     }
 }
 
@@ -135,9 +127,10 @@ mod tests {
             let mut joiner = Joiner::new(BODY);
             let mut parts: Vec<Array2<f32>> = Vec::new();
             for (i, window) in windows_of(&track, &windows).into_iter().enumerate() {
-                parts.push(joiner.push(window, windows.shift(i)));
+                let part = joiner.push(window, windows.n_final(i));
+                assert_eq!(part.nrows(), windows.n_final(i));
+                parts.push(part);
             }
-            parts.push(joiner.finish());
             let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
             let joined = concatenate(Axis(0), &views).expect("of 25 channels");
             // Placements are found anew at every seam, each off by the rounding of 10 m; accelerations
@@ -205,11 +198,9 @@ mod tests {
         let windows = Windows::new(300, 120, 30);
         let mut both = [Joiner::new(BODY), Joiner::new(ROOT)];
         for (i, window) in windows_of(&track, &windows).into_iter().enumerate() {
-            let root = both[1].push(root_of(&window), windows.shift(i));
-            assert_eq!(root, root_of(&both[0].push(window, windows.shift(i))));
+            let root = both[1].push(root_of(&window), windows.n_final(i));
+            assert_eq!(root, root_of(&both[0].push(window, windows.n_final(i))));
         }
-        let [body, root] = both.map(Joiner::finish);
-        assert_eq!(root, root_of(&body));
         let cut = windows_of(&track, &windows);
         let (mut a, mut b) = (root_of(&cut[0]), root_of(&cut[1]));
         agree(ROOT, &mut a, &mut b, windows.shift(1));

@@ -121,14 +121,13 @@ impl Generator<'_> {
             let latent = self.sample_run(track, &job)?;
             let decoded = self.engine.decode(latent.view())?;
             for (i, window) in run.clone().zip(decoded.outer_iter()) {
-                let shift = windows.shift(i);
-                give(joiner.push(window.to_owned(), shift), &mut emit)?;
+                give(joiner.push(window.to_owned(), windows.n_final(i)), &mut emit)?;
             }
             let motions = self.motions(&latent);
             let place = job.places(&motions).pop().unwrap_or(first);
             before = motions.into_iter().last().map(|motion| Window { motion, place });
         }
-        give(joiner.finish(), &mut emit)
+        Ok(())
     }
 
     /// Samples the windows of a run together. → \[windows, frames, 25\], normalised

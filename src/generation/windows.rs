@@ -57,6 +57,11 @@ impl Windows {
         i.checked_sub(1).map_or(0, |before| self.starts[i] - self.starts[before])
     }
 
+    /// Returns how many of the first frames of window i no later window has.
+    pub fn n_final(&self, i: usize) -> usize {
+        if i + 1 < self.len() { self.shift(i + 1) } else { self.length }
+    }
+
     /// Returns the windows in runs of at most `n`, the last of which may be shorter.
     pub fn runs(&self, n: usize) -> impl Iterator<Item = Range<usize>> {
         let (n, len) = (n.max(1), self.len());
@@ -83,6 +88,7 @@ mod tests {
         let frames: Vec<_> = (0..windows.len()).map(|i| windows.frames(i)).collect();
         assert_eq!(frames, [0..120, 60..180, 120..240, 181..301]);
         assert_eq!((windows.shift(0), windows.shift(1), windows.shift(3)), (0, 60, 61));
+        assert_eq!((0..4).map(|i| windows.n_final(i)).collect::<Vec<_>>(), [60, 60, 61, 120]);
         let runs: Vec<_> = windows.runs(3).collect();
         assert_eq!(runs, [0..3, 3..4]);
     }

@@ -102,7 +102,7 @@ pub struct Attention<'a, T> {
     pub width: usize,
     pub heads: usize,
     pub key_mask: Option<&'a T>,
-    /// Whether a query sees only keys up to its own place.
+    /// Whether a query sees only keys up to its own place; queries stand at the places of the last keys.
     pub causal: bool,
 }
 
@@ -248,14 +248,22 @@ pub trait Graph: Sized {
     /// Turns pairs of channels by angles that grow with the frame: rotary position embedding.
     ///
     /// Su et al., "RoFormer", arXiv 2104.09864, 2021, eq. 34; channels 2i and 2i + 1 of each head are
-    /// a pair, turned by frame · 10000^(−2i / d).
-    fn rotary(&mut self, x: &Self::Tensor, heads: usize) -> Result<Self::Tensor>;
+    /// a pair, turned by frame · 10000^(−2i / d). Frames are counted from those of `past` on, where there are any.
+    fn rotary(
+        &mut self,
+        x: &Self::Tensor,
+        heads: usize,
+        past: Option<&Self::Tensor>,
+    ) -> Result<Self::Tensor>;
 
     /// Repeats the last frame until their number is a multiple.
     fn hold_frames(&mut self, x: &Self::Tensor, multiple: usize) -> Result<Self::Tensor>;
 
     /// Drops frames beyond those that `like` has.
     fn crop_frames(&mut self, x: &Self::Tensor, like: &Self::Tensor) -> Result<Self::Tensor>;
+
+    /// Drops as many of the first frames as `past` has.
+    fn frames_behind(&mut self, x: &Self::Tensor, past: &Self::Tensor) -> Result<Self::Tensor>;
 
     /// y\[t\] = x\[clamp(t + shift, 0, frames − 1 − spare)\]: frames that come later, or earlier; the first, and the
     /// last of those that are not spared, are held.

@@ -291,7 +291,12 @@ impl Graph for Outline<'_> {
         Ok(self.result(x.clone()))
     }
 
-    fn rotary(&mut self, x: &Vec<usize>, _heads: usize) -> Result<Vec<usize>> {
+    fn rotary(
+        &mut self,
+        x: &Vec<usize>,
+        _heads: usize,
+        _past: Option<&Vec<usize>>,
+    ) -> Result<Vec<usize>> {
         Ok(self.result(x.clone()))
     }
 
@@ -304,6 +309,12 @@ impl Graph for Outline<'_> {
         let [batch, _, channels] = three("crop_frames", x)?;
         let [_, frames, _] = three("crop_frames", like)?;
         Ok(vec![batch, frames, channels])
+    }
+
+    fn frames_behind(&mut self, x: &Vec<usize>, past: &Vec<usize>) -> Result<Vec<usize>> {
+        let [batch, frames, channels] = three("frames_behind", x)?;
+        let [_, n_past, _] = three("frames_behind", past)?;
+        Ok(self.result(vec![batch, frames.saturating_sub(n_past), channels]))
     }
 
     fn shift_frames(&mut self, x: &Vec<usize>, _shift: isize, _spare: usize) -> Result<Vec<usize>> {

@@ -23,6 +23,60 @@ pub(super) fn hold(g: &mut Builder<'_>, x: Value, multiple: usize) -> Result<Val
     Ok(g.new_last(Axes::Frames, x.channels, y))
 }
 
+/// Drops as many of the first frames as another value has.
+pub(super) fn behind(g: &mut Builder<'_>, x: Value, past: Value) -> Result<Value> {
+    g.begin("frames_behind", None);
+    expect("frames_behind", x, Axes::Frames)?;
+    let starts = g.n_frames(past)?;
+    let axis = if g.has_last(x) { 1 } else { g.frames_axis() };
+    let [ends, axes] = [i64::MAX, axis].map(|n| g.integers(&[n]));
+    g.map(x, x.channels, |g, x| g.node("Slice", &[x, &starts, &ends, &axes], vec![]))
+}
+
+/// Turns pairs of channels of each head by the number of their frame, counted from those of `past` on.
+pub(super) fn rotary(
+    g: &mut Builder<'_>,
+    x: Value,
+    heads: usize,
+    past: Option<Value>,
+) -> Result<Value> {
+    g.begin("rotary", None);
+    let name = g.last(x)?;
+    let dim = x.channels / heads;
+    let rates: Vec<f32> =
+        (0..dim / 2).map(|i| 10_000_f64.powf(-2.0 * i as f64 / dim as f64) as f32).collect();
+    let rates = g.numbers(&format!("constant/rates_{dim}"), &[rates.len()], &rates);
+    let frames = g.n_frames(x)?;
+    let mut places = g.places(&frames);
+    if let Some(past) = past {
+        let first = g.n_frames(past)?;
+        places = g.node("Add", &[&places, &first], vec![]);
+    }
+    let places = g.cast(&places, DataType::Float);
+    let axes = g.integers(&[1]);
+    let places = g.node("Unsqueeze", &[&places, &axes], vec![]);
+    // [frames, d / 2] → [frames, 1, d / 2], beside the heads.
+    let angles = g.node("Mul", &[&places, &rates], vec![]);
+    let angles = g.node("Unsqueeze", &[&angles, &axes], vec![]);
+    let (cos, sin) = (g.node("Cos", &[&angles], vec![]), g.node("Sin", &[&angles], vec![]));
+    let shape = g.integers(&[0, 0, heads as i64, (dim / 2) as i64, 2]);
+    let pairs = g.node("Reshape", &[&name, &shape], vec![]);
+    let halves = vec![integer("axis", -1), integer("num_outputs", 2)];
+    let halves = g.nodes_of("Split", &[&pairs], halves, 2);
+    let last = g.integers(&[4]);
+    let [a, b] = [0, 1].map(|i| g.node("Squeeze", &[&halves[i], &last], vec![]));
+    let times = |g: &mut Builder<'_>, x: &str, y: &str| g.node("Mul", &[x, y], vec![]);
+    let (a_cos, b_sin) = (times(g, &a, &cos), times(g, &b, &sin));
+    let (a_sin, b_cos) = (times(g, &a, &sin), times(g, &b, &cos));
+    let turned =
+        [g.node("Sub", &[&a_cos, &b_sin], vec![]), g.node("Add", &[&a_sin, &b_cos], vec![])]
+            .map(|x| g.node("Unsqueeze", &[&x, &last], vec![]));
+    let pairs = g.node("Concat", &[&turned[0], &turned[1]], vec![integer("axis", -1)]);
+    let shape = g.integers(&[0, 0, x.channels as i64]);
+    let y = g.node("Reshape", &[&pairs, &shape], vec![]);
+    Ok(g.new_last(Axes::Frames, x.channels, y))
+}
+
 /// Takes frame t + `shift` as frame t, held within what is there, `spare` frames from the end.
 pub(super) fn shift(g: &mut Builder<'_>, x: Value, shift: isize, spare: usize) -> Result<Value> {
     g.begin("shift_frames", None);

@@ -10,9 +10,11 @@ mod error;
 mod file;
 mod frames;
 mod literals;
+mod music;
 mod networks;
 mod operations;
 mod parts;
+mod planner;
 mod proto;
 mod runtime;
 mod session;
@@ -28,12 +30,15 @@ pub use networks::{
     DecoderNames, GroupNames, GroupScoreNames, UNetNames, decoder, group_denoiser, group_score,
     unet,
 };
+pub use planner::{
+    PlannerMusicNames, PlannerNames, PlannerStepNames, planner, planner_music, planner_step,
+};
 pub use proto::{Graph, Model};
 pub use runtime::{Device, PINNED_VERSION, Runtime};
 pub use session::{NamedTensor, Numbers, Session, SessionOptions};
 pub use storage::Storage;
 pub use tokens::{
-    PlannerNames, SignalDenoiserNames, SignalNames, TokenEncoderNames, planner, token_denoiser,
-    token_encoder, token_signal,
+    SignalDenoiserNames, SignalNames, TokenEncoderNames, token_denoiser, token_encoder,
+    token_signal,
 };
 pub use weights::values_of;

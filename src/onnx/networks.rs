@@ -3,12 +3,13 @@
 
 use crate::audio::FeatureScale;
 use crate::model::{
-    DecoderConfig, Graph as _, GroupConfig, GroupDenoiser, GroupInputs, GroupScore,
-    GroupScoreInputs, MotionDecoder, ParameterId, Result, UNet1D, UNetConfig, UNetInputs,
+    DecoderConfig, GroupConfig, GroupDenoiser, GroupInputs, GroupScore, GroupScoreInputs,
+    MotionDecoder, ParameterId, Result, UNet1D, UNetConfig, UNetInputs,
 };
-use crate::motion::{CLOCK_DIM, MOTION_DIM};
+use crate::motion::MOTION_DIM;
 
 use super::builder::{Axes, Builder, Form};
+use super::music::{Music, MusicNames};
 use super::proto::Graph;
 use super::storage::Storage;
 
@@ -19,13 +20,10 @@ pub struct UNetNames;
 impl UNetNames {
     pub const X: &'static str = "x_t";
     pub const T: &'static str = "t";
-    pub const AUDIO: &'static str = "audio";
-    /// Only in networks that hear the clock.
-    pub const CLOCK: &'static str = "clock";
-    /// May be left out.
-    pub const DROP_AUDIO: &'static str = "drop_audio";
-    /// May be left out; only in networks that take a style.
-    pub const STYLE: &'static str = "style";
+    pub const AUDIO: &'static str = MusicNames::AUDIO;
+    pub const CLOCK: &'static str = MusicNames::CLOCK;
+    pub const DROP_AUDIO: &'static str = MusicNames::DROP_AUDIO;
+    pub const STYLE: &'static str = MusicNames::STYLE;
     pub const PREDICTION: &'static str = "prediction";
 }
 
@@ -61,40 +59,8 @@ pub fn unet(
         "noisy motion, normalised, 30 frames a second",
     );
     let t = g.integer_input(UNetNames::T, Axes::Batch, "step of the diffusion, 0 the least noisy");
-    let audio = g.input(
-        UNetNames::AUDIO,
-        Axes::Frames,
-        c.audio_cond_dim,
-        "features of the music as motiongen extract writes them",
-    );
-    let clock = c.clock.then(|| {
-        g.input(
-            UNetNames::CLOCK,
-            Axes::Frames,
-            CLOCK_DIM,
-            "cos and sin of 2 pi n bars for n = 1, 2, 3 and the beats of a bar, ln(tempo / 120), 1 where known; \
-             zeros where unknown",
-        )
-    });
-    let drop_audio = g.optional_input(
-        UNetNames::DROP_AUDIO,
-        Axes::Batch,
-        0,
-        "1 for samples that go without music, 0 where left out",
-    );
-    let style = (c.style_dim > 0).then(|| {
-        g.optional_input(
-            UNetNames::STYLE,
-            Axes::Samples,
-            c.style_dim,
-            "style, normalised, 0 for none",
-        )
-    });
-    let features = g.standardized(audio, &scale.centre, &scale.scale)?;
-    let audio = match &clock {
-        Some(clock) => g.concat(&[&features, clock])?,
-        None => features,
-    };
+    let Music { audio, drop_audio, style } =
+        Music::inputs(&mut g, c.into(), c.style_dim, "samples", scale)?;
     let inputs = UNetInputs {
         x: &x,
         t: &t,
@@ -138,11 +104,9 @@ pub struct GroupNames;
 impl GroupNames {
     pub const X: &'static str = "x_t";
     pub const T: &'static str = "t";
-    pub const AUDIO: &'static str = "audio";
-    /// Only in networks that hear the clock.
-    pub const CLOCK: &'static str = "clock";
-    /// May be left out.
-    pub const DROP_AUDIO: &'static str = "drop_audio";
+    pub const AUDIO: &'static str = MusicNames::AUDIO;
+    pub const CLOCK: &'static str = MusicNames::CLOCK;
+    pub const DROP_AUDIO: &'static str = MusicNames::DROP_AUDIO;
     pub const NUMBER: &'static str = "number";
     pub const Z: &'static str = "z";
     pub const X0: &'static str = "x0";
@@ -189,27 +153,8 @@ pub fn group_denoiser(
         "noisy motion, normalised, group by group and dancer by dancer, 30 frames a second",
     );
     let t = g.integer_input(GroupNames::T, Axes::Batch, "step of the diffusion, 0 the least noisy");
-    let audio = g.input(
-        GroupNames::AUDIO,
-        Axes::Frames,
-        config.audio_cond_dim,
-        "features of the music as motiongen extract writes them",
-    );
-    let clock = config.clock.then(|| {
-        g.input(
-            GroupNames::CLOCK,
-            Axes::Frames,
-            CLOCK_DIM,
-            "cos and sin of 2 pi n bars for n = 1, 2, 3 and the beats of a bar, ln(tempo / 120), 1 where known; \
-             zeros where unknown",
-        )
-    });
-    let drop_audio = g.optional_input(
-        GroupNames::DROP_AUDIO,
-        Axes::Batch,
-        0,
-        "1 for groups that go without music, 0 where left out",
-    );
+    let Music { audio, drop_audio, .. } =
+        Music::inputs(&mut g, config.condition(), 0, "groups", scale)?;
     let number = g.integer_input(GroupNames::NUMBER, Axes::Batch, NUMBER);
     let z = g.input(
         GroupNames::Z,
@@ -217,11 +162,6 @@ pub fn group_denoiser(
         config.width,
         "noise of the group embedding, standard normal; the same for all windows of a track",
     );
-    let features = g.standardized(audio, &scale.centre, &scale.scale)?;
-    let audio = match &clock {
-        Some(clock) => g.concat(&[&features, clock])?,
-        None => features,
-    };
     let inputs = GroupInputs {
         x: &x,
         t: &t,

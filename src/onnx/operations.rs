@@ -17,7 +17,6 @@ use crate::model::{
 use super::builder::{Axes, Builder, Form, Use, Value, expect};
 use super::frames;
 use super::literals::{float, integer, integers, word};
-use super::proto::DataType;
 
 impl Graph for Builder<'_> {
     type Tensor = Value;
@@ -309,41 +308,8 @@ impl Graph for Builder<'_> {
         })
     }
 
-    fn rotary(&mut self, x: &Value, heads: usize) -> Result<Value> {
-        self.begin("rotary", None);
-        let name = self.last(*x)?;
-        let dim = x.channels / heads;
-        let rates: Vec<f32> =
-            (0..dim / 2).map(|i| 10_000_f64.powf(-2.0 * i as f64 / dim as f64) as f32).collect();
-        let rates = self.numbers(&format!("constant/rates_{dim}"), &[rates.len()], &rates);
-        let frames = self.n_frames(*x)?;
-        let places = self.places(&frames);
-        let places = self.cast(&places, DataType::Float);
-        let axes = self.integers(&[1]);
-        let places = self.node("Unsqueeze", &[&places, &axes], vec![]);
-        // [frames, d / 2] → [frames, 1, d / 2], beside the heads.
-        let angles = self.node("Mul", &[&places, &rates], vec![]);
-        let angles = self.node("Unsqueeze", &[&angles, &axes], vec![]);
-        let (cos, sin) =
-            (self.node("Cos", &[&angles], vec![]), self.node("Sin", &[&angles], vec![]));
-        let shape = self.integers(&[0, 0, heads as i64, (dim / 2) as i64, 2]);
-        let pairs = self.node("Reshape", &[&name, &shape], vec![]);
-        let halves = vec![integer("axis", -1), integer("num_outputs", 2)];
-        let halves = self.nodes_of("Split", &[&pairs], halves, 2);
-        let last = self.integers(&[4]);
-        let [a, b] = [0, 1].map(|i| self.node("Squeeze", &[&halves[i], &last], vec![]));
-        let times = |g: &mut Self, x: &str, y: &str| g.node("Mul", &[x, y], vec![]);
-        let (a_cos, b_sin) = (times(self, &a, &cos), times(self, &b, &sin));
-        let (a_sin, b_cos) = (times(self, &a, &sin), times(self, &b, &cos));
-        let turned = [
-            self.node("Sub", &[&a_cos, &b_sin], vec![]),
-            self.node("Add", &[&a_sin, &b_cos], vec![]),
-        ]
-        .map(|x| self.node("Unsqueeze", &[&x, &last], vec![]));
-        let pairs = self.node("Concat", &[&turned[0], &turned[1]], vec![integer("axis", -1)]);
-        let shape = self.integers(&[0, 0, x.channels as i64]);
-        let y = self.node("Reshape", &[&pairs, &shape], vec![]);
-        Ok(self.new_last(Axes::Frames, x.channels, y))
+    fn rotary(&mut self, x: &Value, heads: usize, past: Option<&Value>) -> Result<Value> {
+        frames::rotary(self, *x, heads, past.copied())
     }
 
     fn hold_frames(&mut self, x: &Value, multiple: usize) -> Result<Value> {
@@ -357,6 +323,10 @@ impl Graph for Builder<'_> {
         let axis = if self.has_last(*x) { 1 } else { self.frames_axis() };
         let axes = self.integers(&[axis]);
         self.map(*x, x.channels, |g, x| g.node("Slice", &[x, &starts, &ends, &axes], vec![]))
+    }
+
+    fn frames_behind(&mut self, x: &Value, past: &Value) -> Result<Value> {
+        frames::behind(self, *x, *past)
     }
 
     fn shift_frames(&mut self, x: &Value, shift: isize, spare: usize) -> Result<Value> {

@@ -289,10 +289,13 @@ impl Builder<'_> {
         }
     }
 
-    /// \[queries, keys\], 1 where the key comes after the query and 0 elsewhere.
+    /// \[queries, keys\], 1 where the key comes after the query and 0 elsewhere; the last query stands at the place of
+    /// the last key.
     pub(super) fn later(&mut self, query: Value, key: Value) -> Result<String> {
         let (n_queries, n_keys) = (self.n_frames(query)?, self.n_frames(key)?);
         let (queries, keys) = (self.places(&n_queries), self.places(&n_keys));
+        let first = self.node("Sub", &[&n_keys, &n_queries], vec![]);
+        let queries = self.node("Add", &[&queries, &first], vec![]);
         let axes = self.integers(&[1]);
         let queries = self.node("Unsqueeze", &[&queries, &axes], vec![]);
         let later = self.node("Less", &[&queries, &keys], vec![]);

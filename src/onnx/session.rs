@@ -109,20 +109,36 @@ impl Session {
     /// # Errors
     /// [`OnnxError::Inputs`].
     pub fn expect(&self, inputs: &[&str], output: &str) -> Result<(), OnnxError> {
+        self.expect_of(inputs, &[output], 3)
+    }
+
+    /// Refuses a model that does not have these inputs and these outputs, of so many axes.
+    ///
+    /// # Errors
+    /// [`OnnxError::Inputs`].
+    pub fn expect_of(
+        &self,
+        inputs: &[&str],
+        outputs: &[&str],
+        n_axes: usize,
+    ) -> Result<(), OnnxError> {
         let mut found: Vec<&str> = self.session.inputs().iter().map(|input| input.name()).collect();
-        let outputs = self.session.outputs();
-        let is_output = |value: &Outlet| {
-            let axes = value.dtype().tensor_shape().map(|shape| shape.len());
-            value.name() == output && axes == Some(3)
+        let made = self.session.outputs();
+        let is_there = |name: &&str| {
+            let is_output = |value: &Outlet| {
+                let axes = value.dtype().tensor_shape().map(|shape| shape.len());
+                value.name() == *name && axes == Some(n_axes)
+            };
+            made.iter().any(is_output)
         };
-        if inputs.iter().all(|name| found.contains(name)) && outputs.iter().any(is_output) {
+        if inputs.iter().all(|name| found.contains(name)) && outputs.iter().all(is_there) {
             return Ok(());
         }
-        found.extend(outputs.iter().map(|value| value.name()));
+        found.extend(made.iter().map(|value| value.name()));
         Err(OnnxError::Inputs {
             place: self.place.clone(),
             found: found.join(", "),
-            expected: [inputs, &[output]].concat().join(", "),
+            expected: [inputs, outputs].concat().join(", "),
         })
     }
 
@@ -135,8 +151,21 @@ impl Session {
         inputs: &[NamedTensor],
         output: &str,
     ) -> Result<(Vec<usize>, Vec<f32>), OnnxError> {
+        let [found] = self.run_for(inputs, [output])?;
+        Ok(found)
+    }
+
+    /// Runs the model: returns the sizes and the numbers of several outputs.
+    ///
+    /// # Errors
+    /// [`OnnxError::Run`] with what onnxruntime says.
+    pub fn run_for<const N: usize>(
+        &mut self,
+        inputs: &[NamedTensor],
+        outputs: [&str; N],
+    ) -> Result<[(Vec<usize>, Vec<f32>); N], OnnxError> {
         let Self { session, place } = self;
-        let mut run = || -> ort::Result<(Vec<usize>, Vec<f32>)> {
+        let mut run = || -> ort::Result<[(Vec<usize>, Vec<f32>); N]> {
             let mut values: Vec<(&str, ort::session::SessionInputValue)> = Vec::new();
             for input in inputs {
                 let shape = input.shape.clone();
@@ -148,20 +177,28 @@ impl Session {
                     },
                 ));
             }
-            let outputs = session.run(values)?;
-            let value: &DynValue = outputs
-                .get(output)
-                .ok_or_else(|| ort::Error::new(format!("there is no output {output}")))?;
-            let sizes = |shape: &[i64]| shape.iter().map(|&n| n.max(0) as usize).collect();
-            // Whole numbers that networks return are indices, which f32 holds.
-            if let Ok((shape, numbers)) = value.try_extract_tensor::<i64>() {
-                return Ok((sizes(shape), numbers.iter().map(|&x| x as f32).collect()));
+            let made = session.run(values)?;
+            let mut found = std::array::from_fn(|_| (Vec::new(), Vec::new()));
+            for (found, output) in found.iter_mut().zip(outputs) {
+                let value: &DynValue = made
+                    .get(output)
+                    .ok_or_else(|| ort::Error::new(format!("there is no output {output}")))?;
+                *found = numbers_of(value)?;
             }
-            let (shape, numbers) = value.try_extract_tensor::<f32>()?;
-            Ok((sizes(shape), numbers.to_vec()))
+            Ok(found)
         };
         run().map_err(|e| OnnxError::Run { place: place.clone(), reason: one_line(e.message()) })
     }
+}
+
+/// Returns the sizes and the numbers of a value; whole numbers that networks return are indices, which f32 holds.
+fn numbers_of(value: &DynValue) -> ort::Result<(Vec<usize>, Vec<f32>)> {
+    let sizes = |shape: &[i64]| shape.iter().map(|&n| n.max(0) as usize).collect();
+    if let Ok((shape, numbers)) = value.try_extract_tensor::<i64>() {
+        return Ok((sizes(shape), numbers.iter().map(|&x| x as f32).collect()));
+    }
+    let (shape, numbers) = value.try_extract_tensor::<f32>()?;
+    Ok((sizes(shape), numbers.to_vec()))
 }
 
 fn builder(runtime: &Runtime, options: SessionOptions) -> ort::Result<SessionBuilder> {

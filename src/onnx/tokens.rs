@@ -1,10 +1,6 @@
-//! The files of a model of tokens: the encoder with its codebook, the decoder of signals, the denoiser and the planner.
+//! The files of a tokenizer: the encoder with its codebook, the decoder of signals, and the denoiser.
 
-use crate::audio::FeatureScale;
-use crate::model::{
-    Graph as _, ParameterId, Planner, PlannerConfig, PlannerInputs, Result, Tokenizer, TokensConfig,
-};
-use crate::motion::CLOCK_DIM;
+use crate::model::{Graph as _, ParameterId, Result, Tokenizer, TokensConfig};
 
 use super::builder::{Axes, Builder, Form};
 use super::proto::Graph;
@@ -39,24 +35,8 @@ impl SignalDenoiserNames {
     pub const X0: &'static str = "x0";
 }
 
-/// The inputs and the output of `planner.onnx`.
-#[derive(Clone, Copy, Debug)]
-pub struct PlannerNames;
-
-impl PlannerNames {
-    pub const TOKENS: &'static str = "tokens";
-    pub const AUDIO: &'static str = "audio";
-    /// Only in networks that hear the clock.
-    pub const CLOCK: &'static str = "clock";
-    /// May be left out.
-    pub const DROP_AUDIO: &'static str = "drop_audio";
-    /// May be left out; only in networks that take a style.
-    pub const STYLE: &'static str = "style";
-    pub const LOGITS: &'static str = "logits";
-}
-
 /// The axis of tokens, and that of the frames of a signal.
-const TOKENS_AXIS: &str = "tokens";
+pub(super) const TOKENS_AXIS: &str = "tokens";
 const SIGNAL_AXIS: &str = "signal frames";
 
 /// Writes the encoder and the nearest row of the codebook: motion → tokens.
@@ -134,68 +114,4 @@ pub fn token_denoiser(
     let x0 = tokenizer.denoise(&mut g, &x, &t, &signal)?;
     g.output(SignalDenoiserNames::X0, x0, "clean motion, normalised")?;
     Ok(g.finish("denoiser"))
-}
-
-/// Writes a planner: tokens and the music → what is said of each token.
-///
-/// Features come as the `features` table has them and are scaled within.
-///
-/// # Errors
-/// A configuration of which no network can be made.
-pub fn planner(
-    config: &PlannerConfig,
-    weights: &dyn Fn(ParameterId) -> Vec<f32>,
-    scale: &FeatureScale,
-    storage: Storage,
-) -> Result<Graph> {
-    let (planner, list) = Planner::new(config);
-    let mut g = Builder::new(&list, weights, Form::default(), storage);
-    let tokens = g.integer_input(
-        PlannerNames::TOKENS,
-        Axes::Mask,
-        "tokens of a window, as many as encoder.onnx makes of its frames; of the masked kind the number of codes stands \
-         for a token that is not known, of the autoregressive kind a position sees none from its own on",
-    );
-    g.name_axis(1, TOKENS_AXIS);
-    let audio = g.input(
-        PlannerNames::AUDIO,
-        Axes::Frames,
-        config.audio_cond_dim,
-        "features of the music as motiongen extract writes them",
-    );
-    let clock = config.clock.then(|| {
-        g.input(
-            PlannerNames::CLOCK,
-            Axes::Frames,
-            CLOCK_DIM,
-            "cos and sin of 2 pi n bars for n = 1, 2, 3 and the beats of a bar, ln(tempo / 120), 1 where known; \
-             zeros where unknown",
-        )
-    });
-    let drop_audio = g.optional_input(
-        PlannerNames::DROP_AUDIO,
-        Axes::Batch,
-        0,
-        "1 for windows that go without music, 0 where left out",
-    );
-    let style = (config.style_dim > 0).then(|| {
-        let meaning = "style, normalised, 0 for none";
-        g.optional_input(PlannerNames::STYLE, Axes::Samples, config.style_dim, meaning)
-    });
-    let features = g.standardized(audio, &scale.centre, &scale.scale)?;
-    let audio = match &clock {
-        Some(clock) => g.concat(&[&features, clock])?,
-        None => features,
-    };
-    let inputs = PlannerInputs {
-        tokens: &tokens,
-        audio: &audio,
-        drop_audio: Some(&drop_audio),
-        style: style.as_ref(),
-        mask: None,
-    };
-    let logits = planner.forward(&mut g, &inputs)?;
-    g.output(PlannerNames::LOGITS, logits, "ln p of each code at each position, up to a constant")?;
-    g.name_output_axis(1, TOKENS_AXIS);
-    Ok(g.finish("planner"))
 }

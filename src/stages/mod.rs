@@ -27,6 +27,7 @@ pub mod query;
 mod retrieval;
 mod seen;
 pub mod status;
+mod token_model;
 pub mod tokenize;
 pub mod train;
 mod trained;

@@ -127,6 +127,29 @@ impl ModelFolder {
         Ok(Self { source: Source::Folder(fetched), is_verified: true, ..found })
     }
 
+    /// Opens a model as users name it: the folder of one, or the name of one of the store.
+    ///
+    /// # Errors
+    /// One sentence about what is missing or of another kind.
+    pub fn named(model: &str, store: Option<&Location>, cache: &Path) -> anyhow::Result<Self> {
+        let folder = Path::new(model);
+        if [file_names::CARD, POINTER].iter().any(|name| folder.join(name).is_file()) {
+            return Self::of_folder(folder);
+        }
+        match store {
+            Some(store) => Self::of_store(store, model, cache),
+            None => bail!(
+                "there is no model in the folder {model}; name the folder of a model (STORE/models/NAME), or give \
+                 --store beside its name"
+            ),
+        }
+    }
+
+    /// Returns what messages call the folder.
+    pub fn place(&self) -> &str {
+        &self.place
+    }
+
     /// Opens a model in a folder of this machine.
     ///
     /// # Errors

@@ -129,7 +129,7 @@ fn shape_errors_name_the_operation_and_both_sizes() {
             "frame_mask: mask has shape [2, 5], input expects [2, 4]",
         ),
         (
-            said(&|g, _| g.rotary(&zeros(g, &[1, 2, 9]), 3)),
+            said(&|g, _| g.rotary(&zeros(g, &[1, 2, 9]), 3, None)),
             "rotary: 9 channels cannot be split into pairs of 3 heads",
         ),
         (

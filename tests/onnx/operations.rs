@@ -37,6 +37,8 @@ enum Call {
         causal: bool,
     },
     CrossAttention,
+    /// Of the last places of a row of keys.
+    AttentionBehindAPast,
     Add,
     AddChannels,
     MultiplyAcross,
@@ -51,6 +53,7 @@ enum Call {
     Select,
     Normalize,
     Rotary,
+    RotaryBehindAPast,
     HoldAndCrop,
     ShiftFrames {
         shift: isize,
@@ -184,6 +187,20 @@ fn run<G: Graph>(call: Call, g: &mut G, x: &Given<G::Tensor>, ids: &Ids) -> Resu
             key_mask: None,
             causal: false,
         }),
+        Call::AttentionBehindAPast => {
+            let keys = g.concat_frames(&[&x.context, &x.x])?;
+            let query = g.frames_behind(&keys, &x.context)?;
+            let part = |tensor| Channels { tensor, first: 0 };
+            g.attention(Attention {
+                query: part(&query),
+                key: part(&keys),
+                value: part(&keys),
+                width: WIDTH,
+                heads: HEADS,
+                key_mask: None,
+                causal: true,
+            })
+        }
         Call::Add => {
             let h = convolved(g)?;
             g.add(&h, &x.x)
@@ -217,7 +234,14 @@ fn run<G: Graph>(call: Call, g: &mut G, x: &Given<G::Tensor>, ids: &Ids) -> Resu
             g.select(&x.choice, &other, &x.x)
         }
         Call::Normalize => g.normalize(&x.x, 1e-12),
-        Call::Rotary => g.rotary(&x.x, HEADS),
+        Call::Rotary => g.rotary(&x.x, HEADS, None),
+        Call::RotaryBehindAPast => {
+            let h = convolved(g)?;
+            let h = g.concat_frames(&[&x.context, &h])?;
+            let h = g.conv1d(&h, ids.taps, None, SAME)?;
+            let h = g.frames_behind(&h, &x.context)?;
+            g.rotary(&h, HEADS, Some(&x.context))
+        }
         Call::ShiftFrames { shift, spare } => g.shift_frames(&x.x, shift, spare),
         Call::ShiftFramesOfConvolution => {
             let h = convolved(g)?;
@@ -373,6 +397,7 @@ fn every_operation_gives_what_the_interpreter_gives() {
         Call::AttentionWithoutKeys { causal: false },
         Call::AttentionWithoutKeys { causal: true },
         Call::CrossAttention,
+        Call::AttentionBehindAPast,
         Call::Add,
         Call::AddChannels,
         Call::MultiplyAcross,
@@ -387,6 +412,7 @@ fn every_operation_gives_what_the_interpreter_gives() {
         Call::Select,
         Call::Normalize,
         Call::Rotary,
+        Call::RotaryBehindAPast,
         Call::HoldAndCrop,
         Call::ShiftFrames { shift: 1, spare: 0 },
         Call::ShiftFrames { shift: -2, spare: 0 },

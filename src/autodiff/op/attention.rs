@@ -19,7 +19,7 @@ pub struct InputChannels {
 ///
 /// Queries, keys and values may be parts of one input, so that nothing is copied out of a joint
 /// projection. A query all of whose keys are masked gets zeros. Vaswani et al., "Attention Is All You
-/// Need", NIPS 2017, eq. 1.
+/// Need", NIPS 2017, eq. 1. Where attention is causal, the last query stands at the place of the last key.
 ///
 /// # Shapes
 /// inputs: \[batch, queries, …\], \[batch, keys, …\]; mask: \[batch, keys\] → \[batch, queries, width\]
@@ -183,8 +183,10 @@ impl<E: Element> Operation<E> for Attend<E> {
             matmul([queries, dim, keys], scale, q, k.t(), into, false, scratch);
             let keep = mask.map_or(&all_kept[..], |mask| &mask.data()[b * keys..][..keys]);
             for (t, row) in w.chunks_exact_mut(keys).enumerate() {
-                let (seen, unseen) =
-                    row.split_at_mut(if self.causal { keys.min(t + 1) } else { keys });
+                // The last query stands at the place of the last key.
+                let n_seen =
+                    if self.causal { (t + 1 + keys).saturating_sub(queries) } else { keys };
+                let (seen, unseen) = row.split_at_mut(n_seen);
                 softmax_row(seen, &keep[..seen.len()]);
                 unseen.fill(E::ZERO);
             }

@@ -28,6 +28,8 @@ enum Choice {
     },
     /// As many as the second input has.
     Crop,
+    /// Those behind as many as the second input has.
+    Behind,
     /// All but some at either end.
     Inner {
         skip: usize,
@@ -59,6 +61,11 @@ impl TakeFrames {
     /// The first frames, as many as the second input has.
     pub fn crop() -> Self {
         Self::new("crop_frames", Choice::Crop)
+    }
+
+    /// All but the first frames, as many as the second input has.
+    pub fn behind() -> Self {
+        Self::new("frames_behind", Choice::Behind)
     }
 
     /// `n` frames from the frame `first` on, or all behind it.
@@ -109,6 +116,16 @@ impl<E: Element> Operation<E> for TakeFrames {
                 }
                 (0..wanted).collect()
             }
+            Choice::Behind => {
+                expect_axes(self.name, "the other input", x[1], 3, AXES)?;
+                let past = x[1].shape()[1];
+                if past >= frames {
+                    let problem =
+                        format!("input has {frames} frames, those behind {past} asked for");
+                    return Err(GraphError::shape(self.name, problem));
+                }
+                (past..frames).collect()
+            }
             Choice::Shifted { shift, spare } => {
                 let last = (frames - 1).saturating_sub(spare);
                 (0..frames).map(|i| i.saturating_add_signed(shift).min(last)).collect()
@@ -157,7 +174,7 @@ impl<E: Element> Operation<E> for TakeFrames {
                 }
             })
         });
-        if matches!(self.choose, Choice::Crop) {
+        if matches!(self.choose, Choice::Crop | Choice::Behind) {
             found.push(None);
         }
         found

@@ -73,12 +73,8 @@ impl GroupGenerator<'_> {
             let made = self.sample_run(track, &windows, run.clone(), before.as_ref(), &z)?;
             // Frames are given out by the last window that has them, whose blend ends as itself.
             for (i, motion) in run.clone().zip(&made) {
-                let n_own = match i + 1 < windows.len() {
-                    true => windows.shift(i + 1),
-                    false => motion.dim().1,
-                };
                 emit(with_phase(
-                    motion.slice(s![.., ..n_own, ..]),
+                    motion.slice(s![.., ..windows.n_final(i), ..]),
                     track.phase,
                     windows.frames(i).start,
                 ))?;

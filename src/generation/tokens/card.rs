@@ -141,7 +141,9 @@ impl FamilyCard for TokensCard {
                 let n_table = tokens.n_steps * tokens.width;
                 Some(most_bytes(Tokenizer::new(tokens).1.n_elements() + n_table))
             }
-            ModelFileName::Planner => Some(most_bytes(Planner::new(planner).1.n_elements())),
+            ModelFileName::Planner | ModelFileName::PlannerMusic | ModelFileName::PlannerStep => {
+                Some(most_bytes(Planner::new(planner).1.n_elements()))
+            }
             _ => None,
         }
     }

@@ -1,14 +1,15 @@
-//! Motion to tokens, and tokens to motion, by the interpreter that trains.
+//! Motion to tokens, and tokens to motion.
 
 use std::num::NonZeroUsize;
 
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, concatenate, s};
 
-use crate::autodiff::{Arena, Eager, Interpreter as _, Parameters, Stream, Tensor, Threads};
+use super::eager::EagerTokenizer;
+use super::networks::TokenizerNetworks;
+use crate::autodiff::{Parameters, Stream};
 use crate::diffusion::{Refine, SamplerConfig, Schedule, sample, sample_refined};
 use crate::generation::engine::EngineError;
-use crate::generation::pool::Pool;
-use crate::model::{Tokenizer, TokensConfig};
+use crate::model::TokensConfig;
 use crate::motion::{MOTION_DIM, Normalizer, Placement};
 
 /// Windows that are done at once, which bounds memory whatever the length of a motion.
@@ -21,20 +22,14 @@ const WINDOWS_AT_ONCE: usize = 16;
 /// and tokens know nothing of what is beyond their window.
 pub struct TokenEngine {
     config: TokensConfig,
-    tokenizer: Tokenizer,
-    parameters: Parameters<f32>,
+    networks: Box<dyn TokenizerNetworks + Send>,
     normalizer: Normalizer,
     window_frames: usize,
-    workers: Pool<TokenWorker>,
-}
-
-struct TokenWorker {
-    threads: Threads,
-    arena: Arena<f32>,
 }
 
 impl TokenEngine {
-    /// Makes an engine of so many workers of so many threads each; `parameters` are those of [`Tokenizer`].
+    /// Makes an engine of the interpreter that trains, of so many workers of so many threads each; `parameters` are those
+    /// of [`Tokenizer`](crate::model::Tokenizer).
     ///
     /// # Errors
     /// When the system gives no threads.
@@ -43,21 +38,26 @@ impl TokenEngine {
         parameters: Parameters<f32>,
         normalizer: &Normalizer,
         window_frames: usize,
-        (n_workers, n_threads): (NonZeroUsize, NonZeroUsize),
+        workers: (NonZeroUsize, NonZeroUsize),
     ) -> std::io::Result<Self> {
-        let worker = |_| {
-            let threads = Threads::start(n_threads)?;
-            Ok(TokenWorker { threads, arena: Arena::default() })
-        };
-        let workers = (0..n_workers.get()).map(worker).collect::<std::io::Result<Vec<_>>>()?;
-        Ok(Self {
-            config: config.clone(),
-            tokenizer: Tokenizer::new(config).0,
-            parameters,
-            normalizer: normalizer.clone(),
-            window_frames,
-            workers: Pool::new(workers),
-        })
+        let networks = EagerTokenizer::new(config, parameters, workers)?;
+        Ok(Self::with(config, Box::new(networks), normalizer, window_frames))
+    }
+
+    /// Makes an engine of networks, whatever runs them.
+    pub fn with(
+        config: &TokensConfig,
+        networks: Box<dyn TokenizerNetworks + Send>,
+        normalizer: &Normalizer,
+        window_frames: usize,
+    ) -> Self {
+        let (config, normalizer) = (config.clone(), normalizer.clone());
+        Self { config, networks, normalizer, window_frames }
+    }
+
+    /// Returns the name that flags and tables use of what runs the networks.
+    pub fn name(&self) -> &'static str {
+        self.networks.name()
     }
 
     /// Returns the sizes of the tokenizer.
@@ -77,7 +77,7 @@ impl TokenEngine {
 
     /// Returns how many calls run at once.
     pub fn n_workers(&self) -> usize {
-        self.workers.len()
+        self.networks.n_workers()
     }
 
     /// Returns the windows of a motion, each over the origin and facing +Z in its first frame.
@@ -104,16 +104,7 @@ impl TokenEngine {
     pub fn tokens(&self, windows: &[Array2<f32>]) -> Result<Vec<u32>, EngineError> {
         let mut tokens = Vec::new();
         for group in alike(windows) {
-            let motion = self.normalized(group);
-            self.workers.with(|TokenWorker { threads, arena }| {
-                threads.run(|| {
-                    let mut g = Eager::new(&self.parameters, arena);
-                    let motion = constant(&mut g, motion.view());
-                    let found = self.tokenizer.quantize(&mut g, &motion)?;
-                    tokens.extend(found.tokens.data().iter().map(|&token| token as u32));
-                    Ok::<_, EngineError>(())
-                })
-            })?;
+            tokens.extend(self.networks.encode(self.normalized(group).view())?);
         }
         Ok(tokens)
     }
@@ -138,7 +129,7 @@ impl TokenEngine {
         for (number, group) in runs(n_frames).enumerate() {
             let (n, frames) = (group.len(), group[0]);
             let n_tokens = n * self.config.n_tokens(frames);
-            let signal = self.signal(&tokens[first..][..n_tokens], (n, frames))?;
+            let signal = self.networks.signal(&tokens[first..][..n_tokens], (n, frames))?;
             first += n_tokens;
             let shape = [n, frames, MOTION_DIM];
             // Every group of windows has draws of its own; the first is where sampling begins.
@@ -148,7 +139,7 @@ impl TokenEngine {
             let mut x = Array3::zeros(shape);
             Stream::new(seed, (number as u64) << 32)
                 .normal(0, x.as_slice_mut().expect("new arrays lie in order"));
-            let denoise = |x: ArrayView3<f32>, t: usize| self.denoise(x, t, signal.view());
+            let denoise = |x: ArrayView3<f32>, t: usize| self.networks.denoise(x, t, signal.view());
             let sampled = sample(sampler, schedule, x, denoise, noise, None)?;
             for window in sampled.axis_iter(Axis(0)) {
                 let mut window = window.to_owned();
@@ -177,48 +168,10 @@ impl TokenEngine {
         noise: impl FnMut(usize, &mut [f32]),
         refine: Option<Refine>,
     ) -> Result<Array3<f32>, EngineError> {
-        let signal = self.signal(tokens, (1, x.len_of(Axis(1))))?;
-        let denoise = |x: ArrayView3<f32>, t: usize| self.denoise(x, t, signal.view());
+        let signal = self.networks.signal(tokens, (1, x.len_of(Axis(1))))?;
+        let denoise = |x: ArrayView3<f32>, t: usize| self.networks.denoise(x, t, signal.view());
         let start = (x, schedule.len());
         sample_refined(sampler, schedule, start, denoise, noise, None, refine)
-    }
-
-    /// Returns the signal of the tokens of n windows of so many frames, \[n, frames, d\].
-    fn signal(
-        &self,
-        tokens: &[u32],
-        (n, frames): (usize, usize),
-    ) -> Result<Array3<f32>, EngineError> {
-        let n_tokens = self.config.n_tokens(frames);
-        let tokens: Vec<f32> = tokens.iter().map(|&token| token as f32).collect();
-        self.workers.with(|TokenWorker { threads, arena }| {
-            threads.run(|| {
-                let mut g = Eager::new(&self.parameters, arena);
-                let shape = [n, frames, MOTION_DIM];
-                let like = g.constant(&shape, &vec![0.0; n * frames * MOTION_DIM]);
-                let tokens = g.constant(&[n, n_tokens], &tokens);
-                let q = self.tokenizer.codes(&mut g, &tokens)?;
-                let s = self.tokenizer.signal(&mut g, &q, &like)?;
-                Ok::<_, EngineError>(array(&s))
-            })
-        })
-    }
-
-    fn denoise(
-        &self,
-        x: ArrayView3<f32>,
-        t: usize,
-        signal: ArrayView3<f32>,
-    ) -> Result<Array3<f32>, EngineError> {
-        self.workers.with(|TokenWorker { threads, arena }| {
-            threads.run(|| {
-                let mut g = Eager::new(&self.parameters, arena);
-                let t = g.constant(&[x.len_of(Axis(0))], &vec![t as f32; x.len_of(Axis(0))]);
-                let (x, s) = (constant(&mut g, x), constant(&mut g, signal));
-                let x0 = self.tokenizer.denoise(&mut g, &x, &t, &s)?;
-                Ok(array(&x0))
-            })
-        })
     }
 
     /// Returns windows of as many frames in units of spread, \[windows, n, 25\].
@@ -243,22 +196,12 @@ fn runs(n_frames: &[usize]) -> impl Iterator<Item = &[usize]> {
     n_frames.chunk_by(|a, b| a == b).flat_map(|alike| alike.chunks(WINDOWS_AT_ONCE))
 }
 
-fn constant(g: &mut Eager<f32>, x: ArrayView3<f32>) -> Tensor<f32> {
-    let x = x.as_standard_layout();
-    g.constant(x.shape(), x.as_slice().expect("in order"))
-}
-
-fn array(x: &Tensor<f32>) -> Array3<f32> {
-    let shape = <[usize; 3]>::try_from(x.shape()).expect("invariant: [batch, frames, channels]");
-    Array3::from_shape_vec(shape, x.data().to_vec()).expect("invariant: as many as its shape says")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::diffusion::{DiffusionConfig, Prediction};
     use crate::generation::walk::walk;
-    use crate::model::Preset;
+    use crate::model::{Preset, Tokenizer};
     use crate::motion::Channel;
 
     const WINDOW_FRAMES: usize = 24;

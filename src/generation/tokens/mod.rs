@@ -3,13 +3,21 @@
 
 mod card;
 mod control;
+mod eager;
 mod engine;
+mod networks;
 mod planner;
+mod runtime;
 mod track;
 mod weights;
 
 pub use card::{TokensCard, TokensNetworks, TokensProvenance};
 pub use engine::TokenEngine;
+pub use networks::{PlanWindow, PlannerNetworks, TokenizerNetworks, WindowPlan};
 pub use planner::{PlanRequest, PlannerEngine};
+pub use runtime::{OnnxPlanner, OnnxTokenizer};
 pub use track::{TokenGenerator, TokenTrack};
 pub use weights::tokens_parameters;
+
+#[cfg(test)]
+mod tests;

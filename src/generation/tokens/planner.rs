@@ -2,29 +2,21 @@
 
 use std::num::NonZeroUsize;
 
-use ndarray::{Array2, ArrayView2, Axis};
+use ndarray::{Array2, ArrayView2};
 
+use super::eager::EagerPlanner;
+use super::networks::{PlanWindow, PlannerNetworks};
 use crate::audio::FeatureScale;
-use crate::autodiff::{Arena, Eager, Interpreter as _, Parameters, Stream, Threads};
+use crate::autodiff::{Parameters, Stream};
 use crate::diffusion::{TokenSampling, sample_autoregressive, sample_masked};
 use crate::generation::engine::EngineError;
-use crate::generation::pool::Pool;
-use crate::model::{Planner, PlannerConfig, PlannerInputs, PlannerKind, condition_scale};
+use crate::model::{PlannerConfig, PlannerKind};
 use crate::motion::style::STYLE_DIM;
 
-/// Runs a planner by the interpreter that trains it.
+/// Runs a planner.
 pub struct PlannerEngine {
     config: PlannerConfig,
-    planner: Planner,
-    parameters: Parameters<f32>,
-    /// Of the condition.
-    scale: FeatureScale,
-    workers: Pool<PlannerWorker>,
-}
-
-struct PlannerWorker {
-    threads: Threads,
-    arena: Arena<f32>,
+    networks: Box<dyn PlannerNetworks + Send>,
 }
 
 /// A window whose tokens are asked for.
@@ -48,7 +40,8 @@ const PLANS: u64 = 1 << 62;
 const DRAWS_OF_A_WINDOW: u64 = 1 << 20;
 
 impl PlannerEngine {
-    /// Makes an engine of so many workers of so many threads each; `parameters` are those of [`Planner`].
+    /// Makes an engine of the interpreter that trains, of so many workers of so many threads each; `parameters` are those
+    /// of [`Planner`](crate::model::Planner).
     ///
     /// # Errors
     /// When the system gives no threads.
@@ -56,18 +49,20 @@ impl PlannerEngine {
         config: &PlannerConfig,
         parameters: Parameters<f32>,
         feature_scale: &FeatureScale,
-        (n_workers, n_threads): (NonZeroUsize, NonZeroUsize),
+        workers: (NonZeroUsize, NonZeroUsize),
     ) -> std::io::Result<Self> {
-        let worker =
-            |_| Ok(PlannerWorker { threads: Threads::start(n_threads)?, arena: Arena::default() });
-        let workers = (0..n_workers.get()).map(worker).collect::<std::io::Result<Vec<_>>>()?;
-        Ok(Self {
-            config: config.clone(),
-            planner: Planner::new(config).0,
-            parameters,
-            scale: condition_scale(config.condition(), feature_scale),
-            workers: Pool::new(workers),
-        })
+        let networks = EagerPlanner::new(config, parameters, feature_scale, workers)?;
+        Ok(Self::with(config, Box::new(networks)))
+    }
+
+    /// Makes an engine of networks, whatever runs them.
+    pub fn with(config: &PlannerConfig, networks: Box<dyn PlannerNetworks + Send>) -> Self {
+        Self { config: config.clone(), networks }
+    }
+
+    /// Returns the name that flags and tables use of what runs the network.
+    pub fn name(&self) -> &'static str {
+        self.networks.name()
     }
 
     /// Returns the sizes of the planner.
@@ -84,27 +79,43 @@ impl PlannerEngine {
         sampling: &TokenSampling,
         request: &PlanRequest,
     ) -> Result<Vec<u32>, EngineError> {
-        let mut condition = request.condition.to_owned();
-        self.scale.apply(condition.view_mut());
+        let PlanRequest { condition, style, guidance: s, .. } = *request;
         let (codes, n) = (self.config.codes, self.config.n_tokens(condition.nrows()));
         let first = PLANS + request.window * DRAWS_OF_A_WINDOW;
         let stream = |draw: usize| Stream::new(request.seed, first + draw as u64);
+        // With the music, without it, or both: u + s (c − u).
+        let without_music: &[bool] = match s {
+            1.0 => &[false],
+            0.0 => &[true],
+            _ => &[false, true],
+        };
+        let mut plan = self.networks.begin(&PlanWindow { condition, style, without_music })?;
+        let mut logits = |tokens: &[u32]| -> Result<Vec<f32>, EngineError> {
+            let mut found = plan.logits(tokens)?;
+            if without_music.len() == 2 {
+                let without = found.split_off(found.len() / 2);
+                let (to, away) = (s as f32, (1.0 - s) as f32);
+                found.iter_mut().zip(without).for_each(|(c, u)| *c = *c * to + u * away);
+            }
+            Ok(found)
+        };
         match self.config.kind {
             PlannerKind::Masked => {
                 let mut given: Vec<Option<u32>> = request.given.iter().copied().map(Some).collect();
                 given.resize(n, None);
-                let logits = |tokens: &[u32]| self.logits(tokens, &condition, request);
+                let logits = |tokens: &[u32]| -> Result<Array2<f32>, EngineError> {
+                    let (found, what) = (logits(tokens)?, "what the planner says");
+                    let found_len = found.len();
+                    Array2::from_shape_vec((n, codes), found).map_err(|_| EngineError::Shape {
+                        what,
+                        found: vec![found_len],
+                        expected: vec![n, codes],
+                    })
+                };
                 let uniform = |draw: usize, numbers: &mut [f64]| stream(draw).uniform(0, numbers);
                 sample_masked(sampling, &given, codes, logits, uniform)
             }
             PlannerKind::Autoregressive => {
-                // The network is run over the whole window for every token: no state is kept from one to the next.
-                let logits = |tokens: &[u32]| {
-                    let mut padded = tokens.to_vec();
-                    padded.resize(n, 0);
-                    let logits = self.logits(&padded, &condition, request)?;
-                    Ok(logits.row(tokens.len()).to_vec())
-                };
                 let uniform = |draw: usize| {
                     let mut number = [0.0_f64];
                     stream(draw).uniform(0, &mut number);
@@ -113,61 +124,5 @@ impl PlannerEngine {
                 sample_autoregressive(sampling, request.given, n, codes, logits, uniform)
             }
         }
-    }
-
-    /// Returns what the planner says of each position, guided: u + s (c − u), \[N, K\].
-    ///
-    /// `condition`: in units of its spread
-    ///
-    /// # Errors
-    /// Shapes that do not fit.
-    pub fn logits(
-        &self,
-        tokens: &[u32],
-        condition: &Array2<f32>,
-        request: &PlanRequest,
-    ) -> Result<Array2<f32>, EngineError> {
-        let s = request.guidance;
-        let dropped: &[f32] = match s {
-            1.0 => &[0.0],
-            0.0 => &[1.0],
-            _ => &[0.0, 1.0],
-        };
-        let n = dropped.len();
-        let repeated = |values: &mut dyn Iterator<Item = f32>| -> Vec<f32> {
-            let one: Vec<f32> = values.collect();
-            one.repeat(n)
-        };
-        let tokens_of = repeated(&mut tokens.iter().map(|&token| token as f32));
-        let audio = repeated(&mut condition.iter().copied());
-        let style = (self.config.style_dim > 0)
-            .then(|| repeated(&mut request.style.unwrap_or_default().into_iter()));
-        let logits = self.workers.with(|PlannerWorker { threads, arena }| {
-            threads.run(|| {
-                let mut g = Eager::new(&self.parameters, arena);
-                let tokens = g.constant(&[n, tokens.len()], &tokens_of);
-                let audio = g.constant(&[n, condition.nrows(), condition.ncols()], &audio);
-                let drop_audio = g.constant(&[n], dropped);
-                let style = style.as_ref().map(|style| g.constant(&[n, STYLE_DIM], style));
-                let inputs = PlannerInputs {
-                    tokens: &tokens,
-                    audio: &audio,
-                    drop_audio: Some(&drop_audio),
-                    style: style.as_ref(),
-                    mask: None,
-                };
-                let logits = self.planner.forward(&mut g, &inputs)?;
-                Ok::<_, EngineError>(logits.data().to_vec())
-            })
-        })?;
-        let shape = (n * tokens.len(), self.config.codes);
-        let all = Array2::from_shape_vec(shape, logits)
-            .expect("invariant: a row of codes for each token");
-        let (with, without) = all.view().split_at(Axis(0), tokens.len());
-        if n == 1 {
-            return Ok(with.to_owned());
-        }
-        let (to, away) = (s as f32, (1.0 - s) as f32);
-        Ok(&with * to + &without * away)
     }
 }

@@ -78,6 +78,12 @@ impl FrameWindows {
         tokens.start * rho..(tokens.end * rho).min(self.n_frames)
     }
 
+    /// How many of the first frames of window i no later window has.
+    fn n_final(&self, i: usize) -> usize {
+        let n = self.of_tokens.n_final(i) * self.frames_per_token;
+        n.min(self.frames(i).len())
+    }
+
     /// How far window i lies behind the one before it.
     fn shift(&self, i: usize) -> usize {
         self.of_tokens.shift(i) * self.frames_per_token
@@ -133,10 +139,10 @@ impl TokenGenerator<'_> {
             };
             let before_it = before.as_ref().map(|before| &before.motion);
             let motion = self.window(track, &windows, i, (before_it, place))?;
-            give(joiner.push(motion.clone(), windows.shift(i)), &mut emit)?;
+            give(joiner.push(motion.clone(), windows.n_final(i)), &mut emit)?;
             before = Some(Window { motion, place });
         }
-        give(joiner.finish(), &mut emit)
+        Ok(())
     }
 
     /// Plans a window and makes its motion, over the origin, in metres, \[n, 25\].

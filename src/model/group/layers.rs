@@ -121,7 +121,7 @@ impl SelfAttention {
     /// Queries and keys, turned by their frame, and values.
     fn turned<G: Graph>(&self, g: &mut G, qkv: &G::Tensor) -> Result<(G::Tensor, G::Tensor)> {
         let qk = g.channels(qkv, 0..2 * self.width)?;
-        let qk = g.rotary(&qk, 2 * self.heads)?;
+        let qk = g.rotary(&qk, 2 * self.heads, None)?;
         Ok((qk, g.channels(qkv, 2 * self.width..3 * self.width)?))
     }
 
@@ -191,12 +191,12 @@ impl CrossAttention {
         let h = self.norm.forward(g, x)?;
         let q = self.q.forward(g, &h)?;
         let q = g.rebatch(&q, like)?;
-        let q = g.rotary(&q, self.heads)?;
+        let q = g.rotary(&q, self.heads, None)?;
         let q = g.rebatch(&q, x)?;
         let music = self.kv.forward(g, &memory.music)?;
         let step = self.kv.forward(g, &memory.step)?;
         let k_music = g.channels(&music, 0..width)?;
-        let k_music = g.rotary(&k_music, self.heads)?;
+        let k_music = g.rotary(&k_music, self.heads, None)?;
         let k_step = g.channels(&step, 0..width)?;
         let k = g.concat_frames(&[&k_music, &k_step])?;
         let (v_music, v_step) =

@@ -170,7 +170,7 @@ pub fn read_csv(text: &str) -> Result<Array2<f32>, CsvError> {
     Ok(Array2::from_shape_vec(shape, values).expect("every line brings 25 values"))
 }
 
-fn column_names() -> impl Iterator<Item = &'static str> {
+pub(super) fn column_names() -> impl Iterator<Item = &'static str> {
     LEADING.into_iter().chain(CHANNEL_NAMES)
 }
 

@@ -7,6 +7,7 @@ mod body;
 mod bvh;
 mod csv;
 mod glb;
+mod ndjson;
 
 use std::io::{self, Write};
 
@@ -21,6 +22,7 @@ pub use csv::{
     write_group_csv_rows,
 };
 pub use glb::{write_glb, write_group_glb};
+pub use ndjson::write_ndjson_rows;
 
 use super::channels::{CHANNEL_NAMES, Channel, MOTION_DIM};
 use super::kinematics::Poses;

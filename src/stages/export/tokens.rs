@@ -18,8 +18,10 @@ use crate::generation::{
     FamilyCard as _, MODEL_FORMAT, ModelFileName, PlannerEngine, TokenEngine, TokensCard,
     TokensNetworks, TokensProvenance, own_channels, own_features,
 };
-use crate::model::{Family, ParameterId};
-use crate::onnx::{planner, token_denoiser, token_encoder, token_signal};
+use crate::model::{Family, ParameterId, PlannerKind};
+use crate::onnx::{
+    planner, planner_music, planner_step, token_denoiser, token_encoder, token_signal,
+};
 use crate::stages::learned;
 use crate::stages::model_files::folder_of;
 use crate::stages::train::session::{ProgressWatch, read_phrases};
@@ -203,7 +205,7 @@ fn files(
         weights_sha256,
         weights_beside: None,
     };
-    let networks = vec![
+    let mut networks = vec![
         network(
             token_encoder(config, &of_tokenizer, storage)?,
             ModelFileName::Encoder,
@@ -221,5 +223,17 @@ fn files(
             planner_sha256,
         ),
     ];
+    if card.planner.kind == PlannerKind::Autoregressive {
+        networks.push(network(
+            planner_music(&card.planner, &of_planner, &card.feature_scale, storage)?,
+            ModelFileName::PlannerMusic,
+            planner_sha256,
+        ));
+        networks.push(network(
+            planner_step(&card.planner, &of_planner, storage)?,
+            ModelFileName::PlannerStep,
+            planner_sha256,
+        ));
+    }
     encode(networks, card.shared(), &own)
 }

@@ -3,7 +3,7 @@
 use std::fs::File;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, bail};
 use ndarray::ArrayView2;
@@ -11,9 +11,9 @@ use ndarray::ArrayView2;
 use super::GenerateTally;
 use super::maker::{GeneratedMotion, MotionMaker};
 use super::music::PhraseMusic;
-use super::outputs::{self, MotionFormat, MotionOutput};
+use super::outputs::{self, MotionFormat, MotionOutput, StreamFormat};
 use super::receipt::{Receipt, digest_of_song};
-use crate::motion::exchange::{csv_header, write_csv_rows};
+use crate::motion::exchange::{csv_header, write_csv_rows, write_ndjson_rows};
 use crate::motion::{Beats, BeatsError};
 use crate::stages::Progress;
 use crate::stages::extract::{ExtractRules, ExtractedFeatures, Origin, extract};
@@ -29,6 +29,7 @@ pub struct FolderTarget<'a> {
     pub folder: &'a Path,
     pub formats: &'a [MotionFormat],
     pub stream: Option<&'a str>,
+    pub stream_format: StreamFormat,
     pub n_samples: usize,
     pub dry_run: bool,
     pub force: bool,
@@ -98,7 +99,8 @@ pub fn run(
     if target.dry_run {
         return Ok(done);
     }
-    let mut stream = target.stream.map(open_stream).transpose()?;
+    let open = |place| FrameStream::open(place, target.stream_format);
+    let mut stream = target.stream.map(open).transpose()?;
     std::fs::create_dir_all(target.folder)
         .with_context(|| format!("while making {}", target.folder.display()))?;
     progress.start("generate", "motions", tasks.len() as u64);
@@ -113,6 +115,7 @@ pub fn run(
             heard = Some((path, listen(path)));
         }
         let Some((_, music)) = &heard else { continue };
+        let mut first_after = None;
         let outcome = music.as_ref().map_err(Clone::clone).and_then(|(extracted, beats)| {
             let source = path.display().to_string();
             let music = PhraseMusic {
@@ -128,9 +131,11 @@ pub fn run(
                 Some(stream) => stream.write(frames),
                 None => Ok(()),
             };
+            let started = Instant::now();
             let made = maker.make(&music, sample, &mut watch)?;
             // Only the first motion is streamed.
-            stream = None;
+            let first = stream.take().and_then(|stream| stream.first);
+            first_after = first.map(|first| first.duration_since(started));
             Ok(made)
         });
         match outcome {
@@ -154,7 +159,7 @@ pub fn run(
                 match written {
                     Ok(written) => {
                         done.add_made(&made);
-                        done.told.push((told(&name, &made), written));
+                        done.told.push((told(&name, &made, first_after), written));
                     }
                     Err(e) => {
                         let source = path.display().to_string();
@@ -205,15 +210,18 @@ pub(in crate::stages) fn listen(path: &Path) -> FeaturesAndBeats {
     Ok((extracted, beats))
 }
 
-fn told(name: &str, made: &GeneratedMotion) -> String {
+/// Says what was made, and where it was streamed how soon its first frames were there.
+fn told(name: &str, made: &GeneratedMotion, first_after: Option<Duration>) -> String {
     let row = made.rows.iter().find(|row| row.selected);
     let score = row.and_then(|row| row.score).map_or("none".to_owned(), |x| format!("{x:.3}"));
     let checks = row
         .map_or(String::new(), |row| format!("{} of {} checks", row.checks_passed, row.n_checks));
     let duration_s = crate::units::frames_to_s(made.n_frames());
     let factor = made.seconds / duration_s.max(f64::MIN_POSITIVE);
+    let streamed = first_after
+        .map_or(String::new(), |t| format!("; first frames after {:.2} s", t.as_secs_f64()));
     format!(
-        "{name}: {duration_s:.1} s of motion in {:.1} s ({factor:.2} × real time), score {score}, {checks}",
+        "{name}: {duration_s:.1} s of motion in {:.1} s ({factor:.2} × real time), score {score}, {checks}{streamed}",
         made.seconds
     )
 }
@@ -239,25 +247,38 @@ fn facts(made: &GeneratedMotion) -> Vec<(String, String)> {
     facts.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
 }
 
-/// Frames on their way to a player, as CSV.
+/// Frames on their way to a player.
 struct FrameStream {
     out: Box<dyn Write>,
+    format: StreamFormat,
     n_frames: usize,
-}
-
-fn open_stream(target: &str) -> anyhow::Result<FrameStream> {
-    let mut out: Box<dyn Write> = match target {
-        "-" => Box::new(io::stdout()),
-        path => Box::new(File::create(path).with_context(|| format!("while writing {path}"))?),
-    };
-    out.write_all(csv_header().as_bytes())?;
-    Ok(FrameStream { out, n_frames: 0 })
+    /// When the first frames were there.
+    first: Option<Instant>,
 }
 
 impl FrameStream {
+    fn open(place: &str, format: StreamFormat) -> anyhow::Result<Self> {
+        let mut out: Box<dyn Write> = match place {
+            "-" => Box::new(io::stdout()),
+            path => Box::new(File::create(path).with_context(|| format!("while writing {path}"))?),
+        };
+        if format == StreamFormat::Csv {
+            out.write_all(csv_header().as_bytes())?;
+        }
+        Ok(Self { out, format, n_frames: 0, first: None })
+    }
+
     fn write(&mut self, frames: ArrayView2<f32>) -> io::Result<()> {
-        write_csv_rows(frames, self.n_frames, &mut self.out)?;
+        // A write for each number would be a call of the system for each.
+        let mut text = Vec::new();
+        match self.format {
+            StreamFormat::Csv => write_csv_rows(frames, self.n_frames, &mut text)?,
+            StreamFormat::Ndjson => write_ndjson_rows(frames, self.n_frames, &mut text)?,
+        }
+        self.out.write_all(&text)?;
+        self.out.flush()?;
         self.n_frames += frames.nrows();
-        self.out.flush()
+        self.first.get_or_insert_with(Instant::now);
+        Ok(())
     }
 }

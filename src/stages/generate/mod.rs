@@ -23,7 +23,7 @@ use anyhow::bail;
 
 use super::failure::Failure;
 use super::model_files::{
-    EngineChoice, EngineParams, ModelFolder, OpenModel, POINTER, is_model_name, sha256,
+    EngineChoice, EngineParams, ModelFolder, OpenModel, is_model_name, sha256,
 };
 use super::retrieval::Primer;
 use super::{Contract, Progress, Stage, Summary};
@@ -171,6 +171,7 @@ fn make_all(
                 folder,
                 formats: &params.format,
                 stream: params.stream.as_deref(),
+                stream_format: params.stream_format,
                 n_samples,
                 dry_run: params.dry_run,
                 force: params.force,
@@ -200,18 +201,9 @@ fn make_all(
 
 /// Opens the model of a store, or in a folder.
 fn open_model(params: &Params, store: Option<&Location>) -> anyhow::Result<ModelFolder> {
-    let Some(model) = &params.model else { return ModelFolder::pretrained() };
-    let folder = Path::new(model);
-    if [file_names::CARD, POINTER].iter().any(|name| folder.join(name).is_file()) {
-        return ModelFolder::of_folder(folder);
-    }
-    match store {
-        Some(store) => ModelFolder::of_store(store, model, &params.engine.cache()),
-        None => bail!(
-            "there is no model in the folder {}; name the folder of a model (STORE/models/NAME), or give \
-             --store beside its name",
-            model
-        ),
+    match &params.model {
+        None => ModelFolder::pretrained(),
+        Some(model) => ModelFolder::named(model, store, &params.engine.cache()),
     }
 }
 

@@ -36,6 +36,16 @@ pub enum MotionFormat {
     Html,
 }
 
+/// What a stream is made of.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum StreamFormat {
+    /// A header, then a line for each frame, as in a csv file.
+    #[default]
+    Csv,
+    /// An object for each frame, in a line of its own.
+    Ndjson,
+}
+
 impl MotionFormat {
     /// What is written unless the user says otherwise.
     pub const DEFAULT: [Self; 4] = [Self::Npy, Self::Glb, Self::Png, Self::Html];

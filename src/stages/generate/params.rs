@@ -9,7 +9,7 @@ use anyhow::{bail, ensure};
 use serde::{Deserialize, Serialize};
 
 use super::constraints_file::ConstraintsRequest;
-use super::outputs::MotionFormat;
+use super::outputs::{MotionFormat, StreamFormat};
 use super::settings::{MotionSettings, OUTPUT_VERSION};
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing, TokenSampling};
 use crate::generation::{ConsistencyForm, FamilyCard, ModelCard, OVERLAP_FRAMES};
@@ -86,11 +86,15 @@ pub struct Params {
     #[arg(long, value_enum, value_name = "FORMAT", value_delimiter = ',', num_args = 1..,
           default_values_t = MotionFormat::DEFAULT)]
     pub format: Vec<MotionFormat>,
-    /// With --audio: writes the frames of the first motion as CSV, as soon as they are final and before
+    /// With --audio: writes the frames of the first motion, as soon as they are final and before
     /// post-processing; - is the standard output.
     #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-", requires = "audio",
           hide_short_help = RARE)]
     pub stream: Option<String>,
+    /// What --stream writes: lines of CSV, or of JSON.
+    #[arg(long, value_enum, value_name = "FORMAT", default_value_t, requires = "stream",
+          hide_short_help = RARE)]
+    pub stream_format: StreamFormat,
     /// Name under which tables keep the motions [default: the model's]
     #[arg(long, value_name = "NAME")]
     pub run: Option<String>,

@@ -3,7 +3,7 @@
 use std::num::NonZeroUsize;
 use std::time::Instant;
 
-use anyhow::{Context as _, bail};
+use anyhow::bail;
 use ndarray::{Array2, ArrayView2, Axis, concatenate};
 use serde::{Deserialize, Serialize};
 
@@ -19,15 +19,14 @@ use super::{make_all, name_of_model, weights_digest_of_tokens};
 use crate::diffusion::{SamplerConfig, Schedule, TokenSampling};
 use crate::evaluation::{derivative_error, score};
 use crate::generation::{
-    FamilyCard as _, PlannerEngine, TokenEngine, TokenGenerator, TokenTrack, TokensCard,
-    WeightedConstraints, tokens_parameters,
+    FamilyCard as _, TokenGenerator, TokenTrack, TokensCard, WeightedConstraints,
 };
 use crate::motion::postprocess::{PostProcessConfig, process, process_holding};
 use crate::motion::style::STYLE_DIM;
 use crate::motion::{Channel, MOTION_DIM};
-use crate::onnx::Model;
 use crate::stages::failure::{Failure, FailureKind, guarded};
-use crate::stages::model_folder::ModelFolder;
+use crate::stages::model_files::{EngineChoice, EngineParams, ModelFolder};
+use crate::stages::token_model::{OpenTokens, TokenEngines};
 use crate::stages::train::session::check_run_name;
 use crate::stages::{Progress, Summary};
 use crate::store::tables::GenerationRow;
@@ -128,26 +127,23 @@ pub fn run(
     progress: &dyn Progress,
 ) -> anyhow::Result<Box<dyn Summary>> {
     let started = Instant::now();
-    let card = TokensCard::read(files.card_bytes(), files.card_place())?;
+    let opened = OpenTokens::of(files)?;
+    let card = &opened.card;
     let constraints = params.constraints_asked()?;
-    let settings = TokensSettings::new(params, &card, constraints.as_ref())?;
+    let settings = TokensSettings::new(params, card, constraints.as_ref())?;
     let name = name_of_model(params, &card.name);
     let run = params.run.clone().unwrap_or_else(|| name.clone());
     check_run_name(&run)?;
     let is_single = params.audio.len() == 1 || params.phrase.len() == 1;
-    let threads = params.engine.threads;
-    let n_workers = if is_single { NonZeroUsize::MIN } else { threads };
-    let n_threads = NonZeroUsize::new(threads.get() / n_workers.get()).unwrap_or(NonZeroUsize::MIN);
-    let workers = (n_workers, n_threads);
-    let (of_tokenizer, of_planner) = tokens_parameters(&card, |name| -> anyhow::Result<_> {
-        let place = files.place_of(name);
-        Ok((Model::read(files.read(name)?, None, &place)?, place))
-    })?;
-    let tokens =
-        TokenEngine::new(&card.tokens, of_tokenizer, &card.normalizer, card.window_frames, workers)
-            .context("while starting threads")?;
-    let planner = PlannerEngine::new(&card.planner, of_planner, &card.feature_scale, workers)
-        .context("while starting threads")?;
+    let n_workers = if is_single { NonZeroUsize::MIN } else { params.engine.threads };
+    let engine_params = match params.dry_run {
+        true => EngineParams { engine: EngineChoice::Eager, ..params.engine.clone() },
+        false => params.engine.clone(),
+    };
+    let TokenEngines { tokens, planner, note } = opened.engines(&engine_params, n_workers)?;
+    if let Some(note) = note {
+        progress.note(&note);
+    }
     let schedule = Schedule::new(&card.diffusion)?;
     let maker = TokensMaker {
         generator: TokenGenerator {
@@ -159,8 +155,8 @@ pub fn run(
             guidance: settings.guidance,
             overlap_tokens: settings.overlap_tokens,
         },
-        card: &card,
-        weights: weights_digest_of_tokens(&card),
+        card,
+        weights: weights_digest_of_tokens(card),
         model: &name,
         run: &run,
         seed: params.seed,
@@ -169,8 +165,9 @@ pub fn run(
     };
     let (place, done) = make_all(params, store, &maker, tokens.n_workers(), progress)?;
     let made_with = format!(
-        "model {name} (family tokens, {}), {ENGINE} ({}), plans in {} iterations, {} in {} steps, guidance {}",
+        "model {name} (family tokens, {}), {} ({}), plans in {} iterations, {} in {} steps, guidance {}",
         card.planner.kind.name(),
+        tokens.name(),
         tokens.n_workers(),
         settings.plan.n_iterations,
         settings.sampler.sampler.name(),
@@ -180,9 +177,6 @@ pub fn run(
     let (dry_run, took_s) = (params.dry_run, started.elapsed().as_secs_f64());
     Ok(Box::new(GenerateSummary { place, done, model: name, made_with, dry_run, took_s }))
 }
-
-/// Name of the one engine that runs models of tokens: the interpreter that trains them.
-const ENGINE: &str = "eager";
 
 /// Generates motions by tokens.
 struct TokensMaker<'a> {
@@ -319,7 +313,7 @@ impl TokensMaker<'_> {
             seed: seed as i64,
             model: self.model.to_owned(),
             weights: self.weights.clone(),
-            engine: ENGINE.to_owned(),
+            engine: self.generator.tokens.name().to_owned(),
             sampler: settings.sampler.sampler.name().to_owned(),
             n_steps: settings.sampler.n_steps as i32,
             guidance: settings.guidance,

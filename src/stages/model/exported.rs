@@ -9,24 +9,56 @@ use ndarray::Array3;
 use super::thousands;
 use crate::autodiff::Stream;
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
-use crate::generation::{LearnedFrom, ModelCard, MusicDigests, Sampling, sample};
+use crate::generation::{
+    FamilyCard as _, FileEntry, LearnedFrom, MusicDigests, Sampling, SharedFields, sample,
+};
 use crate::motion::MOTION_DIM;
-use crate::stages::model_files::{EngineParams, OpenModel};
+use crate::stages::model_files::{EngineParams, ModelFolder, OpenModel};
 use crate::stages::{Progress, Summary};
-use crate::store::Location;
 use crate::units::frames_to_s;
 
 /// Samplings that are timed: their step counts, 20 of DDIM and 10 of DPM-Solver++.
 const TIMED: [(Sampler, usize); 2] = [(Sampler::Ddim { eta: 0.0 }, 20), (Sampler::DpmSolver, 10)];
 
-/// The account of a model.
+/// The account of a model of any family.
 pub struct ModelSummary {
-    card: ModelCard,
-    place: String,
-    engine: &'static str,
-    load_s: f64,
-    /// Sampler, steps, frames, and the seconds that one motion took.
-    timed: Vec<(&'static str, usize, usize, f64)>,
+    pub name: String,
+    pub place: String,
+    /// What its card says, name and value.
+    pub rows: Vec<(&'static str, String)>,
+    pub files: Vec<FileEntry>,
+    pub engine: &'static str,
+    pub load_s: f64,
+    pub timed: Vec<TimedWork>,
+    /// Figures beside those of every family.
+    pub figures: serde_json::Value,
+}
+
+/// Some work of a model, and how long it took.
+pub struct TimedWork {
+    /// As the account calls it.
+    pub what: String,
+    pub sampler: &'static str,
+    pub n_steps: usize,
+    pub n_frames: usize,
+    pub took_s: f64,
+}
+
+/// Does a piece of work four times, and returns the least seconds: the first run makes buffers, and of the others the
+/// best is what the machine can do.
+///
+/// # Errors
+/// What the work says.
+pub fn least_seconds(mut work: impl FnMut() -> anyhow::Result<()>) -> anyhow::Result<f64> {
+    let mut best = f64::INFINITY;
+    for i in 0..4 {
+        let started = Instant::now();
+        work()?;
+        if i > 0 {
+            best = best.min(started.elapsed().as_secs_f64());
+        }
+    }
+    Ok(best)
 }
 
 /// Opens a model, looks through its files, and samples one motion of noise and silence.
@@ -34,13 +66,13 @@ pub struct ModelSummary {
 /// # Errors
 /// One sentence about what is missing, damaged or of another kind.
 pub fn look(
-    store: &Location,
-    name: &str,
+    files: ModelFolder,
     frames: usize,
     params: &EngineParams,
     progress: &dyn Progress,
 ) -> anyhow::Result<Box<dyn Summary>> {
-    let opened = OpenModel::of_store(store, name, &params.cache())?;
+    let place = files.place().to_owned();
+    let opened = OpenModel::of(files)?;
     let started = Instant::now();
     let (engine, note) = opened.engine(params, NonZeroUsize::MIN)?;
     let load_s = started.elapsed().as_secs_f64();
@@ -58,31 +90,72 @@ pub fn look(
             spacing: Spacing::Trailing,
             clip: true,
         };
-        let run = || -> anyhow::Result<f64> {
+        let took_s = least_seconds(|| {
             let mut x = Array3::zeros((1, frames, MOTION_DIM));
             Stream::new(0, 0).normal(0, x.as_slice_mut().expect("in order"));
             let sampling = Sampling { config: &config, schedule: &schedule, guidance: 1.0 };
-            let started = Instant::now();
-            let latent = sample(
-                &*engine,
-                sampling,
-                (x, schedule.len()),
-                audio.view(),
-                None,
-                |_, _| (),
-                None,
-            )?;
+            let start = (x, schedule.len());
+            let latent = sample(&*engine, sampling, start, audio.view(), None, |_, _| (), None)?;
             engine.decode(latent.view())?;
-            Ok(started.elapsed().as_secs_f64())
-        };
-        // The first run makes buffers; of the others the best is what the machine can do.
-        run()?;
-        let best = (0..3).map(|_| run()).collect::<anyhow::Result<Vec<f64>>>()?;
-        let best = best.into_iter().fold(f64::INFINITY, f64::min);
-        timed.push((sampler.name(), config.n_steps, frames, best));
+            Ok(())
+        })?;
+        let (sampler, n_steps) = (sampler.name(), config.n_steps);
+        let what = format!("{n_steps} steps of {sampler}");
+        timed.push(TimedWork { what, sampler, n_steps, n_frames: frames, took_s });
     }
-    let (place, card) = (store.url_of(&crate::stages::model_files::folder_of(name)), card.clone());
-    Ok(Box::new(ModelSummary { card, place, engine: engine.name(), load_s, timed }))
+    let provenance = &card.provenance;
+    let rows = vec![
+        (
+            "run",
+            format!("{} ({}, step {})", provenance.run, provenance.stage, provenance.unet_step),
+        ),
+        ("validation", validation(provenance.validation_loss)),
+        ("data", provenance.data.clone()),
+        ("learned from", learned(provenance.learned_from.as_ref())),
+        (
+            "parameters",
+            format!(
+                "{} (UNet), {} (decoder)",
+                thousands(card.n_parameters.unet),
+                thousands(card.n_parameters.decoder)
+            ),
+        ),
+    ];
+    Ok(Box::new(ModelSummary {
+        name: card.name.clone(),
+        place,
+        rows: [rows, shared_rows(card.shared())].concat(),
+        files: card.files.clone(),
+        engine: engine.name(),
+        load_s,
+        timed,
+        figures: serde_json::json!({
+            "run": provenance.run,
+            "n_parameters_unet": card.n_parameters.unet,
+            "n_parameters_decoder": card.n_parameters.decoder,
+            "precision": card.precision.name(),
+        }),
+    }))
+}
+
+/// Returns a validation loss as the account has it.
+pub fn validation(loss: Option<f64>) -> String {
+    loss.map_or_else(|| "not known".to_owned(), |x| format!("{x:.4}"))
+}
+
+/// Returns the music that a model learned from as the account has it.
+pub fn learned(from: Option<&LearnedFrom>) -> String {
+    from.map_or_else(|| "not known".to_owned(), summary_of)
+}
+
+/// Returns what cards of every family say, behind what they say of their runs and networks.
+pub fn shared_rows(card: SharedFields) -> Vec<(&'static str, String)> {
+    vec![
+        ("precision", card.precision.name().to_owned()),
+        ("window", format!("{} frames", card.window_frames)),
+        ("licence", card.licence.to_owned()),
+        ("written by", card.program.to_owned()),
+    ]
 }
 
 /// Counts the music that a model learned from.
@@ -106,43 +179,12 @@ fn summary_of(learned: &LearnedFrom) -> String {
 
 impl Summary for ModelSummary {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        let Self { card, place, engine, load_s, timed } = self;
-        let provenance = &card.provenance;
-        writeln!(out, "model {}, {place}\n", card.name)?;
-        let row = |name: &str, value: String| format!("{name:<14}{value}");
-        let lines = [
-            row(
-                "run",
-                format!("{} ({}, step {})", provenance.run, provenance.stage, provenance.unet_step),
-            ),
-            row(
-                "validation",
-                provenance
-                    .validation_loss
-                    .map_or_else(|| "not known".to_owned(), |x| format!("{x:.4}")),
-            ),
-            row("data", provenance.data.clone()),
-            row(
-                "learned from",
-                provenance.learned_from.as_ref().map_or_else(|| "not known".to_owned(), summary_of),
-            ),
-            row(
-                "parameters",
-                format!(
-                    "{} (UNet), {} (decoder)",
-                    thousands(card.n_parameters.unet),
-                    thousands(card.n_parameters.decoder)
-                ),
-            ),
-            row("precision", card.precision.name().to_owned()),
-            row("window", format!("{} frames", card.window_frames)),
-            row("licence", card.licence.clone()),
-            row("written by", card.program.clone()),
-        ];
-        for line in lines {
-            writeln!(out, "{line}")?;
+        let Self { name, place, rows, files, engine, load_s, timed, .. } = self;
+        writeln!(out, "model {name}, {place}\n")?;
+        for (name, value) in rows {
+            writeln!(out, "{name:<14}{value}")?;
         }
-        for file in &card.files {
+        for file in files {
             let mb = file.n_bytes as f64 / 1e6;
             writeln!(
                 out,
@@ -152,12 +194,12 @@ impl Summary for ModelSummary {
             )?;
         }
         writeln!(out, "\nengine {engine}, ready in {load_s:.2} s")?;
-        for (sampler, n_steps, frames, seconds) in timed.iter() {
-            let motion_s = frames_to_s(*frames);
+        for TimedWork { what, n_frames, took_s, .. } in timed {
+            let motion_s = frames_to_s(*n_frames);
             writeln!(
                 out,
-                "{n_steps} steps of {sampler}: {seconds:.2} s for {motion_s:.1} s of motion, {:.1} × real time",
-                motion_s / seconds
+                "{what}: {took_s:.2} s for {motion_s:.1} s of motion, {:.1} × real time",
+                motion_s / *took_s
             )?;
         }
         Ok(())
@@ -168,22 +210,22 @@ impl Summary for ModelSummary {
     }
 
     fn figures(&mut self) -> serde_json::Value {
-        let Self { card, place, engine, load_s, timed } = self;
-        let timed = timed.iter().map(|(sampler, n_steps, n_frames, took_s)| {
+        let Self { name, place, engine, load_s, timed, figures, .. } = self;
+        let timed = timed.iter().map(|TimedWork { sampler, n_steps, n_frames, took_s, .. }| {
             serde_json::json!({
                 "sampler": sampler, "n_steps": n_steps, "n_frames": n_frames, "took_s": took_s,
             })
         });
-        serde_json::json!({
-            "model": card.name,
+        let mut all = serde_json::json!({
+            "model": name,
             "place": place,
-            "run": card.provenance.run,
-            "n_parameters_unet": card.n_parameters.unet,
-            "n_parameters_decoder": card.n_parameters.decoder,
-            "precision": card.precision.name(),
             "engine": engine,
             "load_s": load_s,
             "timed": timed.collect::<Vec<_>>(),
-        })
+        });
+        if let (Some(all), serde_json::Value::Object(figures)) = (all.as_object_mut(), figures) {
+            all.append(figures);
+        }
+        all
     }
 }

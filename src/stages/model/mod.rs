@@ -1,16 +1,17 @@
 //! `model`: what a network consists of and costs, or what an exported model is.
 
 mod exported;
+mod tokens;
 
 use std::io::{self, Write};
 
 use anyhow::ensure;
 
-use super::model_files::{EngineChoice, EngineParams};
+use super::model_files::{EngineChoice, EngineParams, ModelFolder};
 use super::{ClientParams, Contract, Progress, Stage, Summary};
 use crate::model::{
-    ActivationCounts, DecoderConfig, Layer, MotionDecoder, Outline, Preset, UNet1D, UNetConfig,
-    UNetInputs,
+    ActivationCounts, DecoderConfig, Family, Layer, MotionDecoder, Outline, Preset, UNet1D,
+    UNetConfig, UNetInputs,
 };
 use crate::store::Location;
 
@@ -44,8 +45,9 @@ pub struct Params {
     /// Folder or bucket of an exported model.
     #[arg(long, value_name = "URL", requires = "model")]
     pub store: Option<String>,
-    /// Tell of this exported model instead: what it is, whether its files are whole, how fast it runs here.
-    #[arg(long, value_name = "NAME", requires = "store", conflicts_with_all = ["preset", "network", "batch_size"])]
+    /// Tell of this exported model instead, of a store or in a folder: what it is, whether its files are whole, how
+    /// fast it runs here.
+    #[arg(long, value_name = "NAME|DIR", conflicts_with_all = ["preset", "network", "batch_size"])]
     pub model: Option<String>,
     #[command(flatten)]
     pub engine: EngineParams,
@@ -61,19 +63,24 @@ impl Stage for Model {
     const ABOUT: &'static str =
         "print what a network consists of and costs, or what an exported model is";
     const CONTRACT: Contract =
-        Contract { reads: "nothing, or models/<model>/", writes: "standard output" };
+        Contract { reads: "nothing, or models/<model>/, or a folder", writes: "standard output" };
     type Params = Params;
 
     fn run(params: Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
         ensure!(params.frames > 0, "--frames is 0; a motion has at least one frame");
-        if let (Some(store), Some(model)) = (&params.store, &params.model) {
-            let store = Location::open(store, &params.client.options())?;
+        if let Some(model) = &params.model {
+            let open = |url| Location::open(url, &params.client.options());
+            let store = params.store.as_deref().map(open).transpose()?;
             let mut engine = params.engine.clone();
             if params.dry_run {
                 // The one engine that keeps no prepared copy of a model.
                 engine.engine = EngineChoice::Eager;
             }
-            return exported::look(&store, model, params.frames, &engine, progress);
+            let files = ModelFolder::named(model, store.as_ref(), &engine.cache())?;
+            return match files.family() {
+                Family::Tokens => tokens::look(files, params.frames, &engine, progress),
+                _ => exported::look(files, params.frames, &engine, progress),
+            };
         }
         ensure!(params.batch_size > 0, "--batch-size is 0; a batch has at least one motion");
         let one = follow(&params, 1, false)?;

@@ -97,6 +97,11 @@ impl PlannerConfig {
         n_frames.div_ceil(self.frames_per_token)
     }
 
+    /// Returns the numbers that are kept of a position that is done: keys and values of every layer.
+    pub fn cache_dim(&self) -> usize {
+        2 * self.layers * self.width
+    }
+
     /// Returns the number that stands for a token which is not known, \[MASK\]: the one behind the last.
     pub fn mask_token(&self) -> usize {
         self.codes

@@ -22,6 +22,13 @@ pub struct PlannerLayer {
     dropout: f64,
 }
 
+/// Keys, which are turned by their position, and values of positions that are done, \[batch, positions, d\] each.
+#[derive(Clone, Debug)]
+pub struct KeysAndValues<T> {
+    pub keys: T,
+    pub values: T,
+}
+
 impl PlannerLayer {
     /// Makes a layer as a part of a network.
     pub fn new(scope: &mut Scope, config: &PlannerConfig) -> Self {
@@ -53,11 +60,8 @@ impl PlannerLayer {
         h: &G::Tensor,
         mask: Option<&G::Tensor>,
     ) -> Result<G::Tensor> {
-        let Self { width, heads, dropout, .. } = *self;
-        let r = self.norms[0].forward(g, h)?;
-        let qkv = self.qkv.forward(g, &r)?;
-        let qk = g.channels(&qkv, 0..2 * width)?;
-        let qk = g.rotary(&qk, 2 * heads)?;
+        let Self { width, heads, .. } = *self;
+        let (qk, qkv) = self.projected(g, h, None)?;
         let r = g.attention(Attention {
             query: Channels { tensor: &qk, first: 0 },
             key: Channels { tensor: &qk, first: width },
@@ -67,15 +71,69 @@ impl PlannerLayer {
             key_mask: mask,
             causal: self.is_causal,
         })?;
-        let r = self.proj.forward(g, &r)?;
-        let r = g.dropout(&r, dropout)?;
+        self.fed_forward(g, h, &r)
+    }
+
+    /// The layer at positions that stand behind others, whose keys and values are known.
+    ///
+    /// # Shapes
+    /// - `h`: \[batch, n, d\]; `past`: those of the positions before, \[batch, P, d\] each, none where there are none
+    /// - returns \[batch, n, d\], and the keys and values of all positions so far, \[batch, P + n, d\] each
+    pub fn step<G: Graph>(
+        &self,
+        g: &mut G,
+        h: &G::Tensor,
+        past: Option<&KeysAndValues<G::Tensor>>,
+    ) -> Result<(G::Tensor, KeysAndValues<G::Tensor>)> {
+        let Self { width, heads, .. } = *self;
+        let (qk, qkv) = self.projected(g, h, past.map(|past| &past.keys))?;
+        let mut keys = g.channels(&qk, width..2 * width)?;
+        let mut values = g.channels(&qkv, 2 * width..3 * width)?;
+        if let Some(past) = past {
+            keys = g.concat_frames(&[&past.keys, &keys])?;
+            values = g.concat_frames(&[&past.values, &values])?;
+        }
+        let r = g.attention(Attention {
+            query: Channels { tensor: &qk, first: 0 },
+            key: Channels { tensor: &keys, first: 0 },
+            value: Channels { tensor: &values, first: 0 },
+            width,
+            heads,
+            key_mask: None,
+            causal: self.is_causal,
+        })?;
+        Ok((self.fed_forward(g, h, &r)?, KeysAndValues { keys, values }))
+    }
+
+    /// Returns queries and keys, which are turned, and beside them all three as they were projected.
+    fn projected<G: Graph>(
+        &self,
+        g: &mut G,
+        h: &G::Tensor,
+        past: Option<&G::Tensor>,
+    ) -> Result<(G::Tensor, G::Tensor)> {
+        let r = self.norms[0].forward(g, h)?;
+        let qkv = self.qkv.forward(g, &r)?;
+        let qk = g.channels(&qkv, 0..2 * self.width)?;
+        Ok((g.rotary(&qk, 2 * self.heads, past)?, qkv))
+    }
+
+    /// Adds what attention found to its input, and then what the feed-forward layer makes of that.
+    fn fed_forward<G: Graph>(
+        &self,
+        g: &mut G,
+        h: &G::Tensor,
+        attended: &G::Tensor,
+    ) -> Result<G::Tensor> {
+        let r = self.proj.forward(g, attended)?;
+        let r = g.dropout(&r, self.dropout)?;
         let h = g.add(h, &r)?;
 
         let r = self.norms[1].forward(g, &h)?;
         let r = self.feed_forward[0].forward(g, &r)?;
         let r = g.activation(&r, Activation::Gelu)?;
         let r = self.feed_forward[1].forward(g, &r)?;
-        let r = g.dropout(&r, dropout)?;
+        let r = g.dropout(&r, self.dropout)?;
         g.add(&h, &r)
     }
 }

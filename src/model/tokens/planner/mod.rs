@@ -10,9 +10,12 @@
 
 mod config;
 mod layer;
+mod step;
 
 pub use self::config::{PlannerConfig, PlannerKind};
+pub use self::layer::KeysAndValues;
 use self::layer::PlannerLayer;
+pub use self::step::{PlanConditions, PlannerStep, PlannerStepInputs};
 use super::coder::Encoder;
 use crate::model::graph::{Graph, Result};
 use crate::model::layers::{LayerNorm, Linear};
@@ -90,35 +93,64 @@ impl Planner {
         g: &mut G,
         inputs: &PlannerInputs<G::Tensor>,
     ) -> Result<G::Tensor> {
-        let mut music = self.music.forward(g, inputs.audio)?;
-        if let Some(drop_audio) = inputs.drop_audio {
-            let null = g.parameter(self.null_music)?;
-            music = g.select(drop_audio, &null, &music)?;
-        }
-        let mean = g.mean_frames(&music, inputs.mask)?;
-        let mut global = self.global.forward(g, &mean)?;
-        if let (Some(layer), Some(style)) = (&self.style, inputs.style) {
-            let style = layer.forward(g, style)?;
-            global = g.add(&global, &style)?;
-        }
-        let tokens = g.embedding(self.table, inputs.tokens)?;
+        let PlannerInputs { audio, drop_audio, style, mask, .. } = *inputs;
+        let conditions = self.conditions(g, audio, drop_audio, style, mask)?;
+        self.forward_under(g, inputs.tokens, &conditions, mask)
+    }
+
+    /// [`Planner::forward`] of windows whose conditions are known, [`Planner::conditions`].
+    pub fn forward_under<G: Graph>(
+        &self,
+        g: &mut G,
+        tokens: &G::Tensor,
+        conditions: &PlanConditions<G::Tensor>,
+        mask: Option<&G::Tensor>,
+    ) -> Result<G::Tensor> {
+        let PlanConditions { local: music, global } = conditions;
+        let tokens = g.embedding(self.table, tokens)?;
         let h = match self.kind {
             PlannerKind::Masked => {
-                let tokens = g.add(&tokens, &music)?;
-                let h = g.concat_frames(&[&global, &tokens])?;
-                let mask = inputs.mask.map(|mask| g.token_mask(mask, 1)).transpose()?;
+                let tokens = g.add(&tokens, music)?;
+                let h = g.concat_frames(&[global, &tokens])?;
+                let mask = mask.map(|mask| g.token_mask(mask, 1)).transpose()?;
                 let h = self.transformed(g, h, mask.as_ref())?;
                 g.frames(&h, 1, None)?
             }
             PlannerKind::Autoregressive => {
-                let before = g.concat_frames(&[&global, &tokens])?;
-                let before = g.crop_frames(&before, &music)?;
-                let h = g.add(&before, &music)?;
-                self.transformed(g, h, inputs.mask)?
+                let before = g.concat_frames(&[global, &tokens])?;
+                let before = g.crop_frames(&before, music)?;
+                let h = g.add(&before, music)?;
+                self.transformed(g, h, mask)?
             }
         };
         let h = self.norm.forward(g, &h)?;
         self.out.forward(g, &h)
+    }
+
+    /// Returns what the positions of windows hear, m and g of [`Planner::forward`].
+    ///
+    /// # Shapes
+    /// See [`PlannerInputs`].
+    pub fn conditions<G: Graph>(
+        &self,
+        g: &mut G,
+        audio: &G::Tensor,
+        drop_audio: Option<&G::Tensor>,
+        style: Option<&G::Tensor>,
+        mask: Option<&G::Tensor>,
+    ) -> Result<PlanConditions<G::Tensor>> {
+        let mut music = self.music.forward(g, audio)?;
+        if let Some(drop_audio) = drop_audio {
+            let null = g.parameter(self.null_music)?;
+            music = g.select(drop_audio, &null, &music)?;
+        }
+        let mean = g.mean_frames(&music, mask)?;
+        let mut global = self.global.forward(g, &mean)?;
+        if let (Some(layer), Some(style)) = (&self.style, style) {
+            let style = layer.forward(g, style)?;
+            global = g.add(&global, &style)?;
+        }
+        Ok(PlanConditions { local: music, global })
     }
 
     fn transformed<G: Graph>(

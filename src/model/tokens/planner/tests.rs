@@ -47,3 +47,41 @@ fn a_network_without_a_style_has_no_place_for_one() {
     assert_eq!(with.len(), without.len() + 2);
     assert_eq!(names(0), without);
 }
+
+/// Returns the operations of planning windows of N tokens position by position, and those of asking the whole network
+/// for each token.
+fn flops_of_a_plan(n_tokens: usize) -> [u64; 2] {
+    let config = config(PlannerKind::Autoregressive, 4, 0);
+    let (planner, list) = Planner::new(&config);
+    let (batch, frames) = (2, 4 * n_tokens - 1);
+    let mut whole = Outline::new(&list);
+    let tokens = whole.input(&[batch, n_tokens]);
+    let audio = whole.input(&[batch, frames, config.condition().dim()]);
+    let inputs =
+        PlannerInputs { tokens: &tokens, audio: &audio, drop_audio: None, style: None, mask: None };
+    planner.forward(&mut whole, &inputs).expect("shapes fit");
+    let mut steps = Outline::new(&list);
+    let conditions = planner.conditions(&mut steps, &audio, None, None, None).expect("shapes fit");
+    let mut past: Option<Vec<KeysAndValues<Vec<usize>>>> = None;
+    for n in 1..=n_tokens {
+        let tokens = steps.input(&[batch, n]);
+        let inputs =
+            PlannerStepInputs { tokens: &tokens, conditions: &conditions, past: past.as_deref() };
+        let step = planner.step(&mut steps, &inputs).expect("shapes fit");
+        assert_eq!(step.logits, [batch, 1, 32], "one position is evaluated for token {n}");
+        assert!(step.present.iter().all(|known| known.keys == [batch, n, 48]));
+        past = Some(step.present);
+    }
+    [steps.flops(), n_tokens as u64 * whole.flops()]
+}
+
+#[test]
+fn twice_as_many_tokens_take_twice_the_operations() {
+    let [[once, asked_once], [twice, asked_twice]] = [15, 30].map(flops_of_a_plan);
+    // What grows with the square, attention, is a small part.
+    let ratio = twice as f64 / once as f64;
+    assert!((2.0..2.1).contains(&ratio), "{once} and {twice}: {ratio}");
+    let ratio = asked_twice as f64 / asked_once as f64;
+    assert!((4.0..4.2).contains(&ratio), "without what is kept: {ratio}");
+    assert!(asked_twice > 20 * twice, "{twice} instead of {asked_twice}");
+}

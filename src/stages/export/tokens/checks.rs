@@ -1,6 +1,8 @@
 //! The files of a model of tokens, held against the interpreter that trained its networks.
 
-use anyhow::Context as _;
+use std::time::Instant;
+
+use anyhow::{Context as _, ensure};
 use bytes::Bytes;
 
 use crate::audio::FEATURE_DIM;
@@ -9,8 +11,8 @@ use crate::generation::{ModelFileName, TokensCard, tokens_parameters};
 use crate::model::{Graph as _, Planner, PlannerInputs, Tokenizer, condition_scale};
 use crate::motion::{CLOCK_DIM, MOTION_DIM};
 use crate::onnx::{
-    Device, Model, NamedTensor, Numbers, PlannerNames, Runtime, Session, SessionOptions,
-    SignalDenoiserNames, SignalNames, TokenEncoderNames,
+    Device, Model, NamedTensor, Numbers, PlannerMusicNames, PlannerNames, PlannerStepNames,
+    Runtime, Session, SessionOptions, SignalDenoiserNames, SignalNames, TokenEncoderNames,
 };
 use crate::stages::export::Params;
 use crate::stages::export::checks::{
@@ -59,8 +61,8 @@ pub fn checks(
             .with_context(|| format!("while writing {}", path.display()))?;
         sessions.push(Session::open(runtime, &path, options)?);
     }
-    let [encoder, signal, denoiser, planner] = &mut sessions[..] else {
-        unreachable!("four files are written")
+    let [encoder, signal, denoiser, planner, of_steps @ ..] = &mut sessions[..] else {
+        unreachable!("four files are written at least")
     };
     let read = |name: ModelFileName| -> anyhow::Result<(Model, String)> {
         let found = files.iter().find(|(known, _)| *known == name);
@@ -107,6 +109,15 @@ pub fn checks(
         let (wanted, eager_s) = timed(|| given.plan(&networks, card))?;
         let apart = difference(&found.1, wanted.data());
         rows.push((case, "planner", apart, FORWARD_TOLERANCE, onnx_s, eager_s));
+
+        if let [music, step] = of_steps {
+            // Position by position with what is kept, against the whole network at once.
+            let started = Instant::now();
+            let found = given.steps(card, music, step)?;
+            let onnx_s = started.elapsed().as_secs_f64();
+            let apart = difference(&found, wanted.data());
+            rows.push((case, "planner_step", apart, FORWARD_TOLERANCE, onnx_s, eager_s));
+        }
     }
     let build = runtime.build();
     let row = |(case, name, apart, tolerance, onnx_s, eager_s): CheckRow| OnnxCheckRow {
@@ -225,6 +236,48 @@ impl CheckInputs {
             inputs.push(floats(PlannerNames::CLOCK, &self.frames(CLOCK_DIM), &self.clock));
         }
         inputs
+    }
+
+    /// Returns the logits of all positions, found one after the other but for the first few, which come together.
+    fn steps(
+        &self,
+        card: &TokensCard,
+        music: &mut Session,
+        step: &mut Session,
+    ) -> anyhow::Result<Vec<f32>> {
+        type Step = PlannerStepNames;
+        let (n, codes) = (self.case.n_windows, card.planner.codes);
+        // The music alone: the first input of the whole planner is its tokens.
+        let heard = self.of_planner().split_off(1);
+        let names = [PlannerMusicNames::LOCAL, PlannerMusicNames::GLOBAL];
+        let [local, global] = music.run_for(&heard, names)?;
+        let mut past = (vec![n, 0, card.planner.cache_dim()], Vec::new());
+        let mut logits = vec![0.0; n * self.n_tokens * codes];
+        let first = (self.n_tokens / 3).max(1);
+        for n_seen in first..=self.n_tokens {
+            let windows = self.tokens.chunks_exact(self.n_tokens);
+            let seen: Vec<usize> = windows.flat_map(|window| &window[..n_seen]).copied().collect();
+            let n_new = n_seen - past.0[1];
+            let given = [
+                whole(Step::TOKENS, &[n, n_seen], &seen),
+                floats(Step::LOCAL, &local.0, &local.1),
+                floats(Step::GLOBAL, &global.0, &global.1),
+                floats(Step::PAST, &past.0, &past.1),
+            ];
+            let [found, present] = step.run_for(&given, [Step::LOGITS, Step::PRESENT])?;
+            ensure!(
+                found.0 == [n, n_new, codes],
+                "planner_step.onnx returns logits of the shape {:?}, expected {:?}",
+                found.0,
+                [n, n_new, codes]
+            );
+            let windows = logits.chunks_exact_mut(self.n_tokens * codes);
+            for (window, found) in windows.zip(found.1.chunks_exact(n_new * codes)) {
+                window[(n_seen - n_new) * codes..][..found.len()].copy_from_slice(found);
+            }
+            past = present;
+        }
+        Ok(logits)
     }
 
     fn plan(&self, networks: &Networks, card: &TokensCard) -> anyhow::Result<Tensor<f32>> {

@@ -1,0 +1,75 @@
+//! What motion by tokens needs of whatever runs the networks: the interpreter that trains them, or onnxruntime.
+
+use ndarray::{Array3, ArrayView2, ArrayView3};
+
+use crate::generation::engine::EngineError;
+use crate::motion::style::STYLE_DIM;
+
+/// Runs the networks of a tokenizer; calls may come from several threads.
+pub trait TokenizerNetworks: Sync {
+    /// Returns the name that flags and tables use.
+    fn name(&self) -> &'static str;
+
+    /// Returns how many calls run at once.
+    fn n_workers(&self) -> usize;
+
+    /// Returns the tokens of windows, one window after the other.
+    ///
+    /// `motion`: normalised, \[n, T, 25\]
+    ///
+    /// # Errors
+    /// What the runtime says.
+    fn encode(&self, motion: ArrayView3<f32>) -> Result<Vec<u32>, EngineError>;
+
+    /// Returns the signal of the tokens of n windows of so many frames, \[n, frames, d\].
+    ///
+    /// # Errors
+    /// A token that the codebook does not have, and what the runtime says.
+    fn signal(&self, tokens: &[u32], windows: (usize, usize)) -> Result<Array3<f32>, EngineError>;
+
+    /// Estimates clean motion of step t, normalised, \[n, T, 25\].
+    ///
+    /// # Errors
+    /// Shapes that do not fit, and what the runtime says.
+    fn denoise(
+        &self,
+        x: ArrayView3<f32>,
+        t: usize,
+        signal: ArrayView3<f32>,
+    ) -> Result<Array3<f32>, EngineError>;
+}
+
+/// What a planner is told of a window before it is asked for tokens.
+#[derive(Clone, Copy, Debug)]
+pub struct PlanWindow<'a> {
+    /// Features as the table has them, then the clock of a network that hears it, \[T, condition_dim\].
+    pub condition: ArrayView2<'a, f32>,
+    /// Normalised style, for a network that takes one.
+    pub style: Option<[f32; STYLE_DIM]>,
+    /// For each answer that is wanted, whether the music is withheld.
+    pub without_music: &'a [bool],
+}
+
+/// Runs a planner; calls may come from several threads.
+pub trait PlannerNetworks: Sync {
+    /// Returns the name that flags and tables use.
+    fn name(&self) -> &'static str;
+
+    /// Begins a plan: what the window hears is computed once.
+    ///
+    /// # Errors
+    /// Shapes that do not fit, and what the runtime says.
+    fn begin<'a>(&'a self, window: &PlanWindow) -> Result<Box<dyn WindowPlan + 'a>, EngineError>;
+}
+
+/// The plan of a window that has begun.
+pub trait WindowPlan {
+    /// Returns ln p of each token up to a constant, answer after answer.
+    ///
+    /// Of the masked kind those of every position, \[answers · N · K\]. Of the autoregressive kind those of the position
+    /// behind the tokens, \[answers · K\]; from one call to the next tokens only come to those before.
+    ///
+    /// # Errors
+    /// A token that does not exist, and what the runtime says.
+    fn logits(&mut self, tokens: &[u32]) -> Result<Vec<f32>, EngineError>;
+}
