@@ -49,7 +49,7 @@ class Torch:
         self.is_causal = kind == "autoregressive"
         width, conv_width, depth, codes, blocks = TOKENIZERS[preset]
         sizes = tokens.TokensConfig(width, conv_width, depth, codes, RHO, blocks)
-        self.tokenizer = tokens.Tokenizer(sizes).eval()
+        self.tokenizer = tokens.Tokenizer(sizes).eval().float()
         width, heads, layers, conv_width, depth = PLANNERS[preset, self.is_causal]
         config = planner.PlannerConfig(
             self.is_causal, codes, RHO, width, heads, 4, layers, conv_width, depth, CONDITION

@@ -1,9 +1,11 @@
 //! What runs a model of tokens, and its frames as they come.
 
 use std::path::Path;
+use std::process::Command;
 
 use motiongen::motion::npy::read_f32;
 
+use crate::onnx::python;
 use crate::planner::{AUTOREGRESSIVE, MASKED, export, generate, song, store_with_tokenizer};
 use crate::support::{Dir, finish, motiongen};
 use crate::tokens::train;
@@ -39,6 +41,36 @@ fn frames_are_streamed_as_they_are_planned_and_are_those_of_the_file() {
             assert_eq!(found, Some(cell), "{name}");
         }
     }
+    // Of shorter windows there are more, and other motion; the stream is still the file.
+    let stream = ["--stream", &csv.display().to_string(), "--window=12", "--overlap=4"];
+    let short: Vec<&str> = [&flags[..], &stream].concat();
+    let mut command = motiongen();
+    command.arg("generate").arg("--model").arg(store.join("models/next")).arg("--quiet");
+    command.arg("--audio").arg(&audio).arg("--output").arg(&out).args(short);
+    let output = finish(&mut command);
+    assert_eq!(output.code, 0, "{output:?}");
+    assert_eq!(text(&csv), text(&out.join("song.csv")));
+    assert_ne!(text(&csv), lines);
+    for (window, overlap) in [("25", "9"), ("48", "9"), ("8", "9"), ("10", "4")] {
+        let flags = [&format!("--window={window}"), &format!("--overlap={overlap}")];
+        let mut command = motiongen();
+        command.arg("generate").arg("--model").arg(store.join("models/next")).arg("--quiet");
+        command.arg("--audio").arg(&audio).arg("--output").arg(&out).args(flags);
+        let output = finish(&mut command);
+        assert_eq!(output.code, 2, "{output:?}");
+        let expected = format!(
+            "--window {window} does not do for model next: give a multiple of the 4 frames of a token, up to the 24 of \
+             training and more than the {overlap} of --overlap"
+        );
+        assert!(output.stderr.contains(&expected), "{output:?}");
+    }
+    let mut command = motiongen();
+    command.args(["generate", "--window=60", "--quiet", "--audio"]).arg(&audio);
+    let output = finish(command.arg("--output").arg(&out));
+    assert_eq!(output.code, 2, "{output:?}");
+    let expected = "is a model of the family unet, whose windows are as long as in training; leave it out, or name a \
+                    model of the family tokens";
+    assert!(output.stderr.contains(expected), "{output:?}");
     // Without a stream the same file.
     let unstreamed = dir.at("unstreamed");
     assert_eq!(generate(&store, "next", &audio, &unstreamed, &flags).code, 0);
@@ -120,4 +152,30 @@ fn onnxruntime_makes_the_motion_of_the_interpreter_and_models_are_told_of() {
     let expected = "there is no model in the folder nowhere; name the folder of a model (STORE/models/NAME), or give \
                     --store beside its name";
     assert!(output.stderr.contains(expected), "{output:?}");
+}
+
+#[test]
+fn the_documented_python_plans_what_the_whole_planner_says() {
+    let dir = Dir::new();
+    let store = store_with_tokenizer(&dir);
+    assert_eq!(train(&store, "next", &AUTOREGRESSIVE).code, 0);
+    assert_eq!(export(&store, "next", "plan").code, 0);
+    let text = include_str!("../docs/onnx.md");
+    let blocks = text.split("```python\n").skip(1).map(|rest| rest.split("```").next());
+    let block = blocks.flatten().find(|block| block.contains("planner_")).expect("a block");
+    let code = format!(
+        "import json, numpy as np, onnx, onnxruntime as ort\nrng = np.random.default_rng(1)\n\
+         audio, clock = (rng.standard_normal((1, 23, n), dtype=np.float32) for n in (163, 10))\n{block}\n\
+         assert len(tokens) == 6 and past.shape[1] == 6, (tokens, past.shape)\n\
+         for name in ('planner', 'planner_music', 'planner_step'):\n    \
+         onnx.checker.check_model(f'models/plan/{{name}}.onnx', full_check=True)\n\
+         whole = ort.InferenceSession('models/plan/planner.onnx')\n\
+         given = {{'tokens': np.array([tokens]), 'audio': audio, 'clock': clock}}\n\
+         said = whole.run(None, given)[0]\n\
+         assert abs(said[0, -1] - logits[0, -1]).max() < 1e-4, (said[0, -1], logits)\n\
+         assert said[0].argmax(-1).tolist() == tokens, (said[0].argmax(-1), tokens)\n"
+    );
+    let output = Command::new(python()).current_dir(&store).arg("-c").arg(code).output();
+    let output = output.expect("Python");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
 }

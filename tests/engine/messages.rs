@@ -125,6 +125,14 @@ fn shape_errors_name_the_operation_and_both_sizes() {
             "crop_frames: input has 4 frames, 5 asked for",
         ),
         (
+            said(&|g, _| g.frames_behind(&zeros(g, &[1, 4, 2]), &zeros(g, &[1, 4, 3]))),
+            "frames_behind: input has 4 frames, those behind 4 asked for",
+        ),
+        (
+            said(&|g, _| g.rotary(&zeros(g, &[1, 2, 6]), 3, Some(&zeros(g, &[1, 2])))),
+            "rotary: the past has shape [1, 2], expected [batch, frames, channels]",
+        ),
+        (
             said(&|g, _| g.frame_mask(&zeros(g, &[2, 4, 3]), Some(&zeros(g, &[2, 5])), 4)),
             "frame_mask: mask has shape [2, 5], input expects [2, 4]",
         ),

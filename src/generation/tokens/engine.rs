@@ -55,6 +55,11 @@ impl TokenEngine {
         Self { config, networks, normalizer, window_frames }
     }
 
+    /// Cuts motion into windows of so many frames instead.
+    pub fn with_window(self, window_frames: usize) -> Self {
+        Self { window_frames, ..self }
+    }
+
     /// Returns the name that flags and tables use of what runs the networks.
     pub fn name(&self) -> &'static str {
         self.networks.name()

@@ -68,6 +68,14 @@ impl Stage for Generate {
             None => None,
         };
         let files = open_model(&params, store.as_ref())?;
+        if let Some(n) = params.window.filter(|_| files.family() != Family::Tokens) {
+            bail!(
+                "--window {n}: {} is a model of the family {}, whose windows are as long as in training; leave it \
+                 out, or name a model of the family tokens",
+                files.place(),
+                files.family().name()
+            );
+        }
         if files.family() == Family::Group {
             return group::run(&params, store.as_ref(), files, progress);
         }

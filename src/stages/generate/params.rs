@@ -178,6 +178,10 @@ pub struct Params {
     #[arg(long, value_name = "N", default_value_t = OVERLAP_FRAMES, help_heading = "Sampling",
           hide_short_help = RARE)]
     pub overlap: usize,
+    /// Frames of a window of a long track, for a model of the family tokens; of a short one the first frames come
+    /// sooner [default: the model's, which is the most]
+    #[arg(long, value_name = "N", help_heading = "Tokens", hide_short_help = RARE)]
+    pub window: Option<usize>,
     /// Iterations in which a model of the family tokens plans a window; of one that plans token by token no matter.
     #[arg(long, value_name = "N", default_value_t = TokenSampling::default().n_iterations,
           help_heading = "Tokens", hide_short_help = RARE)]

@@ -3,7 +3,7 @@
 use std::num::NonZeroUsize;
 use std::time::Instant;
 
-use anyhow::bail;
+use anyhow::{bail, ensure};
 use ndarray::{Array2, ArrayView2, Axis, concatenate};
 use serde::{Deserialize, Serialize};
 
@@ -46,6 +46,9 @@ struct TokensSettings {
     guidance: f64,
     /// Style in the model's units.
     style: Option<[f32; STYLE_DIM]>,
+    /// Frames of a window, where it is shorter than the model's.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    window_frames: Option<usize>,
     /// Tokens that neighbouring windows share.
     overlap_tokens: usize,
     postprocess: PostProcessConfig,
@@ -83,6 +86,16 @@ impl TokensSettings {
         // Unless steps are asked for, motion is made as in the paper.
         let sampler = if params.steps.is_none() { SamplerConfig::fast27() } else { sampler };
         sampler.check(Schedule::new(&card.diffusion)?.len())?;
+        let rho = card.tokens.frames_per_token;
+        if let Some(n) = params.window {
+            let most = card.window_frames;
+            ensure!(
+                n > overlap_frames && n > rho && n <= most && n.is_multiple_of(rho),
+                "--window {n} does not do for model {}: give a multiple of the {rho} frames of a token, up to the {most} \
+                 of training and more than the {overlap_frames} of --overlap",
+                card.name
+            );
+        }
         let plan = TokenSampling {
             n_iterations: params.plan_iterations,
             temperature: params.plan_temperature,
@@ -100,8 +113,9 @@ impl TokensSettings {
                 (&card.name, card.planner.style_dim > 0),
                 &card.normalizer,
             )?,
+            window_frames: params.window.filter(|&n| n < card.window_frames),
             // A window goes on from one token at least.
-            overlap_tokens: (overlap_frames / card.tokens.frames_per_token).max(1),
+            overlap_tokens: (overlap_frames / rho).max(1),
             postprocess: params.postprocess.config((card.motion_range, card.fusion_variances()))?,
             constraints: constraints.map(|asked| digest(format!("{asked:?}").as_bytes())),
             constraint_strength: params.checked_constraint_strength()?,
@@ -144,6 +158,10 @@ pub fn run(
     if let Some(note) = note {
         progress.note(&note);
     }
+    let tokens = match settings.window_frames {
+        Some(window_frames) => tokens.with_window(window_frames),
+        None => tokens,
+    };
     let schedule = Schedule::new(&card.diffusion)?;
     let maker = TokensMaker {
         generator: TokenGenerator {
