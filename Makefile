@@ -174,6 +174,11 @@ bench-store: build/bench-venv/ready ## measure a store of a million phrases, and
 	$(CARGO) build --locked --profile $(BENCH_PROFILE) --bin motiongen
 	build/bench-venv/bin/python benches/store.py --bin $(BENCH_BIN)/motiongen $(BENCH_ARGS)
 
+.PHONY: bench-scale
+bench-scale: build/bench-venv/ready ## measure what planning costs on stores of millions of songs that nobody has [BENCH_ARGS]
+	$(CARGO) build --locked --profile $(BENCH_PROFILE) --bin motiongen --example synthetic-store
+	build/bench-venv/bin/python benches/scale.py --bin $(BENCH_BIN) $(BENCH_ARGS)
+
 .PHONY: bench-room
 bench-room: ## build the room autodiff alone, from nothing
 	$(PYTHON) benches/room.py
