@@ -5,7 +5,9 @@
 //! frames before it; here positions are channels of their own, and the gradient of (p_t − p*_t)² moves one frame and
 //! makes it a spike. L_ctrl therefore has terms for the size and the jerk of what is moved, and velocities and
 //! accelerations go along ([`crate::motion::correction`]). Since it is quadratic, a step goes along H⁻¹ ∇L instead of ∇L,
-//! with which one step of length 1 is at its least.
+//! with which one step of length 1 is at its least; poses are met there exactly.
+
+use std::f64::consts::TAU;
 
 use ndarray::Array2;
 
@@ -16,7 +18,8 @@ use crate::motion::{Channel, MOTION_DIM};
 
 /// Moves frames a share of the way to where constraints are met: x̂0 ← x̂0 − η H⁻¹ ∇L_ctrl(x̂0).
 ///
-/// The first `n_pinned` frames stay where they are, but for what is asked of themselves.
+/// The first `n_pinned` frames stay where they are, but for what is asked of themselves. Of a whole motion the last step of
+/// its making: share 1, nothing pinned.
 ///
 /// # Shapes
 /// `frames`: \[T, 25\] in the world, of which the first is frame `first` of the track
@@ -66,7 +69,7 @@ pub fn steer(
 /// Turns frames to the orientations that are asked for, and their angular velocities with them.
 fn turn(asked: &[(usize, WantedValue)], frames: &mut Array2<f32>, n_pinned: usize, share: f64) {
     let n = frames.nrows();
-    let missing: Vec<(usize, [f64; 3])> = asked
+    let mut missing: Vec<(usize, [f64; 3])> = asked
         .iter()
         .filter_map(|&(t, wanted)| match wanted {
             WantedValue::Orientation(q) => {
@@ -75,6 +78,7 @@ fn turn(asked: &[(usize, WantedValue)], frames: &mut Array2<f32>, n_pinned: usiz
             WantedValue::Value { .. } => None,
         })
         .collect();
+    continue_turns(&mut missing);
     let turns: Option<Vec<Vec<f64>>> = (0..3)
         .map(|axis| {
             let of_axis = missing.iter();
@@ -98,6 +102,26 @@ fn turn(asked: &[(usize, WantedValue)], frames: &mut Array2<f32>, n_pinned: usiz
     }
     for (column, turns) in Channel::AngularVelocity.range().zip(&turns) {
         move_column(frames, column, &rates(turns), share);
+    }
+}
+
+/// Takes of each turn the one of the two, this way or the other way round, that is nearer to the turn before: between two
+/// of nearly half a turn a body is not turned all the way back.
+fn continue_turns(turns: &mut [(usize, [f64; 3])]) {
+    let mut before: Option<[f64; 3]> = None;
+    for (_, turn) in turns {
+        let angle = turn.iter().map(|x| x * x).sum::<f64>().sqrt();
+        if let Some(before) = before
+            && angle > 0.0
+        {
+            let other = turn.map(|x| x * (1.0 - TAU / angle));
+            let apart =
+                |v: [f64; 3]| -> f64 { v.iter().zip(before).map(|(a, b)| (a - b) * (a - b)).sum() };
+            if apart(other) < apart(*turn) {
+                *turn = other;
+            }
+        }
+        before = Some(*turn);
     }
 }
 
@@ -151,12 +175,13 @@ mod tests {
         let mut moved = before.clone();
         steer(&asked, &mut moved, 200, 3, 1.0);
         for miss in asked.errors_from(moved.view(), 200) {
-            assert!(miss.error < 2e-4, "{miss:?}");
+            // f32 of some metres; of angles what its cosine keeps.
+            assert!(miss.error < 1e-6, "{miss:?}");
         }
         for t in 0..3 {
             for channel in 0..3 {
                 let apart = (moved[[t, channel]] - before[[t, channel]]).abs();
-                assert!(apart < 2e-4, "frame {t}: {apart}");
+                assert!(apart < 1e-6, "frame {t}: {apart}");
             }
         }
         let mut half = before.clone();
@@ -165,6 +190,29 @@ mod tests {
         let mut none = before.clone();
         steer(&asked, &mut none, 0, 3, 1.0);
         assert_eq!(none, before, "nothing is asked of these frames");
+    }
+
+    #[test]
+    fn a_body_is_not_turned_back_and_forth_between_turns_of_nearly_half() {
+        let mut before = walk(121);
+        for mut row in before.rows_mut() {
+            for (i, x) in Channel::Quaternion.range().zip([1.0, 0.0, 0.0, 0.0]) {
+                row[i] = x;
+            }
+        }
+        // 179° and 181°, which is −179°.
+        let asked = constraints(vec![
+            (40, WantedValue::Orientation(facing(179.0_f64.to_radians()))),
+            (60, WantedValue::Orientation(facing(181.0_f64.to_radians()))),
+        ]);
+        let mut moved = before;
+        steer(&asked, &mut moved, 0, 0, 1.0);
+        for t in 40..=60 {
+            let q = orientation(moved.view(), t);
+            let apart = rotation_vector(facing(std::f64::consts::PI), q);
+            let apart = apart.iter().map(|x| x * x).sum::<f64>().sqrt().to_degrees();
+            assert!(apart < 25.0, "frame {t}: {apart}° from half a turn");
+        }
     }
 
     #[test]

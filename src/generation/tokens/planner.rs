@@ -103,12 +103,13 @@ impl PlannerEngine {
         let stream = |draw: usize| Stream::new(request.seed, first + draw as u64);
         // With two conditions the pairs {both, constraints alone} and {both, music alone} take turns by chance, each as
         // often (paper, eq. 10 and 11); with one there is one pair.
+        let is_constrained = request.constraints.is_some() && self.config.constraint_dim > 0;
         let mut n_asked = 0;
         let mut withheld = || {
             let mut number = [0.0_f64];
             stream(PAIRS + n_asked).uniform(0, &mut number);
             n_asked += 1;
-            match request.constraints.is_some() && number[0] >= 0.5 {
+            match is_constrained && number[0] >= 0.5 {
                 true => Withheld::Constraints,
                 false => Withheld::Music,
             }
@@ -117,8 +118,7 @@ impl PlannerEngine {
             PlannerKind::Masked => {
                 let mut given: Vec<Option<u32>> = request.given.iter().copied().map(Some).collect();
                 given.resize(n, None);
-                let logits =
-                    |tokens: &[u32]| self.logits(tokens, &condition, request, withheld());
+                let logits = |tokens: &[u32]| self.logits(tokens, &condition, request, withheld());
                 let uniform = |draw: usize, numbers: &mut [f64]| stream(draw).uniform(0, numbers);
                 sample_masked(sampling, &given, codes, logits, uniform)
             }
