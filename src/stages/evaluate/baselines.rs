@@ -163,6 +163,7 @@ fn of_columns(row: &GenerationRow, card: &ModelCard) -> anyhow::Result<MotionSet
         no_clock: false,
         decoder_derives: card.decoder.fusion.is_some(),
         phase_given: false,
+        uncontrolled: false,
     })
 }
 
