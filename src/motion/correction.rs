@@ -14,7 +14,7 @@
 use super::banded::{Equation, SPAN, Solution};
 use crate::units::FPS;
 
-/// L: of the correction at one frame a third is left ten frames on, and a thirtieth thirty.
+/// L: of the correction of one frame 0.78 are left ten frames on, 0.35 twenty, and 0.03 thirty.
 const REACH_FRAMES: f64 = 10.0;
 /// ε² of velocities and accelerations: 1 mm/s, 1 cm/s².
 const VARIANCES: [f64; 2] = [1e-6, 1e-4];

@@ -111,6 +111,7 @@ impl RunSettings {
         settings.best_of = 1;
         settings.prime = None;
         settings.constraints = None;
+        settings.uncontrolled = false;
         let check = || -> anyhow::Result<()> {
             settings.sampler.check(Schedule::new(&card.diffusion)?.len())?;
             settings.postprocess.check()?;
