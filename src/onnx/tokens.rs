@@ -196,6 +196,8 @@ pub fn planner(
         );
         let meaning = "1 for windows that go without constraints, 0 where left out";
         let drop = g.optional_input(PlannerNames::DROP_CONSTRAINTS, Axes::Batch, 0, meaning);
+        // It may be given where drop_audio is left out: onnxruntime takes axes of one name to be of one size.
+        g.name_axis(0, "batch or 1 of constraints");
         (constraints, drop)
     });
     let features = g.standardized(audio, &scale.centre, &scale.scale)?;
