@@ -11,7 +11,7 @@ mod weights;
 
 pub use asked::Control;
 pub use card::{TokensCard, TokensNetworks, TokensProvenance};
-pub use control::steer;
+pub use control::{Steering, steer};
 pub use engine::TokenEngine;
 pub use planner::{PlanRequest, PlannerEngine};
 pub use track::{TokenGenerator, TokenTrack};

@@ -11,7 +11,7 @@ use std::ops::Range;
 use ndarray::{Array2, Array3, ArrayView2, Axis, s};
 
 use super::asked::{Control, asked_of_window};
-use super::control::steer;
+use super::control::{Steering, steer};
 use super::engine::TokenEngine;
 use super::planner::{PlanRequest, PlannerEngine};
 use crate::autodiff::Stream;
@@ -188,7 +188,8 @@ impl TokenGenerator<'_> {
             if let Some(WeightedConstraints { constraints, strength }) = steered {
                 let n_pinned = PINNED_FRAMES[usize::from(before.is_some())];
                 place.restore(&mut motion);
-                steer(constraints, &mut motion, frames.start, n_pinned, strength);
+                let steering = Steering::Estimate { n_pinned, share: strength };
+                steer(constraints, &mut motion, frames.start, steering);
                 place.remove(&mut motion);
             }
             set_phase(&mut motion, track.phase, frames.start);

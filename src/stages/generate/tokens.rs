@@ -19,10 +19,10 @@ use super::{make_all, name_of_model, weights_digest_of_tokens};
 use crate::diffusion::{SamplerConfig, Schedule, TokenSampling};
 use crate::evaluation::{derivative_error, score};
 use crate::generation::{
-    Control, FamilyCard as _, PlannerEngine, TokenEngine, TokenGenerator, TokenTrack, TokensCard,
-    WeightedConstraints, steer, tokens_parameters,
+    Control, FamilyCard as _, PlannerEngine, Steering, TokenEngine, TokenGenerator, TokenTrack,
+    TokensCard, WeightedConstraints, steer, tokens_parameters,
 };
-use crate::motion::postprocess::{PostProcessConfig, process, process_holding};
+use crate::motion::postprocess::{HeldPoses, PostProcessConfig, process, process_holding};
 use crate::motion::style::STYLE_DIM;
 use crate::motion::{Channel, MOTION_DIM};
 use crate::onnx::Model;
@@ -267,7 +267,6 @@ impl TokensMaker<'_> {
         let control = self.settings.control.unwrap_or(Control::None);
         let is_kept = control.decodes() && !self.settings.soft;
         let kept = constraints.as_ref().filter(|_| is_kept);
-        let held = kept.map(|constraints| constraints.held(n_frames)).unwrap_or_default();
         let seed = seed_of(self.seed, music.phrase_id, sample, 0);
         let track = TokenTrack {
             condition: heard.condition.view(),
@@ -287,18 +286,14 @@ impl TokensMaker<'_> {
         };
         self.generator.run(&track, emit).map_err(|stop| stop.of(music.source))?;
         let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
-        let mut decoded =
+        let decoded =
             concatenate(Axis(0), &views).unwrap_or_else(|_| Array2::zeros((0, MOTION_DIM)));
-        if let Some(constraints) = kept {
-            // What blending of windows has moved.
-            steer(constraints, &mut decoded, 0, 0, 1.0);
-        }
         let mut frames = decoded.clone();
         let postprocess = &self.settings.postprocess;
-        let displacement = process_holding(postprocess, &mut frames, bars, &held);
+        let displacement = process_holding(postprocess, &mut frames, bars, &HeldPoses::default());
         if let Some(constraints) = kept {
-            // Smoothing and limits have moved it, by millimetres; what follows from poses follows again.
-            steer(constraints, &mut frames, 0, 0, 1.0);
+            // Only now is it smooth, and what is missing yet too; what follows from poses follows again.
+            steer(constraints, &mut frames, 0, Steering::Finish);
             process(&postprocess.without_smoothing(), &mut frames, bars);
         }
         let seconds = started.elapsed().as_secs_f64();
