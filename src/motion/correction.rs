@@ -17,17 +17,19 @@
 use super::banded::{Equation, SPAN, Solution};
 use crate::units::FPS;
 
-/// L: of the correction of one frame 0.78 are left ten frames on, 0.35 twenty, and 0.03 thirty.
-const REACH_FRAMES: f64 = 10.0;
-/// ε² of positions (and of angles in rad) that are to be near, of velocities and accelerations: 1 cm, 1 mm/s, 1 cm/s².
-const VARIANCES: [f64; 3] = [1e-4, 1e-6, 1e-4];
+/// L: of the correction of one frame 0.94 are left ten frames on, 0.57 thirty, and nothing sixty. Half as far a body that
+/// has metres to go was faster than any in training, and where its speed is held the jerk of motion rose by half.
+const REACH_FRAMES: f64 = 20.0;
+/// ε² of positions (and of angles in rad) that are to be near, of velocities and accelerations: 1 mm, 1 mm/s, 1 cm/s². With
+/// L this lets what is missing through up to 2.4 Hz, where (2π f / FPS)⁶ = 1 / (ε² L⁶).
+const VARIANCES: [f64; 3] = [1e-6, 1e-6, 1e-4];
 /// Third differences hold four neighbours.
 const BANDWIDTH: usize = 3;
 
 /// How near a correction brings positions to what is asked.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Closeness {
-    /// By about a centimetre, smoothly.
+    /// As near as is smooth.
     Near,
     /// Exactly.
     Exact,
@@ -128,11 +130,11 @@ mod tests {
         assert_eq!(u[120], 0.5);
         // Half a metre on one frame alone would be 15 m/s and 900 m/s².
         let (v, a) = (rates(&u), rates(&rates(&u)));
-        assert!(largest(&v) < 0.7 && largest(&a) < 2.3, "{} {}", largest(&v), largest(&a));
-        assert!(u[..75].iter().all(|x| x.abs() < 0.05), "{u:?}");
-        assert!(u[0].abs() < 1e-3 && u[240].abs() < 1e-3, "{} {}", u[0], u[240]);
+        assert!(largest(&v) < 0.35 && largest(&a) < 0.6, "{} {}", largest(&v), largest(&a));
+        assert!(u[..60].iter().all(|x| x.abs() < 0.08), "{u:?}");
+        assert!(u[0].abs() < 0.08 && u[240].abs() < 0.08, "{} {}", u[0], u[240]);
         for t in 0..120 {
-            assert!((u[120 - t] - u[120 + t]).abs() < 1e-9, "it is the same on either side");
+            assert!((u[120 - t] - u[120 + t]).abs() < 1e-6, "it is the same on either side");
         }
     }
 
@@ -158,9 +160,9 @@ mod tests {
         let missing: Vec<_> = (4..120).step_by(2).map(|t| at(t, 0, 0.5 + noise(t))).collect();
         let (near, met) = (smoothest(120, 3, &missing, Closeness::Near), exact(120, &missing));
         assert_eq!(near[..3], [0.0; 3]);
-        assert!(near[20..118].iter().all(|u| (u - 0.5).abs() < 0.02), "{near:?}");
+        assert!(near[20..118].iter().all(|u| (u - 0.5).abs() < 0.03), "{near:?}");
         let largest = |x: &[f64]| x.iter().fold(0.0_f64, |a, b| a.max(b.abs()));
-        let rate = |u: &[f64]| largest(&rates(&u[40..110]));
+        let rate = |u: &[f64]| largest(&rates(&u[45..110]));
         assert!(5.0 * rate(&near) < rate(&met), "{} {}", rate(&near), rate(&met));
         // What is asked of a pinned frame itself moves it.
         let moved = smoothest(60, 3, &[at(1, 0, 0.2)], Closeness::Near);
@@ -177,7 +179,7 @@ mod tests {
             let jerk: f64 =
                 u.windows(4).map(|w| (w[3] - 3.0 * w[2] + 3.0 * w[1] - w[0]).powi(2)).sum();
             let rate = FPS * (u[21] - u[20]) - 0.5;
-            u.iter().map(|x| x * x).sum::<f64>() + 1e6 * jerk + 1e6 * rate * rate
+            u.iter().map(|x| x * x).sum::<f64>() + 6.4e7 * jerk + 1e6 * rate * rate
         };
         let least = sum(&u);
         for t in (0..n).filter(|t| ![3, 11, 12].contains(t)) {
