@@ -5,9 +5,9 @@
 //! frames before it; here positions are channels of their own, and the gradient of (p_t − p*_t)² moves one frame and
 //! makes it a spike. L_ctrl therefore has terms for the size and the jerk of what is moved, and velocities and
 //! accelerations go along ([`crate::motion::correction`]). Since it is quadratic, a step goes along H⁻¹ ∇L instead of ∇L,
-//! with which one step of length 1 is at its least. There poses are met as nearly as is smooth: the estimates of a step are noisy,
-//! and who meets them exactly follows their noise. Exactly they are met at the end, by motion that post-processing has made
-//! smooth.
+//! with which one step of length 1 is at its least. There poses are met as nearly as is smooth: the estimates of a step
+//! are noisy, and who meets them exactly follows their noise. Exactly they are met at the end, by motion that
+//! post-processing has made smooth.
 
 use std::f64::consts::TAU;
 
