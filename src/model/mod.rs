@@ -31,6 +31,7 @@ pub use layers::{AttentionBlock, Conv1d, GroupNorm, LayerNorm, Linear, ResBlock}
 pub use outline::{ActivationCounts, Layer, Outline};
 pub use parameter::{Init, Parameter, ParameterId, ParameterList, Role, Scope};
 pub use tokens::{
-    Planner, PlannerConfig, PlannerInputs, PlannerKind, Quantized, Tokenizer, TokensConfig,
+    AskedPose, CONSTRAINT_DIM, Planner, PlannerConfig, PlannerInputs, PlannerKind, Quantized,
+    Tokenizer, TokensConfig,
 };
 pub use unet::{ConfigError, Preset, UNet1D, UNetConfig, UNetInputs};

@@ -52,6 +52,10 @@ impl PlannerNames {
     pub const DROP_AUDIO: &'static str = "drop_audio";
     /// May be left out; only in networks that take a style.
     pub const STYLE: &'static str = "style";
+    /// Only in networks that take constraints.
+    pub const CONSTRAINTS: &'static str = "constraints";
+    /// May be left out; only in networks that take constraints.
+    pub const DROP_CONSTRAINTS: &'static str = "drop_constraints";
     pub const LOGITS: &'static str = "logits";
 }
 
@@ -182,6 +186,20 @@ pub fn planner(
         let meaning = "style, normalised, 0 for none";
         g.optional_input(PlannerNames::STYLE, Axes::Samples, config.style_dim, meaning)
     });
+    let constraints = (config.constraint_dim > 0).then(|| {
+        let constraints = g.input(
+            PlannerNames::CONSTRAINTS,
+            Axes::Frames,
+            config.constraint_dim,
+            "what is asked of each frame: x, z, y normalised, the directions of the body's +Z and +Y, and 1 for each of \
+             floor, height and orientation that is asked for; zeros for what is not",
+        );
+        let meaning = "1 for windows that go without constraints, 0 where left out";
+        let drop = g.optional_input(PlannerNames::DROP_CONSTRAINTS, Axes::Batch, 0, meaning);
+        // It may be given where drop_audio is left out: onnxruntime takes axes of one name to be of one size.
+        g.name_axis(0, "batch or 1 of constraints");
+        (constraints, drop)
+    });
     let features = g.standardized(audio, &scale.centre, &scale.scale)?;
     let audio = match &clock {
         Some(clock) => g.concat(&[&features, clock])?,
@@ -192,6 +210,8 @@ pub fn planner(
         audio: &audio,
         drop_audio: Some(&drop_audio),
         style: style.as_ref(),
+        constraints: constraints.as_ref().map(|(asked, _)| asked),
+        drop_constraints: constraints.as_ref().map(|(_, drop)| drop),
         mask: None,
     };
     let logits = planner.forward(&mut g, &inputs)?;

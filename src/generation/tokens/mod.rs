@@ -1,6 +1,7 @@
 //! Motion by tokens: the card of a model of the family `tokens`, the engines that run its networks, and motion for a
 //! track of any length.
 
+mod asked;
 mod card;
 mod control;
 mod engine;
@@ -8,7 +9,9 @@ mod planner;
 mod track;
 mod weights;
 
+pub use asked::Control;
 pub use card::{TokensCard, TokensNetworks, TokensProvenance};
+pub use control::{Steering, steer};
 pub use engine::TokenEngine;
 pub use planner::{PlanRequest, PlannerEngine};
 pub use track::{TokenGenerator, TokenTrack};

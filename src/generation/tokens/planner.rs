@@ -34,9 +34,12 @@ pub struct PlanRequest<'a> {
     pub condition: ArrayView2<'a, f32>,
     /// Normalised style, for a network that takes one.
     pub style: Option<[f32; STYLE_DIM]>,
+    /// What is asked of the motion, \[T, 12\] (`AskedPose::channels`), of a planner that takes it; none where nothing
+    /// is asked.
+    pub constraints: Option<ArrayView2<'a, f32>>,
     /// The first tokens, where they are known.
     pub given: &'a [u32],
-    /// 1 follows the music, more exaggerates it, 0 ignores it.
+    /// 1 follows the music, more exaggerates it, 0 ignores it; of two conditions it is that of both.
     pub guidance: f64,
     pub seed: u64,
     /// Number of the window among those of the seed.
@@ -46,6 +49,15 @@ pub struct PlanRequest<'a> {
 /// Streams of random numbers of plans, apart from those of the noise that motion is made of; 2^20 draws for each window.
 const PLANS: u64 = 1 << 62;
 const DRAWS_OF_A_WINDOW: u64 = 1 << 20;
+/// Draws of a window that choose what guidance withholds, behind those that choose tokens.
+const PAIRS: usize = 1 << 19;
+
+/// The condition without which a prediction is that guidance leads away from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Withheld {
+    Music,
+    Constraints,
+}
 
 impl PlannerEngine {
     /// Makes an engine of so many workers of so many threads each; `parameters` are those of [`Planner`].
@@ -89,11 +101,24 @@ impl PlannerEngine {
         let (codes, n) = (self.config.codes, self.config.n_tokens(condition.nrows()));
         let first = PLANS + request.window * DRAWS_OF_A_WINDOW;
         let stream = |draw: usize| Stream::new(request.seed, first + draw as u64);
+        // With two conditions the pairs {both, constraints alone} and {both, music alone} take turns by chance, each as
+        // often (paper, eq. 10 and 11); with one there is one pair.
+        let is_constrained = request.constraints.is_some() && self.config.constraint_dim > 0;
+        let mut n_asked = 0;
+        let mut withheld = || {
+            let mut number = [0.0_f64];
+            stream(PAIRS + n_asked).uniform(0, &mut number);
+            n_asked += 1;
+            match is_constrained && number[0] >= 0.5 {
+                true => Withheld::Constraints,
+                false => Withheld::Music,
+            }
+        };
         match self.config.kind {
             PlannerKind::Masked => {
                 let mut given: Vec<Option<u32>> = request.given.iter().copied().map(Some).collect();
                 given.resize(n, None);
-                let logits = |tokens: &[u32]| self.logits(tokens, &condition, request);
+                let logits = |tokens: &[u32]| self.logits(tokens, &condition, request, withheld());
                 let uniform = |draw: usize, numbers: &mut [f64]| stream(draw).uniform(0, numbers);
                 sample_masked(sampling, &given, codes, logits, uniform)
             }
@@ -102,7 +127,7 @@ impl PlannerEngine {
                 let logits = |tokens: &[u32]| {
                     let mut padded = tokens.to_vec();
                     padded.resize(n, 0);
-                    let logits = self.logits(&padded, &condition, request)?;
+                    let logits = self.logits(&padded, &condition, request, withheld())?;
                     Ok(logits.row(tokens.len()).to_vec())
                 };
                 let uniform = |draw: usize| {
@@ -115,17 +140,18 @@ impl PlannerEngine {
         }
     }
 
-    /// Returns what the planner says of each position, guided: u + s (c − u), \[N, K\].
+    /// Returns what the planner says of each position, guided: u + s (c − u), \[N, K\], u that without one condition.
     ///
     /// `condition`: in units of its spread
     ///
     /// # Errors
     /// Shapes that do not fit.
-    pub fn logits(
+    fn logits(
         &self,
         tokens: &[u32],
         condition: &Array2<f32>,
         request: &PlanRequest,
+        withheld: Withheld,
     ) -> Result<Array2<f32>, EngineError> {
         let s = request.guidance;
         let dropped: &[f32] = match s {
@@ -134,6 +160,11 @@ impl PlannerEngine {
             _ => &[0.0, 1.0],
         };
         let n = dropped.len();
+        let nothing = [0.0; 2];
+        let [no_music, no_constraints] = match withheld {
+            Withheld::Music => [dropped, &nothing[..n]],
+            Withheld::Constraints => [&nothing[..n], dropped],
+        };
         let repeated = |values: &mut dyn Iterator<Item = f32>| -> Vec<f32> {
             let one: Vec<f32> = values.collect();
             one.repeat(n)
@@ -142,18 +173,28 @@ impl PlannerEngine {
         let audio = repeated(&mut condition.iter().copied());
         let style = (self.config.style_dim > 0)
             .then(|| repeated(&mut request.style.unwrap_or_default().into_iter()));
+        let asked = request
+            .constraints
+            .filter(|_| self.config.constraint_dim > 0)
+            .map(|asked| (asked.dim(), repeated(&mut asked.iter().copied())));
         let logits = self.workers.with(|PlannerWorker { threads, arena }| {
             threads.run(|| {
                 let mut g = Eager::new(&self.parameters, arena);
                 let tokens = g.constant(&[n, tokens.len()], &tokens_of);
                 let audio = g.constant(&[n, condition.nrows(), condition.ncols()], &audio);
-                let drop_audio = g.constant(&[n], dropped);
+                let drop_audio = g.constant(&[n], no_music);
                 let style = style.as_ref().map(|style| g.constant(&[n, STYLE_DIM], style));
+                let asked = asked
+                    .as_ref()
+                    .map(|((frames, width), asked)| g.constant(&[n, *frames, *width], asked));
+                let drop_constraints = g.constant(&[n], no_constraints);
                 let inputs = PlannerInputs {
                     tokens: &tokens,
                     audio: &audio,
                     drop_audio: Some(&drop_audio),
                     style: style.as_ref(),
+                    constraints: asked.as_ref(),
+                    drop_constraints: asked.is_some().then_some(&drop_constraints),
                     mask: None,
                 };
                 let logits = self.planner.forward(&mut g, &inputs)?;

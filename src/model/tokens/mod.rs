@@ -13,7 +13,9 @@ mod planner;
 pub use self::coder::{Encoder, SignalDecoder};
 pub use self::config::TokensConfig;
 pub use self::denoiser::SignalDenoiser;
-pub use self::planner::{Planner, PlannerConfig, PlannerInputs, PlannerKind};
+pub use self::planner::{
+    AskedPose, CONSTRAINT_DIM, Planner, PlannerConfig, PlannerInputs, PlannerKind,
+};
 use super::graph::{Graph, Result};
 use super::parameter::{Init, ParameterId, ParameterList, Role, Scope};
 

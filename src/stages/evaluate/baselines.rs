@@ -111,6 +111,7 @@ impl RunSettings {
         settings.best_of = 1;
         settings.prime = None;
         settings.constraints = None;
+        settings.uncontrolled = false;
         let check = || -> anyhow::Result<()> {
             settings.sampler.check(Schedule::new(&card.diffusion)?.len())?;
             settings.postprocess.check()?;
@@ -163,6 +164,7 @@ fn of_columns(row: &GenerationRow, card: &ModelCard) -> anyhow::Result<MotionSet
         no_clock: false,
         decoder_derives: card.decoder.fusion.is_some(),
         phase_given: false,
+        uncontrolled: false,
     })
 }
 

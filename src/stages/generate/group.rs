@@ -81,6 +81,7 @@ impl GroupSettings {
     fn new(params: &Params, card: &GroupCard) -> anyhow::Result<Self> {
         let only_soloists = [
             ("--constraints", params.constraints.is_some()),
+            ("--control", params.control.is_some()),
             ("--prime", params.prime.is_some()),
             ("--style", !params.style.is_empty()),
             ("--stream", params.stream.is_some()),

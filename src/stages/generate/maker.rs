@@ -145,7 +145,9 @@ impl SoloistMaker<'_> {
         let heard = music.heard_by(&self.card.unet, self.settings.no_clock);
         let bars = heard.bars();
         let priming = self.priming(music)?;
-        let kept = constraints.as_ref().filter(|_| !self.settings.soft);
+        let settings = self.settings;
+        let is_kept = !settings.soft && !settings.uncontrolled;
+        let kept = constraints.as_ref().filter(|_| is_kept);
         let held = kept.map(|constraints| constraints.held(n_frames)).unwrap_or_default();
         let mut best: Option<Candidate> = None;
         let mut rows = Vec::with_capacity(self.settings.best_of);
@@ -240,6 +242,7 @@ impl SoloistMaker<'_> {
             seed,
             style: self.settings.style,
             constraints: constraints
+                .filter(|_| !self.settings.uncontrolled)
                 .map(|constraints| WeightedConstraints { constraints, strength }),
             primed: priming.zip(self.settings.prime.as_ref()).map(|(priming, prime)| {
                 PrimingMotion { motion: priming.motion.view(), n_left: prime.n_left }
@@ -256,7 +259,8 @@ impl SoloistMaker<'_> {
         let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
         let mut frames =
             concatenate(Axis(0), &views).unwrap_or_else(|_| Array2::zeros((0, MOTION_DIM)));
-        if let Some(constraints) = constraints.filter(|_| !self.settings.soft) {
+        let is_kept = !self.settings.soft && !self.settings.uncontrolled;
+        if let Some(constraints) = constraints.filter(|_| is_kept) {
             constraints.bend(&mut frames, 0, 1.0);
         }
         Ok(frames)

@@ -7,6 +7,7 @@ mod maker;
 mod music;
 mod outputs;
 mod params;
+mod path_file;
 mod receipt;
 mod report;
 mod settings;

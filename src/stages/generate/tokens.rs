@@ -3,7 +3,7 @@
 use std::num::NonZeroUsize;
 use std::time::Instant;
 
-use anyhow::{Context as _, bail};
+use anyhow::{Context as _, bail, ensure};
 use ndarray::{Array2, ArrayView2, Axis, concatenate};
 use serde::{Deserialize, Serialize};
 
@@ -19,10 +19,10 @@ use super::{make_all, name_of_model, weights_digest_of_tokens};
 use crate::diffusion::{SamplerConfig, Schedule, TokenSampling};
 use crate::evaluation::{derivative_error, score};
 use crate::generation::{
-    FamilyCard as _, PlannerEngine, TokenEngine, TokenGenerator, TokenTrack, TokensCard,
-    WeightedConstraints, tokens_parameters,
+    Control, FamilyCard as _, PlannerEngine, Steering, TokenEngine, TokenGenerator, TokenTrack,
+    TokensCard, WeightedConstraints, steer, tokens_parameters,
 };
-use crate::motion::postprocess::{PostProcessConfig, process, process_holding};
+use crate::motion::postprocess::{HeldPoses, PostProcessConfig, process, process_holding};
 use crate::motion::style::STYLE_DIM;
 use crate::motion::{Channel, MOTION_DIM};
 use crate::onnx::Model;
@@ -58,6 +58,9 @@ struct TokensSettings {
     soft: bool,
     /// Whether the clock is withheld from a network that hears it.
     no_clock: bool,
+    /// Where constraints act; none where there are none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    control: Option<Control>,
 }
 
 impl TokensSettings {
@@ -91,6 +94,16 @@ impl TokensSettings {
             ..TokenSampling::default()
         };
         plan.check()?;
+        let knows_constraints = card.planner.constraint_dim > 0;
+        let usual = if knows_constraints { Control::Both } else { Control::Decode };
+        let control = params.control.unwrap_or(usual);
+        ensure!(
+            knows_constraints || !control.plans(),
+            "--control {}: the planner of model {} knows nothing of constraints; give decode or none, or train a planner \
+             without --no-constraints",
+            control.name(),
+            card.name
+        );
         Ok(Self {
             output_version: OUTPUT_VERSION,
             plan,
@@ -108,6 +121,7 @@ impl TokensSettings {
             constraint_strength: params.checked_constraint_strength()?,
             soft: params.soft,
             no_clock: params.no_clock,
+            control: constraints.is_some().then_some(control),
         })
     }
 
@@ -250,8 +264,9 @@ impl TokensMaker<'_> {
             Some(Ok(constraints)) => Some(constraints),
             None => None,
         };
-        let kept = constraints.as_ref().filter(|_| !self.settings.soft);
-        let held = kept.map(|constraints| constraints.held(n_frames)).unwrap_or_default();
+        let control = self.settings.control.unwrap_or(Control::None);
+        let is_kept = control.decodes() && !self.settings.soft;
+        let kept = constraints.as_ref().filter(|_| is_kept);
         let seed = seed_of(self.seed, music.phrase_id, sample, 0);
         let track = TokenTrack {
             condition: heard.condition.view(),
@@ -260,6 +275,7 @@ impl TokensMaker<'_> {
             constraints: constraints
                 .as_ref()
                 .map(|constraints| WeightedConstraints { constraints, strength }),
+            control,
             seed,
         };
         let mut parts: Vec<Array2<f32>> = Vec::new();
@@ -270,18 +286,14 @@ impl TokensMaker<'_> {
         };
         self.generator.run(&track, emit).map_err(|stop| stop.of(music.source))?;
         let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
-        let mut decoded =
+        let decoded =
             concatenate(Axis(0), &views).unwrap_or_else(|_| Array2::zeros((0, MOTION_DIM)));
-        if let Some(constraints) = kept {
-            // What blending of windows has moved.
-            constraints.bend(&mut decoded, 0, 1.0);
-        }
         let mut frames = decoded.clone();
         let postprocess = &self.settings.postprocess;
-        let displacement = process_holding(postprocess, &mut frames, bars, &held);
+        let displacement = process_holding(postprocess, &mut frames, bars, &HeldPoses::default());
         if let Some(constraints) = kept {
-            // Smoothing and limits have moved it, by millimetres; what follows from poses follows again.
-            constraints.bend(&mut frames, 0, 1.0);
+            // Only now is it smooth, and what is missing yet too; what follows from poses follows again.
+            steer(constraints, &mut frames, 0, Steering::Finish);
             process(&postprocess.without_smoothing(), &mut frames, bars);
         }
         let seconds = started.elapsed().as_secs_f64();
