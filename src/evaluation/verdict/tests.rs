@@ -87,6 +87,7 @@ fn outcomes(
         truth: &truth,
         has_raw: true,
         has_network: true,
+        group: None,
     };
     verdicts(&evidence)
         .into_iter()
@@ -149,6 +150,7 @@ fn what_was_not_measured_leaves_a_verdict_open() {
         truth: &truth,
         has_raw: false,
         has_network: false,
+        group: None,
     };
     let found = verdicts(&evidence);
     assert_eq!(
@@ -178,6 +180,7 @@ fn a_test_says_both_values_and_what_it_is_held_against() {
         truth: &truth,
         has_raw: true,
         has_network: false,
+        group: None,
     };
     let found = verdicts(&evidence);
     assert_eq!(

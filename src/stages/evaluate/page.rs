@@ -68,10 +68,17 @@ impl Page<'_> {
         let Self { subject, found, .. } = self;
         let made = subject.generations.first();
         let length_s = subject.length_s();
-        let n = subject.motions.len();
+        let n = subject.n_items();
+        let n_dancers = subject.motions.len();
         let mut facts = vec![
             ("run".to_owned(), subject.run.clone()),
-            ("motions".to_owned(), format!("{n}, {length_s:.1} s in all")),
+            (
+                "motions".to_owned(),
+                match subject.is_of_groups {
+                    true => format!("{n} groups, {n_dancers} dancers, {length_s:.1} s in all"),
+                    false => format!("{n}, {length_s:.1} s in all"),
+                },
+            ),
             ("real motion".to_owned(), self.data_hash[..16.min(self.data_hash.len())].to_owned()),
         ];
         let own_settings = made.map(settings);
@@ -161,10 +168,12 @@ impl Page<'_> {
             failed.get(&(motions[*i].phrase_id.as_str(), motions[*i].sample)).map_or(0, Vec::len)
         };
         let score = |i: &usize| {
-            let row = self.subject.generations.get(*i);
+            let row = self.subject.generations.get(motions[*i].item);
             row.and_then(|row| row.score).unwrap_or(f64::NEG_INFINITY)
         };
-        let mut order: Vec<usize> = (0..motions.len()).collect();
+        // A group is one motion, of which the first dancer is drawn.
+        let mut order: Vec<usize> =
+            (0..motions.len()).filter(|&i| motions[i].dancer == 0).collect();
         order.sort_by(|a, b| n_failed(b).cmp(&n_failed(a)).then(score(a).total_cmp(&score(b))));
         order.into_iter().take(n).map(|i| self.card(i, &failed)).collect()
     }
@@ -177,7 +186,8 @@ impl Page<'_> {
         let looked_at = &self.subject.motions[i];
         let phrase_id = looked_at.phrase_id.as_str();
         let motion = Trajectory::new(self.subject.frames(self.store, i)?)?;
-        let name = format!("{phrase_id}, sample {}", looked_at.sample);
+        let dancer = if self.subject.is_of_groups { ", dancer 0" } else { "" };
+        let name = format!("{phrase_id}, sample {}{dancer}", looked_at.sample);
         let plotted = MotionPlot {
             title: &name,
             motion: &motion,
@@ -189,7 +199,7 @@ impl Page<'_> {
         let messages = failed.get(&(phrase_id, looked_at.sample));
         let seconds = frames_to_s(motion.n_frames());
         let mut facts = vec![("length".to_owned(), format!("{seconds:.1} s"))];
-        if let Some(row) = self.subject.generations.get(i) {
+        if let Some(row) = self.subject.generations.get(looked_at.item) {
             facts.extend(row.score.map(|score| ("score".to_owned(), format!("{score:.3}"))));
             facts.push(("seed".to_owned(), (row.seed as u64).to_string()));
         }
