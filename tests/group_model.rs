@@ -260,7 +260,7 @@ fn mistakes_are_named() {
     // A model of one dancer makes no group, and a command for soloists takes no model of groups.
     let mut command = motiongen();
     command.arg("generate").arg("--audio").arg(&audio).arg("--output").arg(&out);
-    let output = finish(command.args(["--dancers=5", "--quiet"]));
+    let output = finish(command.args(["--model=pretrained", "--dancers=5", "--quiet"]));
     assert_eq!(output.code, 2, "{output:?}");
     assert!(
         output.stderr.contains(

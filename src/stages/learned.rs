@@ -279,7 +279,7 @@ fn card_of(store: &Location, model: &str) -> Result<Option<Bytes>, StoreError> {
     match store.read_regular(&path, MAX_CARD_BYTES) {
         Err(StoreError::NotFound { .. }) => {
             Ok(shipped_as(model).and_then(|shipped| shipped.file(file_names::CARD)))
-        },
+        }
         read => read.map(Some),
     }
 }

@@ -102,7 +102,7 @@ impl ModelFolder {
             Err(StoreError::NotFound { .. }) => match shipped_as(name) {
                 Some(model) => return Self::shipped(model),
                 None => bail!(
-                "store {store} has no model \"{name}\"{}; run motiongen export --store {store} --run RUN \
+                    "store {store} has no model \"{name}\"{}; run motiongen export --store {store} --run RUN \
                  --model {name} first",
                     others(store)?
                 ),

@@ -21,7 +21,8 @@ pub fn read_dataset(
     store: &Location,
     threads: NonZeroUsize,
 ) -> Result<Dataset, crate::training::DatasetError> {
-    let (dataset, left_out) = dataset_of(&StoreSnapshot::take(store)?, Ensemble::Soloists, threads)?;
+    let (dataset, left_out) =
+        dataset_of(&StoreSnapshot::take(store)?, Ensemble::Soloists, threads)?;
     let n_groups = left_out.iter().filter(|one| one.is_for_other_models()).count();
     if n_groups > 0 {
         tracing::info!(

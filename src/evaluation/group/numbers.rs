@@ -91,7 +91,8 @@ pub fn feature_distribution(windows: &[GroupWindow]) -> Option<Gaussian> {
 }
 
 fn distribution<'a>(windows: impl Iterator<Item = &'a GroupWindow>) -> Option<Gaussian> {
-    let rows: Vec<_> = windows.filter_map(|window| Some(window.features.as_ref()?.view())).collect();
+    let rows: Vec<_> =
+        windows.filter_map(|window| Some(window.features.as_ref()?.view())).collect();
     Gaussian::fit(concatenate(Axis(0), &rows).ok()?.view())
 }
 
@@ -156,8 +157,13 @@ fn too_few(number: Number, n: usize, least: usize, what: &str) -> Number {
 fn realism_number(windows: &[GroupWindow], reference: Option<&Gaussian>) -> Number {
     let rows = |window: &GroupWindow| window.features.as_ref().map_or(0, Array2::nrows);
     let n_chunks: usize = windows.iter().map(rows).sum();
-    let songs: BTreeMap<usize, usize> =
-        windows.iter().map(|w| w.song).collect::<std::collections::BTreeSet<_>>().into_iter().zip(0..).collect();
+    let songs: BTreeMap<usize, usize> = windows
+        .iter()
+        .map(|w| w.song)
+        .collect::<std::collections::BTreeSet<_>>()
+        .into_iter()
+        .zip(0..)
+        .collect();
     let distance = |left_out: Option<usize>| {
         let kept = windows.iter().filter(|window| Some(songs[&window.song]) != left_out);
         frechet_distance(&distribution(kept)?, reference?)

@@ -97,8 +97,7 @@ fn belong_together(group: &GroupEvidence) -> Test {
     let differences: Vec<f64> = own
         .zip(alone)
         .map(|(own, alone)| {
-            let difference_of_song =
-                |(song, x): (&usize, &f64)| Some(x - alone.by_song.get(song)?);
+            let difference_of_song = |(song, x): (&usize, &f64)| Some(x - alone.by_song.get(song)?);
             own.by_song.iter().filter_map(difference_of_song).collect()
         })
         .unwrap_or_default();

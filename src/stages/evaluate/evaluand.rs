@@ -271,7 +271,8 @@ impl Evaluand {
             self.motions.iter().zip(&evaluated).collect();
         for dancers in pairs.chunk_by(|(a, _), (b, _)| a.item == b.item) {
             let (id, sample) = (dancers[0].0.phrase_id.as_str(), dancers[0].0.sample);
-            let decoded = dancers.iter().map(|(_, found)| Some(&found.decoded.as_ref()?.checks[..]));
+            let decoded =
+                dancers.iter().map(|(_, found)| Some(&found.decoded.as_ref()?.checks[..]));
             if let Some(decoded) = decoded.collect::<Option<Vec<&[Check]>>>() {
                 let has_phase = self.phase_given && has_music;
                 let derived = |check: &str| match check {

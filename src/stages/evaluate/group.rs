@@ -125,7 +125,9 @@ impl GroupMeasurer {
             let last = first + window;
             let others: Option<Vec<_>> = strangers
                 .iter()
-                .map(|stranger| (stranger.nrows() >= last).then(|| stranger.slice(s![first..last, ..])))
+                .map(|stranger| {
+                    (stranger.nrows() >= last).then(|| stranger.slice(s![first..last, ..]))
+                })
                 .collect();
             if let Some(others) = others.filter(|others| !is_sampled && others.len() == n_dancers) {
                 add(Subject::Independent, independent(frames, &others).view());
@@ -162,7 +164,8 @@ impl GroupMeasurer {
             self.add_real(phrases, truth);
         }
         let training = self.windows.get(&(ALL, Subject::TrainingTruth));
-        let reference: Option<Gaussian> = training.and_then(|windows| feature_distribution(windows));
+        let reference: Option<Gaussian> =
+            training.and_then(|windows| feature_distribution(windows));
         let numbers = self.windows.iter().map(|(&(split, subject), windows)| {
             ((split, subject), group_numbers(windows, reference.as_ref()))
         });
@@ -177,7 +180,8 @@ impl GroupMeasurer {
             let groups: Vec<&[TruthPhrase]> =
                 truth.phrases.chunk_by(|a, b| a.id == b.id).filter(is_of_subject).collect();
             let n = groups.len().min(MAX_REAL);
-            let chosen: Vec<&[TruthPhrase]> = (0..n).map(|i| groups[i * groups.len() / n]).collect();
+            let chosen: Vec<&[TruthPhrase]> =
+                (0..n).map(|i| groups[i * groups.len() / n]).collect();
             // The bars of real motion are those of its own phase.
             let music: Vec<Option<WindowMusic>> =
                 chosen.iter().map(|group| music_of_real(phrases, &group[0])).collect();

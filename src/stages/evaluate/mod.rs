@@ -152,7 +152,8 @@ fn not_won(params: &Params, report: &Report) -> Vec<UnwonVerdict> {
     let is_required = |name: &str| params.require.iter().any(|asked| asked.asks_for(name));
     let told = report.verdicts.iter().map(|told| (told.verdict.clone(), told.outcome));
     let is_told = |name: &str| report.verdicts.iter().any(|told| told.verdict == name);
-    let of_groups = params.require.contains(&RequiredVerdict::Together).then_some(Quality::Together);
+    let of_groups =
+        params.require.contains(&RequiredVerdict::Together).then_some(Quality::Together);
     let untold = Quality::OF_SOLOISTS
         .into_iter()
         .chain(of_groups)

@@ -11,11 +11,11 @@ use crate::evaluation::interval::{holm, paired_difference};
 use crate::motion::Trajectory;
 use crate::plot::{self, Format, MOTION_WIDTH_PX, MotionPanel, MotionPlot};
 use crate::report::{
-    self, CheckLine, ComparedRun, Metric, Outcome, PairedNumber, Report, Verdict, VerdictTest,
-    WorstMotion,
+    self, CheckLine, ComparedRun, DialRun, Metric, Outcome, PairedNumber, Report, Verdict,
+    VerdictTest, WorstMotion,
 };
 use crate::store::tables::{GenerationRow, MetricRow, SanityCheckRow, SongMetricRow, VerdictRow};
-use crate::store::{Location, StoreSnapshot};
+use crate::store::{Location, Row as _, StoreSnapshot};
 use crate::training::TemporalConfig;
 use crate::units::frames_to_s;
 
@@ -94,7 +94,37 @@ impl Page<'_> {
             metrics: shown(&found.metrics),
             worst: self.worst(n_worst)?,
             against: self.against.map(|other| self.compared(other)),
+            dial: self.dial()?,
         })
+    }
+
+    /// Returns the evaluated runs of groups of the same weights and number of dancers, this one among them, in order of
+    /// γ; none for soloists.
+    fn dial(&self) -> anyhow::Result<Vec<DialRun>> {
+        let own = self.subject.generations.first().filter(|_| self.subject.is_of_groups);
+        let Some(own) = own else { return Ok(Vec::new()) };
+        let mut known: BTreeMap<String, f64> = BTreeMap::new();
+        self.subject.snapshot.table(GenerationRow::schema())?.rows_where(
+            |row: &GenerationRow| {
+                if row.weights == own.weights && row.count_dancers() == own.count_dancers() {
+                    known.insert(row.run.clone(), row.consistency.unwrap_or(0.0));
+                }
+                false
+            },
+        )?;
+        let mut runs = Vec::new();
+        for (run, consistency) in known {
+            let is_this = run == self.subject.run;
+            let metrics = match is_this {
+                true => shown(&self.found.metrics),
+                false => shown(&rows::metrics_of(self.store, &run)?),
+            };
+            if !metrics.is_empty() {
+                runs.push(DialRun { run, consistency, is_this, metrics });
+            }
+        }
+        runs.sort_by(|a, b| a.consistency.total_cmp(&b.consistency).then(a.run.cmp(&b.run)));
+        Ok(runs)
     }
 
     /// Compares the run with another one.
@@ -293,7 +323,7 @@ fn paired(there: &[SongMetricRow], here: &[SongMetricRow]) -> Vec<PairedNumber> 
 }
 
 /// Returns the settings that determine the motions of a run.
-fn settings(row: &GenerationRow) -> [(&'static str, String); 7] {
+fn settings(row: &GenerationRow) -> [(&'static str, String); 9] {
     [
         ("model", row.model.clone()),
         ("weights", row.weights[..16.min(row.weights.len())].to_owned()),
@@ -302,6 +332,8 @@ fn settings(row: &GenerationRow) -> [(&'static str, String); 7] {
         ("steps", row.n_steps.to_string()),
         ("guidance", row.guidance.to_string()),
         ("eta", row.eta.map_or("–".to_owned(), |eta| eta.to_string())),
+        ("dancers", row.count_dancers().to_string()),
+        ("consistency", row.consistency.map_or("–".to_owned(), |gamma| gamma.to_string())),
     ]
 }
 

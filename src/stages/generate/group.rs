@@ -17,8 +17,8 @@ use crate::autodiff::Parameters;
 use crate::diffusion::{SamplerConfig, Schedule};
 use crate::evaluation::{derivative_error, score};
 use crate::generation::{
-    ConsistencyForm, EngineError, FamilyCard as _, GroupCard, GroupEngine, GroupGenerator,
-    GroupTrack, ModelFileName,
+    ConsistencyForm, EngineError, FamilyCard as _, GroupCard, GroupEngine, GroupEstimator as _,
+    GroupGenerator, GroupTrack, ModelFileName,
 };
 use crate::model::{GroupNetworks, Parameter};
 use crate::motion::Channel;
@@ -233,7 +233,10 @@ pub fn run(
 ///
 /// # Errors
 /// When a file is not what the card says.
-pub(in crate::stages) fn parameters(files: &ModelFolder, card: &GroupCard) -> anyhow::Result<Parameters<f32>> {
+pub(in crate::stages) fn parameters(
+    files: &ModelFolder,
+    card: &GroupCard,
+) -> anyhow::Result<Parameters<f32>> {
     let model = |name| -> anyhow::Result<(Model, String)> {
         let place = files.place_of(name);
         Ok((Model::read(files.read(name)?, None, &place)?, place))

@@ -25,9 +25,8 @@ impl Evaluand {
         let stride = stride_for(self.n_frames.iter().sum());
         let measurer = job.measurer(stride);
         // The place of the first dancer of each generation or file.
-        let firsts: Vec<usize> = (0..self.motions.len())
-            .filter(|&i| self.motions[i].dancer == 0)
-            .collect();
+        let firsts: Vec<usize> =
+            (0..self.motions.len()).filter(|&i| self.motions[i].dancer == 0).collect();
         progress.start("evaluate", "motions", firsts.len() as u64);
         let mut look = |first: usize, group: &Array3<f32>| {
             if let Some(groups) = groups.as_mut() {

@@ -152,9 +152,10 @@ impl GroupBaselines<'_> {
                 .iter()
                 .map(|window| {
                     let features = bytes(&mut window.features.iter().map(|x| x.to_le_bytes()));
-                    let phase = window.phase.as_ref().map(|phase| {
-                        bytes(&mut phase.iter().map(|&x| (x as f32).to_le_bytes()))
-                    });
+                    let phase = window
+                        .phase
+                        .as_ref()
+                        .map(|phase| bytes(&mut phase.iter().map(|&x| (x as f32).to_le_bytes())));
                     (window.phrase_id.as_str(), window.first_frame, features, phase)
                 })
                 .collect(),
