@@ -170,7 +170,7 @@ rows! {
     {
         model: String, "", "Name of the model.";
         run: String, "", "The run that it was exported from.";
-        check: String, "", "`forward` (one prediction of the UNet), `sample` (all steps of DDIM), `guided_sample` (the same with guidance), `decode` (the decoder on what was sampled), `rounding` (all steps of DDIM with rounded weights against the trained ones).";
+        check: String, "", "`forward` (one prediction of the UNet), `sample` (all steps of DDIM), `guided_sample` (the same with guidance), `decode` (the decoder on what was sampled), `rounding` (all steps of DDIM with rounded weights against the trained ones); of a model of groups `score` (log f) and `agreement` (the part of it that is the dancers').";
         precision: String, "", "How the weights are stored: `fp32`, `fp16` or `int8`.";
         n_samples: i32, "samples", "Motions of the batch.";
         n_frames: i32, "frames", "Frames of each.";
