@@ -88,7 +88,7 @@ mod tests {
     use super::super::example::{example, metric, with_interval};
     use super::super::names::SUBJECTS;
     use super::super::{
-        BY_CONSTRUCTION, CheckLine, ComparedRun, Metric, Outcome, PairedNumber, Verdict,
+        BY_CONSTRUCTION, CheckLine, ComparedRun, DialRun, Metric, Outcome, PairedNumber, Verdict,
         VerdictTest,
     };
     use super::*;
@@ -255,6 +255,14 @@ mod tests {
                 failed: vec![own()],
                 svg: own(),
             }],
+            dial: [-1.0, 1.0]
+                .map(|consistency| DialRun {
+                    run: own(),
+                    consistency,
+                    is_this: consistency > 0.0,
+                    metrics: metrics.clone(),
+                })
+                .into(),
             against: Some(ComparedRun {
                 run: own(),
                 paired: vec![PairedNumber {

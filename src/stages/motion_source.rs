@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use anyhow::{anyhow, bail, ensure};
-use ndarray::{Array2, Array3};
+use ndarray::Array3;
 
 use super::Stage as _;
 use super::beats;
