@@ -50,6 +50,10 @@ keep-tables: build-diff-tables ## keep the demo's tables as they are now; CHANGE
 pretrained: build setup ## train the model that ships with the program again (models/pretrained)
 	@$(MAKE) --file pipelines/pretrained.mk BIN=$(BIN)
 
+.PHONY: pretrained-group
+pretrained-group: build setup ## train the model of groups that ships with the program again (models/group)
+	@$(MAKE) --file pipelines/pretrained.mk pretrained-group BIN=$(BIN)
+
 .PHONY: ingest
 ingest: build ## ingest your own files: make ingest SOURCE=… STORE=… [SHARDS=8 -j4]
 	@$(MAKE) --file pipelines/ingest.mk BIN=$(BIN)

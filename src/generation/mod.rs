@@ -29,8 +29,8 @@ pub use control::{Constraints, ControlError, Miss, REACH_FRAMES, WantedValue, co
 pub use eager::EagerEngine;
 pub use engine::{Engine, EngineError, EngineInputs};
 pub use group::{
-    ConsistencyForm, GroupCard, GroupEngine, GroupEngineInputs, GroupGenerator, GroupProvenance,
-    GroupTrack,
+    ConsistencyForm, GroupCard, GroupEngine, GroupEngineInputs, GroupEstimator, GroupGenerator,
+    GroupProvenance, GroupTrack,
 };
 pub use learned::{LearnedFrom, MusicDigests, MusicSplit, Purpose, ShortDigest};
 pub use pool::Pool;

@@ -6,7 +6,7 @@ use super::generate::{weights_digest, weights_digest_of_tokens};
 use super::model_files::{current_folder, folder_of, is_model_name};
 use super::train::session::{MachineParams, ProgressWatch, read_phrases};
 use super::trained::{FinetuneData, TrainedRun};
-use super::{Progress, Stage as _, finetune::Finetune, pretrained, train::Train};
+use super::{Progress, Stage as _, finetune::Finetune, model_files::shipped_as, train::Train};
 
 use crate::generation::{
     CardError, FamilyCard as _, GroupCard, LearnedFrom, MAX_CARD_BYTES, ModelCard, Purpose,
@@ -276,10 +276,10 @@ fn card_of(store: &Location, model: &str) -> Result<Option<Bytes>, StoreError> {
         return Ok(None);
     }
     let path = format!("{}/{}", current_folder(store, &folder_of(model))?, file_names::CARD);
-    let pretrained_card =
-        || (model == pretrained::NAME).then(|| pretrained::file(file_names::CARD));
     match store.read_regular(&path, MAX_CARD_BYTES) {
-        Err(StoreError::NotFound { .. }) => Ok(pretrained_card().flatten()),
+        Err(StoreError::NotFound { .. }) => {
+            Ok(shipped_as(model).and_then(|shipped| shipped.file(file_names::CARD)))
+        }
         read => read.map(Some),
     }
 }

@@ -170,7 +170,7 @@ rows! {
     {
         model: String, "", "Name of the model.";
         run: String, "", "The run that it was exported from.";
-        check: String, "", "`forward` (one prediction of the UNet), `sample` (all steps of DDIM), `guided_sample` (the same with guidance), `decode` (the decoder on what was sampled), `rounding` (all steps of DDIM with rounded weights against the trained ones).";
+        check: String, "", "`forward` (one prediction of the UNet), `sample` (all steps of DDIM), `guided_sample` (the same with guidance), `decode` (the decoder on what was sampled), `rounding` (all steps of DDIM with rounded weights against the trained ones); of a model of groups `score` (log f) and `agreement` (the part of it that is the dancers').";
         precision: String, "", "How the weights are stored: `fp32`, `fp16` or `int8`.";
         n_samples: i32, "samples", "Motions of the batch.";
         n_frames: i32, "frames", "Frames of each.";
@@ -289,7 +289,7 @@ rows! {
     {
         run: String, "", "The run of generate that was evaluated, or the name of motions of another program; evaluating it again replaces its rows.";
         model: String, "", "Name of the model; empty for motions of another program.";
-        subject: String, "", "Whose number it is: `generated`, or a baseline: `shuffled` (the same motions with the music of other songs), `shifted` (with the bars shifted by beats), `untrained` (motion of the same network with its first weights), `no_music` (of the trained network, its music withheld), `retrieval` (the library's phrase with the nearest features), `mean_motion`, `held_out_truth`, `training_truth`.";
+        subject: String, "", "Whose number it is: `generated`, or a baseline: `shuffled` (the same motions with the music of other songs), `shifted` (with the bars shifted by beats), `untrained` (motion of the same network with its first weights), `no_music` (of the trained network, its music withheld), `retrieval` (the library's phrase with the nearest features), `mean_motion`, `held_out_truth`, `training_truth`; of groups also `independent` (soloists who were sampled one by one, in the places of the dancers) and `copied` (one dancer in the places of all).";
         split: String, "", "Which music: `held_out` (the model met none of it), `validation` (its checkpoints were chosen by it), `trained_on`, `unknown` (nobody knows), or `all` of these.";
         metric: String, "", "Name of the number: see docs/evaluate.md.";
         variant: String, "", "Which of several ways to measure it; empty where there is one. `raw` is of motion as it was decoded.";
@@ -310,7 +310,7 @@ rows! {
         run: String, "", "The run of generate that was evaluated, or the name of motions of another program; evaluating it again replaces its rows.";
         model: String, "", "Name of the model; empty for motions of another program.";
         split: String, "", "Which music, as in `metrics`.";
-        verdict: String, "", "`sound`, `like_real`, `follows_music` or `varied`.";
+        verdict: String, "", "`sound`, `like_real`, `follows_music` or `varied`; of groups also `together`.";
         verdict_outcome: String, "", "`won` (every test is won), `lost` (one is lost) or `open` (too little was measured).";
         test: String, "", "Name of the test: see docs/evaluate.md.";
         outcome: String, "", "`won`, `lost` or `open`.";

@@ -91,7 +91,7 @@ pub struct Number {
 }
 
 impl Number {
-    fn new(
+    pub(in crate::evaluation) fn new(
         metric: &'static str,
         variant: impl Into<String>,
         unit: &'static str,
@@ -102,7 +102,7 @@ impl Number {
         Self { metric, variant, unit, estimate, by_song: BTreeMap::new(), protocol }
     }
 
-    fn with_songs(self, by_song: BTreeMap<usize, f64>) -> Self {
+    pub(in crate::evaluation) fn with_songs(self, by_song: BTreeMap<usize, f64>) -> Self {
         Self { by_song, ..self }
     }
 }
@@ -112,8 +112,14 @@ fn mean_over(
     danced: &[MotionWindow],
     value: impl Fn(&MotionWindow) -> Option<f64>,
 ) -> (Estimate, BTreeMap<usize, f64>) {
-    let (values, songs): (Vec<f64>, Vec<usize>) =
-        danced.iter().filter_map(|item| Some((value(item)?, item.song))).unzip();
+    mean_by_song(danced.iter().filter_map(|item| Some((value(item)?, item.song))))
+}
+
+/// Mean over values with the number of their songs, with songs as clusters, and the mean of each song.
+pub(in crate::evaluation) fn mean_by_song(
+    known: impl Iterator<Item = (f64, usize)>,
+) -> (Estimate, BTreeMap<usize, f64>) {
+    let (values, songs): (Vec<f64>, Vec<usize>) = known.unzip();
     let mut sums: BTreeMap<usize, (f64, f64)> = BTreeMap::new();
     for (value, song) in values.iter().zip(&songs) {
         let (sum, n) = sums.entry(*song).or_default();

@@ -4,7 +4,7 @@
 //! Sampling takes minutes, so that what was sampled is kept in the store under a digest of everything that
 //! determines it: `baselines/<digest>.npy`.
 
-mod cache;
+pub(super) mod cache;
 #[cfg(test)]
 mod tests;
 

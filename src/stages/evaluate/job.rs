@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use ndarray::Array2;
 
+use super::group::GroupFindings;
 use super::measure::{MeasuredMotion, Measurer, kept_frames, stride_for};
 use super::motions::{PhraseIndex, is_held_out};
 use super::params::Params;
@@ -47,11 +48,15 @@ impl MotionStage {
     }
 }
 
-/// A motion that is evaluated.
+/// A motion that is evaluated, of a soloist or of a dancer of a group; dancers of a group stand side by side.
 #[derive(Clone, Debug)]
 pub struct EvaluationMotion {
     pub phrase_id: String,
     pub sample: i32,
+    /// Place of the generation, or of the file, that it is of.
+    pub item: usize,
+    /// Number of the dancer, 0 of a soloist.
+    pub dancer: usize,
     pub split: MusicSplit,
     /// Largest misses of its constraints: mm and degrees.
     pub misses: [Option<f64>; 2],
@@ -94,6 +99,8 @@ pub struct EvaluationJob<'a> {
     pub has_network: bool,
     /// Split of the windows that were sampled.
     pub sampled_split: Option<MusicSplit>,
+    /// What was measured of groups; none of soloists.
+    pub groups: Option<&'a GroupFindings>,
 }
 
 impl EvaluationJob<'_> {
@@ -189,6 +196,7 @@ impl EvaluationJob<'_> {
                 Finding { subject, split: name, numbers }
             };
             let untrained = baseline(Subject::Untrained, &sampled.untrained);
+            let group = self.groups.map(|groups| groups.of_split(split));
             let evidence = Evidence {
                 own: &numbers,
                 shuffled: &shuffled,
@@ -197,8 +205,10 @@ impl EvaluationJob<'_> {
                 truth: &truth,
                 has_raw: self.has_raw,
                 has_network: self.has_network && self.sampled_split == Some(split),
+                group: group.as_ref().map(|group| group.evidence()),
             };
-            all_verdicts.extend(verdicts(&evidence).map(|verdict| (split, verdict)));
+            let told = verdicts(&evidence);
+            all_verdicts.extend(told.into_iter().map(|verdict| (split, verdict)));
             let finding = |subject, numbers| Finding { subject, split: name, numbers };
             findings.extend([
                 finding(Subject::Generated, numbers),
@@ -210,6 +220,7 @@ impl EvaluationJob<'_> {
                 baseline(Subject::MeanMotion, &constant),
             ]);
         }
+        findings.extend(self.groups.into_iter().flat_map(GroupFindings::findings));
         findings.retain(|finding| !finding.numbers.is_empty());
         Ok(EvaluationFindings { findings, verdicts: all_verdicts })
     }

@@ -16,12 +16,14 @@ const OUTPUT_VERSION: u32 = 2;
 /// A verdict that may be required.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum RequiredVerdict {
-    /// All four.
+    /// All four, and of groups the fifth.
     All,
     Sound,
     LikeReal,
     FollowsMusic,
     Varied,
+    /// Of groups: do their dancers belong together, and keep apart?
+    Together,
 }
 
 impl RequiredVerdict {
@@ -33,6 +35,7 @@ impl RequiredVerdict {
             Self::LikeReal => verdict == Quality::LikeReal.name(),
             Self::FollowsMusic => verdict == Quality::FollowsMusic.name(),
             Self::Varied => verdict == Quality::Varied.name(),
+            Self::Together => verdict == Quality::Together.name(),
         }
     }
 }

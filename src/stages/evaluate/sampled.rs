@@ -18,7 +18,7 @@ use crate::stages::{Progress, learned};
 use crate::store::{Location, StoreError, digest, tables};
 
 /// Seed of the noise of baselines, so that two evaluations sample the same.
-const BASELINE_SEED: u64 = 2026;
+pub(super) const BASELINE_SEED: u64 = 2026;
 
 impl Evaluand {
     /// Samples the untrained network, and the trained one without music, for windows of the music of a split; none,
@@ -77,7 +77,7 @@ impl Evaluand {
     }
 
     /// Returns up to `most` windows of the music of a split, evenly among all of up to as many phrases.
-    fn music_windows(
+    pub(super) fn music_windows(
         &self,
         split: MusicSplit,
         length: usize,

@@ -21,7 +21,7 @@ use crate::evaluation::reference_statistics::ReferenceStatistics;
 const MAX_OTHER_SONGS: usize = 8;
 
 /// The motions or baseline that numbers were measured on.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Subject {
     Generated,
     /// The same motions with the music of other songs.
@@ -35,6 +35,11 @@ pub enum Subject {
     /// The library's phrase with the nearest features.
     Retrieval,
     MeanMotion,
+    /// Soloists of the same model, each sampled by itself, in the places of the dancers of a group; of motions of another
+    /// program dancers of other groups.
+    Independent,
+    /// One dancer of the group, copied to the places of all.
+    Copied,
     HeldOutTruth,
     TrainingTruth,
 }
@@ -50,6 +55,8 @@ impl Subject {
             Self::NoMusic => "no_music",
             Self::Retrieval => "retrieval",
             Self::MeanMotion => "mean_motion",
+            Self::Independent => "independent",
+            Self::Copied => "copied",
             Self::HeldOutTruth => "held_out_truth",
             Self::TrainingTruth => "training_truth",
         }

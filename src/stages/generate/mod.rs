@@ -24,7 +24,7 @@ use anyhow::bail;
 
 use super::failure::Failure;
 use super::model_files::{
-    EngineChoice, EngineParams, ModelFolder, OpenModel, POINTER, is_model_name, sha256,
+    EngineChoice, EngineParams, ModelFolder, OpenModel, POINTER, is_model_name, sha256, shipped_as,
 };
 use super::retrieval::Primer;
 use super::{Contract, Progress, Stage, Summary};
@@ -40,6 +40,7 @@ pub use params::{Params, SamplerName, Tracks};
 use report::{GeneratePlace, GenerateSummary};
 
 pub(in crate::stages) use files::listen;
+pub(in crate::stages) use group::{GroupSettings, parameters as group_parameters};
 pub(in crate::stages) use maker::{generation_id, seed_of};
 pub(in crate::stages) use params::PostProcessParams;
 pub(in crate::stages) use settings::MotionSettings;
@@ -201,14 +202,17 @@ fn make_all(
 
 /// Opens the model of a store, or in a folder.
 fn open_model(params: &Params, store: Option<&Location>) -> anyhow::Result<ModelFolder> {
-    let Some(model) = &params.model else { return ModelFolder::pretrained() };
+    let Some(model) = &params.model else {
+        return ModelFolder::shipped(group::shipped_for(params));
+    };
     let folder = Path::new(model);
     if [file_names::CARD, POINTER].iter().any(|name| folder.join(name).is_file()) {
         return ModelFolder::of_folder(folder);
     }
-    match store {
-        Some(store) => ModelFolder::of_store(store, model, &params.engine.cache()),
-        None => bail!(
+    match (store, shipped_as(model)) {
+        (Some(store), _) => ModelFolder::of_store(store, model, &params.engine.cache()),
+        (None, Some(shipped)) => ModelFolder::shipped(shipped),
+        (None, None) => bail!(
             "there is no model in the folder {}; name the folder of a model (STORE/models/NAME), or give \
              --store beside its name",
             model

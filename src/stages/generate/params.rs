@@ -73,7 +73,8 @@ pub struct Params {
     /// Folder or bucket of the tables; its model and, without --audio, its phrases.
     #[arg(long, value_name = "URL")]
     pub store: Option<String>,
-    /// Name of a model of the store, or the folder of one [default: the model that ships with the program]
+    /// Name of a model of the store, or the folder of one [default: the model that ships with the program, `pretrained`, or
+    /// `group` where --dancers or --consistency are given]
     #[arg(long, value_name = "NAME|DIR")]
     pub model: Option<String>,
     /// Audio files to dance to, instead of the store's phrases.
