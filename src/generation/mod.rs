@@ -38,8 +38,8 @@ pub use retrieval::Retrieval;
 pub use runtime::{OnnxEngine, SessionPlan};
 pub use sampling::{Sampling, sample};
 pub use tokens::{
-    PlanRequest, PlannerEngine, TokenEngine, TokenGenerator, TokenTrack, TokensCard,
-    TokensNetworks, TokensProvenance, tokens_parameters,
+    PlanRequest, PlannerEngine, Reconstruction, TokenEngine, TokenGenerator, TokenTrack,
+    TokensCard, TokensNetworks, TokensProvenance, shuffle, tokens_parameters,
 };
 pub use track::{
     Generator, OVERLAP_FRAMES, PrimingMotion, RUN_WINDOWS, Track, WeightedConstraints,

@@ -5,11 +5,13 @@ mod card;
 mod control;
 mod engine;
 mod planner;
+mod reconstruct;
 mod track;
 mod weights;
 
 pub use card::{TokensCard, TokensNetworks, TokensProvenance};
 pub use engine::TokenEngine;
-pub use planner::{PlanRequest, PlannerEngine};
+pub use planner::{PlanRequest, PlannerEngine, shuffle};
+pub use reconstruct::Reconstruction;
 pub use track::{TokenGenerator, TokenTrack};
 pub use weights::tokens_parameters;

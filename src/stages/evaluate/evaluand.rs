@@ -8,20 +8,19 @@ use ndarray::Array2;
 
 use super::foreign::{self, ForeignMotions, RefusedFile};
 use super::job::{EvaluatedMotion, EvaluationJob, EvaluationMotion, MotionStage};
+use super::making::{Making, keyframes};
 use super::measure::{MeasuredMotion, stride_for};
 use super::motions::{self, PhraseIndex, is_held_out};
 use super::params::Params;
 use super::rows::{self, EvaluationRows, RunName};
-use super::splits::{MusicSplit, telling};
+use super::splits::{MusicSplit, splits_of, telling};
 use super::truth::{self, Truth};
+use crate::evaluation::keyframe::{KeyframeMisses, keyframe_misses};
 use crate::evaluation::metrics::PhaseOrigin;
 use crate::evaluation::window::own_window_frames;
 use crate::evaluation::{holds_by_construction, holds_by_derivation};
-use crate::generation::LearnedFrom;
 use crate::motion::postprocess::PostProcessConfig;
 use crate::stages::Progress;
-use crate::stages::generate::MotionSettings;
-use crate::stages::learned;
 use crate::stages::motion_source::generated_frames;
 use crate::store::tables::{self, GenerationRow};
 use crate::store::{
@@ -72,7 +71,9 @@ impl Evaluand {
         match (&params.run, &params.motions) {
             (Some(run), _) => Self::of_run(snapshot, run, params.num_samples.map(Into::into)),
             (None, Some(folder)) => Self::of_folder(snapshot, folder, params),
-            (None, None) => bail!("give --run NAME, or --motions DIR for those of another program"),
+            (None, None) => bail!(
+                "give --run NAME, --motions DIR for those of another program, or --tokenizer RUN"
+            ),
         }
     }
 
@@ -92,26 +93,27 @@ impl Evaluand {
                 "{n_groups} motions of groups of dancers are left out; what is measured is a soloist's."
             ));
         }
-        let motions = generations
+        let motions: anyhow::Result<Vec<EvaluationMotion>> = generations
             .iter()
             .zip(splits)
-            .map(|(row, split)| EvaluationMotion {
-                phrase_id: row.phrase_id.clone(),
-                sample: row.sample,
-                split,
-                misses: [row.control_error_mm, row.control_error_deg],
+            .map(|(row, split)| {
+                Ok(EvaluationMotion {
+                    phrase_id: row.phrase_id.clone(),
+                    sample: row.sample,
+                    split,
+                    misses: [row.control_error_mm, row.control_error_deg],
+                    keyframes: keyframes(row)?,
+                })
             })
             .collect();
-        let settings = |row: &GenerationRow| -> Option<MotionSettings> {
-            row.settings.as_ref().and_then(|text| serde_json::from_str(text).ok())
-        };
-        let settings: Vec<MotionSettings> = generations.iter().filter_map(settings).collect();
+        let motions = motions?;
+        let settings: Vec<Making> = generations.iter().filter_map(Making::of_row).collect();
         Ok(Self {
             run: run.to_owned(),
             model: generations[0].model.clone(),
             phrases,
             motions,
-            n_candidates: settings.iter().map(|settings| settings.best_of).max().unwrap_or(1),
+            n_candidates: settings.iter().map(|settings| settings.n_candidates).max().unwrap_or(1),
             notes,
             refused: Vec::new(),
             n_frames: generations
@@ -165,6 +167,7 @@ impl Evaluand {
                         sample: i32::try_from(file.sample).unwrap_or(i32::MAX),
                         split: MusicSplit::Unknown,
                         misses: [None; 2],
+                        keyframes: Vec::new(),
                     });
                     n_frames.push(motion.frames.nrows());
                     has_phase &= motion.has_phase;
@@ -387,27 +390,37 @@ impl Evaluand {
             return Ok(found
                 .into_iter()
                 .flatten()
-                .map(|is| EvaluatedMotion { is, decoded: None })
+                .map(|is| EvaluatedMotion {
+                    is,
+                    decoded: None,
+                    keyframes: KeyframeMisses::default(),
+                })
                 .collect());
         }
         let places: BTreeMap<&str, usize> =
             self.generations.iter().map(|row| row.generation.as_str()).zip(0..).collect();
         let names: BTreeSet<String> =
             self.generations.iter().map(|row| row.generation.clone()).collect();
-        let read = |schema, advances: bool| -> Result<Vec<Option<MeasuredMotion>>, StoreError> {
+        let read = |schema,
+                    look: &mut dyn FnMut(usize, &Array2<f32>)|
+         -> Result<Vec<Option<MeasuredMotion>>, StoreError> {
             let table = self.snapshot.table(schema)?;
             measurer.run(self.motions.len(), |give| {
                 table.visit_items(&names, |name, frames: Array2<f32>| {
                     if let Some(&i) = places.get(name) {
+                        look(i, &frames);
                         give(i, frames);
-                        progress.advance(u64::from(advances));
                     }
                     Ok::<_, StoreError>(())
                 })
             })
         };
-        let decoded = read(tables::decoded(), false)?;
-        let is = read(tables::generated(), true)?;
+        let decoded = read(tables::decoded(), &mut |_, _| ())?;
+        let mut keyframes = vec![KeyframeMisses::default(); self.motions.len()];
+        let is = read(tables::generated(), &mut |i, frames| {
+            keyframes[i] = keyframe_misses(frames.view(), &self.motions[i].keyframes);
+            progress.advance(1);
+        })?;
         progress.finish();
         let missing = self.generations.iter().zip(&is).find(|(_, found)| found.is_none());
         if let Some((row, _)) = missing {
@@ -421,7 +434,8 @@ impl Evaluand {
             .into_iter()
             .flatten()
             .zip(decoded)
-            .map(|(is, decoded)| EvaluatedMotion { is, decoded })
+            .zip(keyframes)
+            .map(|((is, decoded), keyframes)| EvaluatedMotion { is, decoded, keyframes })
             .collect())
     }
 }
@@ -449,41 +463,3 @@ fn refuse_outdated(
 
 /// Notes on single files that are told; the table of failures has all that were refused.
 const MAX_NOTES: usize = 5;
-
-/// Returns what the model that made each motion had to do with its music, as the card says, and a note where that is
-/// not known.
-pub(super) fn splits_of(
-    store: &Location,
-    phrases: &PhraseIndex,
-    generations: &[GenerationRow],
-) -> anyhow::Result<(Vec<MusicSplit>, Vec<String>)> {
-    let mut models: BTreeMap<(&str, &str), Option<LearnedFrom>> = BTreeMap::new();
-    let mut notes = Vec::new();
-    for row in generations {
-        let key = (row.model.as_str(), row.weights.as_str());
-        if models.contains_key(&key) {
-            continue;
-        }
-        let learned_from = match learned::of_model(store, key.0, key.1)? {
-            Ok(learned_from) => Some(learned_from),
-            Err(why) => {
-                notes.push(format!(
-                    "Nobody knows which of these songs model {} learned from: {why}.",
-                    row.model
-                ));
-                None
-            }
-        };
-        models.insert(key, learned_from);
-    }
-    let split = |row: &GenerationRow| -> MusicSplit {
-        let learned_from = models.get(&(row.model.as_str(), row.weights.as_str()));
-        match (learned_from, phrases.row(&row.phrase_id)) {
-            (Some(Some(learned_from)), Some(phrase)) => {
-                learned_from.split_of(phrase.song_hash.as_deref(), &phrase.content_hash)
-            }
-            _ => MusicSplit::Unknown,
-        }
-    };
-    Ok((generations.iter().map(split).collect(), notes))
-}

@@ -1,7 +1,6 @@
 //! Runs of groups: how dancers move together, keep apart and follow the music, beside real groups and made-up ones.
 
 mod made_up;
-mod summary;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Instant;
@@ -10,11 +9,11 @@ use anyhow::bail;
 use ndarray::{Array2, Array3, ArrayView3, Axis, concatenate, s};
 
 use super::Evaluate;
-use super::evaluand::splits_of;
+use super::metrics_summary::MetricsSummary;
 use super::motions::PhraseIndex;
 use super::params::Params;
 use super::rows::{EvaluationRows, RunIdentity};
-use super::splits::MusicSplit;
+use super::splits::{MusicSplit, splits_of};
 use crate::evaluation::frechet::{Gaussian, frechet_distance};
 use crate::evaluation::group::realism::kinetic_features;
 use crate::evaluation::group::{GroupMeasures, dancers, measure};
@@ -27,7 +26,6 @@ use crate::store::tables::{self, GenerationRow, MetricRow, PhraseRow};
 use crate::store::{self, Location, Row as _, StoreError, StoreSnapshot, TimestampUs, digest};
 use crate::units::{FPS, frames_to_s};
 use made_up::{copied, independent};
-use summary::GroupEvaluationSummary;
 
 /// Raised when this evaluation writes something else for the same motions.
 const OUTPUT_VERSION: u32 = 1;
@@ -239,14 +237,16 @@ pub fn run(
     let is_up_to_date = !params.force && identity.is_up_to_date(Evaluate::NAME)?;
     let n_frames: i64 = generations.iter().map(|row| row.n_frames).sum();
     let length_s = n_frames as f64 / FPS;
-    let mut summary = GroupEvaluationSummary {
+    let mut summary = MetricsSummary {
         store: store.to_string(),
         run: run.to_owned(),
+        items: "groups",
         n_motions: generations.len(),
         length_s,
         is_up_to_date,
         dry_run: params.dry_run,
         metrics: Vec::new(),
+        shown: &[],
         took_s: 0.0,
     };
     if params.dry_run {
