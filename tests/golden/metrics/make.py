@@ -479,7 +479,7 @@ def timing(path, frame, place):
     distances = [float(np.sqrt(np.sum((path[t] - place) ** 2))) for t in near]
     least = min(distances)
     for t, distance in zip(near, distances):
-        assert abs(distance - least - SAME_PLACE) > 1e-9, "rounding would decide; take another seed"
+        assert abs(distance - least - SAME_PLACE) > 1e-6, "rounding would decide; take another seed"
         if distance <= least + SAME_PLACE and (best is None or abs(t - frame) < best):
             best = abs(t - frame)
     return best / FPS
