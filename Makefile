@@ -31,6 +31,10 @@ demo: build setup ## from tests/data to tables, a library, trained networks, a p
 demo-group: build setup ## from tests/data to a library of groups, a model of groups, and five dancers on a page (build/demo-group)
 	@$(MAKE) --file pipelines/group.mk BIN=$(BIN)
 
+.PHONY: demo-tokens
+demo-tokens: build setup ## from tests/data to a tokenizer, a planner of its tokens, and motion along a path on a page (build/demo-tokens)
+	@$(MAKE) --file pipelines/tokens.mk BIN=$(BIN)
+
 # Processors round transforms differently, and a phrase that library constructs is named by a digest of every bit. One row
 # of motion that moves by half of its column's spread is told.
 TABLES := phrases,motion,beats,features,extractions

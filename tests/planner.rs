@@ -1,5 +1,7 @@
 //! Planners of tokens from training to motion, as a user makes and uses them.
 
+mod evaluation;
+
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Duration;

@@ -38,8 +38,8 @@ pub use retrieval::Retrieval;
 pub use runtime::{OnnxEngine, SessionPlan};
 pub use sampling::{Sampling, sample};
 pub use tokens::{
-    Control, PlanRequest, PlannerEngine, Steering, TokenEngine, TokenGenerator, TokenTrack,
-    TokensCard, TokensNetworks, TokensProvenance, steer, tokens_parameters,
+    Control, PlanRequest, PlannerEngine, Reconstruction, Steering, TokenEngine, TokenGenerator,
+    TokenTrack, TokensCard, TokensNetworks, TokensProvenance, shuffle, steer, tokens_parameters,
 };
 pub use track::{
     Generator, OVERLAP_FRAMES, PrimingMotion, RUN_WINDOWS, Track, WeightedConstraints,

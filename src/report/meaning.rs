@@ -67,7 +67,7 @@ pub(super) struct Meaning {
 
 /// Every metric that is known, in the order in which they are shown.
 #[rustfmt::skip]
-const MEANINGS: [Meaning; 56] = [
+const MEANINGS: [Meaning; 64] = [
     of("locking_r2", Music, Higher,
         "Share of the vertical velocity that repeats with the bar (R²).",
         "1 is perfect; chance is not 0 but locking_wrong_r2."),
@@ -145,6 +145,18 @@ const MEANINGS: [Meaning; 56] = [
     of("channel_distance", Real, Lower,
         "Wasserstein distance of a channel’s values from real motion’s, in its standard deviations.",
         "As low as the held-out truth’s is perfect."),
+    of("reconstruction_position", Real, Lower,
+        "Distance of positions from those that a tokenizer makes of their tokens again.",
+        "0 is perfect."),
+    of("reconstruction_orientation", Real, Lower,
+        "Angle of orientations to those that a tokenizer makes of their tokens again.",
+        "0 is perfect."),
+    of("tokens_per_frame", Real, Lower,
+        "Tokens that stand for a frame.",
+        "1/ρ by construction."),
+    of("code_perplexity", Varied, Higher,
+        "How many codes are in use, were all used alike: in codes, or as a share of the codebook.",
+        "K, or 1, where all are used alike."),
     of("diversity", Varied, Neither,
         "Mean distance of the features of two motions.",
         "Best near the truth’s."),
@@ -227,6 +239,18 @@ const MEANINGS: [Meaning; 56] = [
     of("control_orientation", Asked, Lower,
         "Angle from how the body was asked to be turned.",
         "0 is perfect."),
+    of("control_trajectory_error", Asked, Lower,
+        "Share of the motions with a keyframe that is off by more than a threshold (Traj. err.).",
+        "0 is perfect."),
+    of("control_location_error", Asked, Lower,
+        "Share of the keyframes that are off by more than a threshold (Loc. err.).",
+        "0 is perfect."),
+    of("control_average_error", Asked, Lower,
+        "Mean miss over keyframes (Avg. err.).",
+        "0 is perfect."),
+    of("control_timing_error", Asked, Lower,
+        "How long before or after its time the body is nearest to the place of a keyframe.",
+        "0 is perfect; at most half a second, beyond which nothing is looked for."),
 ];
 
 const fn of(

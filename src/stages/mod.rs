@@ -28,6 +28,7 @@ mod retrieval;
 mod seen;
 pub mod status;
 pub mod tokenize;
+mod tokens_model;
 pub mod train;
 mod trained;
 pub mod vacuum;

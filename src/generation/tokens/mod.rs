@@ -6,6 +6,7 @@ mod card;
 mod control;
 mod engine;
 mod planner;
+mod reconstruct;
 mod track;
 mod weights;
 
@@ -13,6 +14,7 @@ pub use asked::Control;
 pub use card::{TokensCard, TokensNetworks, TokensProvenance};
 pub use control::{Steering, steer};
 pub use engine::TokenEngine;
-pub use planner::{PlanRequest, PlannerEngine};
+pub use planner::{PlanRequest, PlannerEngine, shuffle};
+pub use reconstruct::Reconstruction;
 pub use track::{TokenGenerator, TokenTrack};
 pub use weights::tokens_parameters;

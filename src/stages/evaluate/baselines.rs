@@ -7,6 +7,7 @@
 pub(super) mod cache;
 #[cfg(test)]
 mod tests;
+pub mod tokens;
 
 use std::num::NonZeroUsize;
 use std::sync::Mutex;
@@ -21,7 +22,7 @@ use crate::generation::{
     Track,
 };
 use crate::model::condition;
-use crate::motion::postprocess::process;
+use crate::motion::postprocess::{PostProcessConfig, process};
 use crate::stages::Progress;
 use crate::stages::generate::{MotionSettings, PostProcessParams, seed_of};
 use crate::stages::model_files::OpenModel;
@@ -168,20 +169,9 @@ fn of_columns(row: &GenerationRow, card: &ModelCard) -> anyhow::Result<MotionSet
     })
 }
 
-/// Returns motion for each window, in order: what the store keeps, else sampled, and kept.
-///
-/// Same request, same bytes, for any number of threads.
-///
-/// # Errors
-/// When the store cannot be read or written, a file of the model is not what its card says, or the sampler
-/// refuses; windows that are no music in a sentence.
-pub fn sample(
-    baseline: Baseline,
-    request: &BaselineRequest,
-    progress: &dyn Progress,
-) -> anyhow::Result<Vec<BaselineMotion>> {
-    let BaselineRequest { store, model, settings, windows, .. } = request;
-    for MusicWindow { phrase_id, first_frame, features, phase, .. } in *windows {
+/// Refuses windows that are no music.
+fn check_windows(windows: &[MusicWindow]) -> anyhow::Result<()> {
+    for MusicWindow { phrase_id, first_frame, features, phase, .. } in windows {
         let (n_frames, n_features) = features.dim();
         ensure!(
             n_frames > 0 && n_features == FEATURE_DIM,
@@ -195,6 +185,23 @@ pub fn sample(
              for each"
         );
     }
+    Ok(())
+}
+
+/// Returns motion for each window, in order: what the store keeps, else sampled, and kept.
+///
+/// Same request, same bytes, for any number of threads.
+///
+/// # Errors
+/// When the store cannot be read or written, a file of the model is not what its card says, or the sampler
+/// refuses; windows that are no music in a sentence.
+pub fn sample(
+    baseline: Baseline,
+    request: &BaselineRequest,
+    progress: &dyn Progress,
+) -> anyhow::Result<Vec<BaselineMotion>> {
+    let BaselineRequest { store, model, settings, windows, .. } = request;
+    check_windows(windows)?;
     if windows.is_empty() {
         return Ok(Vec::new());
     }
@@ -239,34 +246,48 @@ fn sample_all(
         window_frames: card.window_frames,
         overlap_frames: settings.overlap_frames,
     };
+    let decode = |window: &MusicWindow, parts: &mut Vec<Array2<f32>>| {
+        let clock = window.clock.as_ref().filter(|_| !settings.no_clock);
+        let clock = clock.map(|clock| clock.view());
+        let heard = condition(&card.unet, window.features.view(), clock);
+        let track = Track {
+            condition: heard.view(),
+            // A network without training, or without music, would get from the phase what it is asked to make.
+            phase: None,
+            seed: seed_of(*seed, &window.phrase_id, window.first_frame, 0),
+            style: settings.style,
+            constraints: None,
+            primed: None,
+        };
+        generator.run(&track, |frames| -> Result<(), EngineError> {
+            parts.push(frames);
+            Ok(())
+        })
+    };
+    decoded_windows((windows, *threads), &settings.postprocess, decode, progress)
+}
+
+/// Makes motion for each window, in order and several at once, and processes it; `decode` gives the frames of a window
+/// in parts.
+fn decoded_windows(
+    (windows, threads): (&[MusicWindow], NonZeroUsize),
+    postprocess: &PostProcessConfig,
+    decode: impl Fn(&MusicWindow, &mut Vec<Array2<f32>>) -> Result<(), EngineError> + Sync,
+    progress: &dyn Progress,
+) -> anyhow::Result<Vec<BaselineMotion>> {
     progress.start("baselines", "windows", windows.len() as u64);
     let motions: Mutex<Vec<Option<BaselineMotion>>> = Mutex::new(vec![None; windows.len()]);
     let mut queue = windows.iter().enumerate();
     pool::run(
-        *threads,
+        threads,
         || queue.next(),
         |(i, window): (usize, &MusicWindow)| -> anyhow::Result<()> {
-            let clock = window.clock.as_ref().filter(|_| !settings.no_clock);
-            let clock = clock.map(|clock| clock.view());
-            let heard = condition(&card.unet, window.features.view(), clock);
-            let track = Track {
-                condition: heard.view(),
-                // A network without training, or without music, would get from the phase what it is asked to make.
-                phase: None,
-                seed: seed_of(*seed, &window.phrase_id, window.first_frame, 0),
-                style: settings.style,
-                constraints: None,
-                primed: None,
-            };
             let mut parts: Vec<Array2<f32>> = Vec::new();
-            generator.run(&track, |frames| -> Result<(), EngineError> {
-                parts.push(frames);
-                Ok(())
-            })?;
+            decode(window, &mut parts)?;
             let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
             let decoded = concatenate(Axis(0), &views).context("while joining windows")?;
             let mut frames = decoded.clone();
-            process(&settings.postprocess, &mut frames, window.phase.as_deref());
+            process(postprocess, &mut frames, window.phase.as_deref());
             lock(&motions)[i] = Some(BaselineMotion { decoded, frames });
             progress.advance(1);
             Ok(())

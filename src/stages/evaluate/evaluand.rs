@@ -11,6 +11,7 @@ use ndarray::{Array2, Axis};
 use super::foreign::{ForeignMotions, RefusedFile};
 use super::group::GroupMeasurer;
 use super::job::{EvaluatedMotion, EvaluationJob, EvaluationMotion, MotionStage};
+use super::making::{Making, keyframes};
 use super::measure::over_dancers;
 use super::motions::{self, PhraseIndex, is_held_out};
 use super::params::Params;
@@ -24,7 +25,6 @@ use crate::generation::LearnedFrom;
 use crate::motion::group::MAX_DANCERS;
 use crate::motion::postprocess::PostProcessConfig;
 use crate::stages::Progress;
-use crate::stages::generate::{GroupSettings, MotionSettings};
 use crate::stages::learned;
 use crate::stages::motion_source::generated_group;
 use crate::store::tables::{self, GenerationRow};
@@ -106,6 +106,7 @@ impl Evaluand {
         let mut motions = Vec::new();
         let mut n_frames = Vec::new();
         for (item, (row, split)) in generations.iter().zip(splits).enumerate() {
+            let keyframes = keyframes(row)?;
             for dancer in 0..row.count_dancers().max(1) {
                 motions.push(EvaluationMotion {
                     phrase_id: row.phrase_id.clone(),
@@ -114,21 +115,16 @@ impl Evaluand {
                     dancer,
                     split,
                     misses: [row.control_error_mm, row.control_error_deg],
+                    keyframes: keyframes.clone(),
                 });
                 n_frames.push(usize::try_from(row.n_frames).unwrap_or(0));
             }
         }
-        let texts = || generations.iter().filter_map(|row| row.settings.as_deref());
-        let settings: Vec<MotionSettings> =
-            texts().filter_map(|text| serde_json::from_str(text).ok()).collect();
-        // Rows of a model of groups have settings of their own.
-        let of_group = texts().find_map(GroupSettings::of_text);
-        let phase_given = settings.iter().any(|settings| settings.phase_given)
-            || of_group.as_ref().is_some_and(|settings| !settings.no_clock);
-        let n_candidates = settings.iter().map(|settings| settings.best_of).max().unwrap_or(1);
+        let settings: Vec<Making> = generations.iter().filter_map(Making::of_row).collect();
+        let phase_given = settings.iter().any(|settings| settings.phase_given);
+        let n_candidates = settings.iter().map(|settings| settings.n_candidates).max().unwrap_or(1);
         let decoder_derives = settings.iter().any(|settings| settings.decoder_derives);
-        let first = settings.into_iter().next().map(|settings| settings.postprocess);
-        let postprocess = of_group.map(|settings| settings.postprocess).or(first);
+        let postprocess = settings.into_iter().next().map(|settings| settings.postprocess);
         Ok(Self {
             run: run.to_owned(),
             model: generations[0].model.clone(),

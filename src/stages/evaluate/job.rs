@@ -13,9 +13,10 @@ use super::splits::{ALL, MusicSplit, SPLITS};
 use super::subjects::{Finding, MeasureSettings, MeasuredWindow, Subject, channels};
 use super::truth::{Truth, TruthPhrase};
 use crate::evaluation::coupling::{Coupling, Harmonics, Template, consistency_p};
+use crate::evaluation::keyframe::{Keyframe, KeyframeMisses};
 use crate::evaluation::metrics::{
-    MotionWindow, Number, PhaseOrigin, control_numbers, coupling_ratio, motion_ratios,
-    song_harmonics, whole_numbers,
+    MotionWindow, Number, PhaseOrigin, control_numbers, coupling_ratio, keyframe_numbers,
+    motion_ratios, song_harmonics, whole_numbers,
 };
 use crate::evaluation::verdict::{Evidence, Verdict, verdicts};
 use crate::evaluation::window::window_starts;
@@ -60,12 +61,15 @@ pub struct EvaluationMotion {
     pub split: MusicSplit,
     /// Largest misses of its constraints: mm and degrees.
     pub misses: [Option<f64>; 2],
+    /// What it was asked to do; empty where nothing was asked or nobody wrote it down.
+    pub keyframes: Vec<Keyframe>,
 }
 
 /// A motion, measured as it is and, where that is known, as it was decoded.
 pub struct EvaluatedMotion {
     pub is: MeasuredMotion,
     pub decoded: Option<MeasuredMotion>,
+    pub keyframes: KeyframeMisses,
 }
 
 /// Motion that was sampled as a baseline: one window each, and the place of its music.
@@ -165,7 +169,7 @@ impl EvaluationJob<'_> {
             let items: Vec<&MeasuredWindow> = generated.iter().map(|(item, _)| item).collect();
             let mut numbers = meter(items.len()).numbers(ALL, &items, own);
             numbers.extend(meter(0).decoded(&items, self.raw_phase()));
-            numbers.extend(self.control(None));
+            numbers.extend(self.control(evaluated, None));
             findings.push(Finding { subject: Subject::Generated, split: ALL, numbers });
         }
         for split in splits {
@@ -180,7 +184,7 @@ impl EvaluationJob<'_> {
             numbers.extend(motion_ratios(&numbers, &truth));
             numbers.extend(coupling_ratio(&numbers, &truth));
             numbers.extend(channels(chosen.iter().map(|(_, kept)| kept), &training_kept));
-            numbers.extend(self.control(Some(split)));
+            numbers.extend(self.control(evaluated, Some(split)));
             let shuffled = meter.shuffled(&items);
             let shifted = meter.shifted(&items);
             let items_in_split = |items: &'_ [MeasuredWindow]| -> Vec<MeasuredWindow> {
@@ -216,6 +220,7 @@ impl EvaluationJob<'_> {
                 finding(Subject::Shifted, shifted),
                 untrained,
                 baseline(Subject::NoMusic, &sampled.no_music),
+                baseline(Subject::ShuffledPlan, &sampled.shuffled_plan),
                 baseline(Subject::Retrieval, &retrieved),
                 baseline(Subject::MeanMotion, &constant),
             ]);
@@ -367,7 +372,7 @@ impl EvaluationJob<'_> {
     }
 
     /// Sums up how far motions are from their constraints.
-    fn control(&self, split: Option<MusicSplit>) -> Vec<Number> {
+    fn control(&self, evaluated: &[EvaluatedMotion], split: Option<MusicSplit>) -> Vec<Number> {
         let chosen = || {
             self.motions
                 .iter()
@@ -381,7 +386,17 @@ impl EvaluationJob<'_> {
                 .unzip()
         };
         let (position, orientation) = (misses(0), misses(1));
-        control_numbers([&position.0, &orientation.0], [&position.1, &orientation.1])
+        let mut numbers =
+            control_numbers([&position.0, &orientation.0], [&position.1, &orientation.1]);
+        let at_keyframes: Vec<(usize, &KeyframeMisses)> = self
+            .motions
+            .iter()
+            .zip(evaluated)
+            .filter(|(motion, _)| split.is_none_or(|split| motion.split == split))
+            .map(|(motion, found)| (self.phrases.song(&motion.phrase_id), &found.keyframes))
+            .collect();
+        numbers.extend(keyframe_numbers(&at_keyframes));
+        numbers
     }
 }
 

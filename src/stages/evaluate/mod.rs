@@ -6,7 +6,9 @@ mod evaluand;
 mod foreign;
 mod group;
 mod job;
+mod making;
 mod measure;
+mod metrics_summary;
 mod motions;
 mod page;
 mod params;
@@ -15,6 +17,7 @@ mod sampled;
 mod splits;
 mod subjects;
 mod survey;
+mod tokenizer;
 mod truth;
 
 use std::collections::BTreeSet;
@@ -48,7 +51,7 @@ impl Stage for Evaluate {
     const NAME: &'static str = "evaluate";
     const ABOUT: &'static str = "tell good motion from bad, beside its baselines";
     const CONTRACT: Contract = Contract {
-        reads: "generations, generated, decoded, phrases, beats, features, motion, models/MODEL",
+        reads: "generations, generated, decoded, phrases, beats, features, motion, models/MODEL, runs/RUN",
         writes: "sanity_checks, metrics, verdicts, song_metrics, reference/, baselines/, an HTML file with \
                  --report",
     };
@@ -58,6 +61,9 @@ impl Stage for Evaluate {
         let started = Instant::now();
         params.check()?;
         let store = Location::open(&params.store, &params.client.options())?;
+        if let Some(run) = &params.tokenizer {
+            return tokenizer::run(&params, &store, run, progress);
+        }
         let against = params.against.as_deref().map(|run| page::OtherRun::read(&store, run));
         let against = against.transpose()?;
         let mut subject = Evaluand::read(&store, &params)?;

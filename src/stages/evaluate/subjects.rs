@@ -32,6 +32,10 @@ pub enum Subject {
     Untrained,
     /// Motion of the trained network, its music withheld.
     NoMusic,
+    /// Motion of a trained model of tokens, the tokens of each window in an order of chance.
+    ShuffledPlan,
+    /// Motion that a tokenizer made of the tokens of real motion.
+    Reconstructed,
     /// The library's phrase with the nearest features.
     Retrieval,
     MeanMotion,
@@ -53,6 +57,8 @@ impl Subject {
             Self::Shifted => "shifted",
             Self::Untrained => "untrained",
             Self::NoMusic => "no_music",
+            Self::ShuffledPlan => "shuffled_plan",
+            Self::Reconstructed => "reconstructed",
             Self::Retrieval => "retrieval",
             Self::MeanMotion => "mean_motion",
             Self::Independent => "independent",

@@ -382,6 +382,7 @@ impl GroupMaker<'_> {
             velocity_error,
             control_error_mm: None,
             control_error_deg: None,
+            constraints: None,
             generate_s,
             real_time_factor: generate_s / frames_to_s(n_frames).max(f64::MIN_POSITIVE),
             settings: Some(settings.text()),

@@ -4,6 +4,7 @@ use std::time::Instant;
 
 use ndarray::{Array2, Array3, ArrayView2, Axis, concatenate};
 
+use super::constraints_text::text_of;
 use super::music::{HeardMusic, PhraseMusic};
 use super::params::Settings;
 use crate::evaluation::{Score, derivative_error, score};
@@ -188,6 +189,7 @@ impl SoloistMaker<'_> {
                 score: &score,
                 velocity_error,
                 control: worst_misses(&misses),
+                constraints: constraints.as_ref(),
                 generate_s,
             };
             rows.push(self.row(music, n_frames, &found));
@@ -299,6 +301,7 @@ impl SoloistMaker<'_> {
             velocity_error: found.velocity_error,
             control_error_mm: found.control[0],
             control_error_deg: found.control[1],
+            constraints: found.constraints.map(text_of),
             generate_s: found.generate_s,
             real_time_factor: found.generate_s / frames_to_s(n_frames).max(f64::MIN_POSITIVE),
             settings: Some(settings.to_row().to_json()),
@@ -339,6 +342,7 @@ struct CandidateFindings<'a> {
     velocity_error: f64,
     /// Largest misses: mm, degrees.
     control: [Option<f64>; 2],
+    constraints: Option<&'a Constraints>,
     generate_s: f64,
 }
 

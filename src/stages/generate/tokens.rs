@@ -3,11 +3,12 @@
 use std::num::NonZeroUsize;
 use std::time::Instant;
 
-use anyhow::{Context as _, bail, ensure};
+use anyhow::{bail, ensure};
 use ndarray::{Array2, ArrayView2, Axis, concatenate};
 use serde::{Deserialize, Serialize};
 
 use super::constraints_file::ConstraintsRequest;
+use super::constraints_text::text_of;
 use super::maker::{
     GeneratedMotion, MotionMaker, StopReason, generation_id, seed_of, worst_misses,
 };
@@ -19,15 +20,15 @@ use super::{make_all, name_of_model, weights_digest_of_tokens};
 use crate::diffusion::{SamplerConfig, Schedule, TokenSampling};
 use crate::evaluation::{derivative_error, score};
 use crate::generation::{
-    Control, FamilyCard as _, PlannerEngine, Steering, TokenEngine, TokenGenerator, TokenTrack,
-    TokensCard, WeightedConstraints, steer, tokens_parameters,
+    Control, FamilyCard as _, Steering, TokenGenerator, TokenTrack, TokensCard,
+    WeightedConstraints, steer,
 };
 use crate::motion::postprocess::{HeldPoses, PostProcessConfig, process, process_holding};
 use crate::motion::style::STYLE_DIM;
 use crate::motion::{Channel, MOTION_DIM};
-use crate::onnx::Model;
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::model_folder::ModelFolder;
+use crate::stages::tokens_model::OpenTokensModel;
 use crate::stages::train::session::check_run_name;
 use crate::stages::{Progress, Summary};
 use crate::store::tables::GenerationRow;
@@ -36,31 +37,31 @@ use crate::units::frames_to_s;
 
 /// The settings that determine a motion beside its music and its sample: the column `settings` of `generations`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-struct TokensSettings {
+pub struct TokensSettings {
     /// The version of what generate writes.
-    output_version: u32,
+    pub output_version: u32,
     /// How tokens are drawn.
-    plan: TokenSampling,
+    pub plan: TokenSampling,
     /// How motion is made of them.
-    sampler: SamplerConfig,
+    pub sampler: SamplerConfig,
     /// Of the plan: 1 follows the music, more exaggerates it, 0 ignores it.
-    guidance: f64,
+    pub guidance: f64,
     /// Style in the model's units.
-    style: Option<[f32; STYLE_DIM]>,
+    pub style: Option<[f32; STYLE_DIM]>,
     /// Tokens that neighbouring windows share.
-    overlap_tokens: usize,
-    postprocess: PostProcessConfig,
+    pub overlap_tokens: usize,
+    pub postprocess: PostProcessConfig,
     /// Digest of the constraints.
-    constraints: Option<String>,
+    pub constraints: Option<String>,
     /// Length of the steps by which the decoder is steered to constraints.
-    constraint_strength: f64,
+    pub constraint_strength: f64,
     /// Whether the rest of the way to constraints is left.
-    soft: bool,
+    pub soft: bool,
     /// Whether the clock is withheld from a network that hears it.
-    no_clock: bool,
+    pub no_clock: bool,
     /// Where constraints act; none where there are none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    control: Option<Control>,
+    pub control: Option<Control>,
 }
 
 impl TokensSettings {
@@ -142,9 +143,10 @@ pub fn run(
     progress: &dyn Progress,
 ) -> anyhow::Result<Box<dyn Summary>> {
     let started = Instant::now();
-    let card = TokensCard::read(files.card_bytes(), files.card_place())?;
+    let model = OpenTokensModel::read(&files)?;
+    let card = &model.card;
     let constraints = params.constraints_asked()?;
-    let settings = TokensSettings::new(params, &card, constraints.as_ref())?;
+    let settings = TokensSettings::new(params, card, constraints.as_ref())?;
     let name = name_of_model(params, &card.name);
     let run = params.run.clone().unwrap_or_else(|| name.clone());
     check_run_name(&run)?;
@@ -153,15 +155,7 @@ pub fn run(
     let n_workers = if is_single { NonZeroUsize::MIN } else { threads };
     let n_threads = NonZeroUsize::new(threads.get() / n_workers.get()).unwrap_or(NonZeroUsize::MIN);
     let workers = (n_workers, n_threads);
-    let (of_tokenizer, of_planner) = tokens_parameters(&card, |name| -> anyhow::Result<_> {
-        let place = files.place_of(name);
-        Ok((Model::read(files.read(name)?, None, &place)?, place))
-    })?;
-    let tokens =
-        TokenEngine::new(&card.tokens, of_tokenizer, &card.normalizer, card.window_frames, workers)
-            .context("while starting threads")?;
-    let planner = PlannerEngine::new(&card.planner, of_planner, &card.feature_scale, workers)
-        .context("while starting threads")?;
+    let (card, tokens, planner) = model.engines(workers)?;
     let schedule = Schedule::new(&card.diffusion)?;
     let maker = TokensMaker {
         generator: TokenGenerator {
@@ -301,6 +295,7 @@ impl TokensMaker<'_> {
             self.row(music, (sample, seed), (&frames, &decoded), heard.phase.as_deref(), seconds);
         let misses = constraints.as_ref().map(|c| c.errors(frames.view())).unwrap_or_default();
         [row.control_error_mm, row.control_error_deg] = worst_misses(&misses);
+        row.constraints = constraints.as_ref().map(text_of);
         let [frames, decoded] = [frames, decoded].map(|motion| motion.insert_axis(Axis(0)));
         Ok(GeneratedMotion { frames, decoded, rows: vec![row], displacement, seconds })
     }
@@ -346,6 +341,7 @@ impl TokensMaker<'_> {
             velocity_error,
             control_error_mm: None,
             control_error_deg: None,
+            constraints: None,
             generate_s,
             real_time_factor: generate_s / frames_to_s(n_frames).max(f64::MIN_POSITIVE),
             settings: Some(settings.text()),

@@ -72,6 +72,7 @@ impl Evaluand {
                             dancer,
                             split: MusicSplit::Unknown,
                             misses: [None; 2],
+                            keyframes: Vec::new(),
                         });
                         n_frames.push(motion.frames.nrows());
                     }

@@ -9,6 +9,7 @@ use super::super::group::GroupMeasurer;
 use super::super::job::{EvaluatedMotion, EvaluationJob};
 use super::super::measure::{MeasuredMotion, stride_for};
 use super::Evaluand;
+use crate::evaluation::keyframe::{KeyframeMisses, keyframe_misses};
 use crate::stages::Progress;
 use crate::store::tables;
 use crate::store::{Location, StoreError};
@@ -54,7 +55,11 @@ impl Evaluand {
             return Ok(found
                 .into_iter()
                 .flatten()
-                .map(|is| EvaluatedMotion { is, decoded: None })
+                .map(|is| EvaluatedMotion {
+                    is,
+                    decoded: None,
+                    keyframes: KeyframeMisses::default(),
+                })
                 .collect());
         }
         let names: BTreeSet<String> =
@@ -78,8 +83,12 @@ impl Evaluand {
             })
         };
         let decoded: Vec<Option<MeasuredMotion>> = read(tables::decoded(), &mut |_, _| {})?;
+        let mut keyframes = vec![KeyframeMisses::default(); self.motions.len()];
         let is: Vec<Option<MeasuredMotion>> = read(tables::generated(), &mut |first, group| {
             look(first, group);
+            for (i, frames) in (first..).zip(group.axis_iter(Axis(0))) {
+                keyframes[i] = keyframe_misses(frames, &self.motions[i].keyframes);
+            }
             progress.advance(1);
         })?;
         progress.finish();
@@ -95,7 +104,8 @@ impl Evaluand {
             .into_iter()
             .flatten()
             .zip(decoded)
-            .map(|(is, decoded)| EvaluatedMotion { is, decoded })
+            .zip(keyframes)
+            .map(|((is, decoded), keyframes)| EvaluatedMotion { is, decoded, keyframes })
             .collect())
     }
 }
