@@ -31,6 +31,10 @@ demo: build setup ## from tests/data to tables, a library, trained networks, a p
 demo-group: build setup ## from tests/data to a library of groups, a model of groups, and five dancers on a page (build/demo-group)
 	@$(MAKE) --file pipelines/group.mk BIN=$(BIN)
 
+.PHONY: demo-tokens
+demo-tokens: build setup ## from tests/data to a tokenizer, a planner of its tokens, and motion along a path on a page (build/demo-tokens)
+	@$(MAKE) --file pipelines/tokens.mk BIN=$(BIN)
+
 # Processors round transforms differently, and a phrase that library constructs is named by a digest of every bit. One row
 # of motion that moves by half of its column's spread is told.
 TABLES := phrases,motion,beats,features,extractions
@@ -49,6 +53,10 @@ keep-tables: build-diff-tables ## keep the demo's tables as they are now; CHANGE
 .PHONY: pretrained
 pretrained: build setup ## train the model that ships with the program again (models/pretrained)
 	@$(MAKE) --file pipelines/pretrained.mk BIN=$(BIN)
+
+.PHONY: pretrained-group
+pretrained-group: build setup ## train the model of groups that ships with the program again (models/group)
+	@$(MAKE) --file pipelines/pretrained.mk pretrained-group BIN=$(BIN)
 
 .PHONY: ingest
 ingest: build ## ingest your own files: make ingest SOURCE=… STORE=… [SHARDS=8 -j4]
@@ -179,6 +187,11 @@ bench-evaluation: build/bench-venv/ready build ## measure evaluation of 10,000 m
 bench-store: build/bench-venv/ready ## measure a store of a million phrases, and a year of updates [BENCH_PROFILE, BENCH_ARGS]
 	$(CARGO) build --locked --profile $(BENCH_PROFILE) --bin motiongen
 	build/bench-venv/bin/python benches/store.py --bin $(BENCH_BIN)/motiongen $(BENCH_ARGS)
+
+.PHONY: bench-scale
+bench-scale: build/bench-venv/ready ## measure what planning costs on stores of millions of songs that nobody has [BENCH_ARGS]
+	$(CARGO) build --locked --profile $(BENCH_PROFILE) --bin motiongen --example synthetic-store
+	build/bench-venv/bin/python benches/scale.py --bin $(BENCH_BIN) $(BENCH_ARGS)
 
 .PHONY: bench-room
 bench-room: ## build the room autodiff alone, from nothing

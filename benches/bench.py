@@ -61,7 +61,7 @@ class Run:
     output: str
 
 
-def run(command: list[str | pathlib.Path]) -> Run:
+def run(command: list[str | pathlib.Path], good: tuple[int, ...] = (0,)) -> Run:
     """Runs a program to its good end and measures the whole process."""
     with tempfile.TemporaryFile() as output:
         start = time.perf_counter()
@@ -72,7 +72,7 @@ def run(command: list[str | pathlib.Path]) -> Run:
         child.returncode = os.waitstatus_to_exitcode(status)
         output.seek(0)
         text = output.read().decode(errors="replace")
-    if child.returncode != 0:
+    if child.returncode not in good:
         sys.exit(f"{' '.join(map(str, command))} ended with {child.returncode}:\n{text}")
     return Run(wall_s, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024 / 1e6, text)
 

@@ -5,6 +5,8 @@
     python benches/training.py --bin … --quick      the small network, to see that it works
 
   finetune  a step end to end: 5 steps of DDIM with gradients, both networks, batch 8; time and memory
+  group     a step of training a model of groups, batch 4 of three dancers, `small` and `base`; time and memory
+  group_generation   groups by an untrained network, whose speed is that of a trained one
   train     steps of `motiongen train` on the demo library: how long a step waits for its batch, and
             what an epoch of the reference's 5,242 phrases would take
 
@@ -31,6 +33,10 @@ ROOT = HERE.parent
 # What the reference trains on, and its and PyTorch's times for an epoch of it (issue and section 13.1).
 EPOCH_PHRASES = 5242
 REFERENCE_MIN = 35
+# Groups of a batch, and their dancers.
+GROUPS, DANCERS = 4, 3
+# Dancers and frames of generation.
+MANY_DANCERS, LONG_FRAMES = 5, 30 * 30
 
 
 def finetune(arguments: argparse.Namespace) -> str:
@@ -62,6 +68,71 @@ def finetune(arguments: argparse.Namespace) -> str:
         f"### End-to-end step of `{arguments.preset}`, batch {arguments.batch}, {FRAMES} frames, "
         f"5 DDIM steps, {arguments.threads} threads"
     )
+    return f"{title}\n\n{table(head, rows)}"
+
+
+def group(arguments: argparse.Namespace) -> str:
+    presets = ["small"] if arguments.quick else ["small", "base"]
+    parts = []
+    for preset in presets:
+        workers = {
+            OURS: Worker([arguments.bin / "examples" / "training-bench"], arguments.threads),
+            TORCH: Worker([sys.executable, HERE / "group_peer.py"], arguments.threads),
+        }
+        counts = {
+            name: worker.ask(
+                "init",
+                family="group",
+                preset=preset,
+                batch=GROUPS,
+                dancers=DANCERS,
+                frames=FRAMES,
+                threads=arguments.threads,
+                # As `train` does by itself.
+                side_by_side=2 if preset == "small" else 1,
+            )["parameters"]
+            for name, worker in workers.items()
+        }
+        answers = in_turns(workers, "step", arguments.repeats, lead=1)
+        rows = []
+        for name, own in answers.items():
+            ratio = f"{median(answers[TORCH], 'wall_s') / median(own, 'wall_s'):.2f}"
+            peak = workers[name].peak_mb()
+            cpu = f"{median(own, 'cpu_s') * 1e3:,.0f}"
+            rows.append([name, f"{counts[name]:,}", spread(own), cpu, ratio, f"{peak:,.0f}"])
+        for worker in workers.values():
+            worker.close()
+        head = ["program", "parameters", "step ms", "CPU ms", "theirs / ours", "peak MB"]
+        title = (
+            f"### Step of a model of groups, `{preset}`, batch {GROUPS} of {DANCERS} dancers, {FRAMES} frames, "
+            f"8 mixed groups each, {arguments.threads} threads"
+        )
+        parts.append(f"{title}\n\n{table(head, rows)}")
+    return "\n\n".join(parts)
+
+
+def group_generation(arguments: argparse.Namespace) -> str:
+    rows = []
+    for preset in ["small"] if arguments.quick else ["small", "base"]:
+        for consistency in (0.0, 0.5):
+            worker = Worker([arguments.bin / "examples" / "training-bench"], arguments.threads)
+            worker.ask(
+                "init",
+                family="group_generation",
+                preset=preset,
+                dancers=MANY_DANCERS,
+                frames=LONG_FRAMES,
+                threads=arguments.threads,
+                consistency=consistency,
+            )
+            answers = in_turns({OURS: worker}, "step", 1 if preset == "base" else arguments.repeats)[OURS]
+            length_s = LONG_FRAMES / 30
+            factor = f"{median(answers, 'wall_s') / length_s:.2f}"
+            cpu = f"{median(answers, 'cpu_s') / length_s:.2f}"
+            rows.append([preset, f"{consistency:g}", spread(answers), factor, cpu, f"{worker.peak_mb():,.0f}"])
+            worker.close()
+    head = ["preset", "γ", "ms", "real-time factor", "CPU s a second", "peak MB"]
+    title = f"### {MANY_DANCERS} dancers, {LONG_FRAMES / 30:.0f} s, 20 steps, {arguments.threads} threads"
     return f"{title}\n\n{table(head, rows)}"
 
 
@@ -138,14 +209,14 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="the small network, few steps")
     parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--only", choices=["finetune", "train"])
+    parser.add_argument("--only", choices=["finetune", "group", "group_generation", "train"])
     arguments = parser.parse_args()
     arguments.bin = arguments.bin.resolve()
     arguments.preset = "small" if arguments.quick else "base"
     arguments.batch, arguments.train_steps = 8, 14
     arguments.work = ROOT / "build"
     arguments.work.mkdir(exist_ok=True)
-    parts = {"finetune": finetune, "train": train}
+    parts = {"finetune": finetune, "group": group, "group_generation": group_generation, "train": train}
     print(machine(arguments))
     for name, part in parts.items():
         if arguments.only in (None, name):

@@ -27,6 +27,7 @@ demo-group:
 	@echo "tables   $(STORE)"
 	@echo "answers  $(ANSWERS)"
 	@echo "model    $(STORE)/models/$(MODEL)"
+	@echo "report   $(OUT)/report.html"
 	@echo "motion   $(PAGE) (open it in a browser)"
 
 # library: groups of two to five dancers.
@@ -50,7 +51,8 @@ $(STAMPS)/generate-$(call name_of,$(1)).done: | $(EXPORTED) $(WITH)
 	$$(call stage,$$(MOTIONGEN) generate --config $$(CONFIG) --store $$(STORE) --model $$(MODEL) --dancers 5 \
 	  --split test --run $(call name_of,$(1)) --consistency $(lastword $(subst =, ,$(1))))
 $(STAMPS)/evaluate-$(call name_of,$(1)).done: | $(STAMPS)/generate-$(call name_of,$(1)).done $(WITH)
-	$$(call stage,$$(MOTIONGEN) evaluate --config $$(CONFIG) --store $$(STORE) --run $(call name_of,$(1)))
+	$$(call stage,$$(MOTIONGEN) evaluate --config $$(CONFIG) --store $$(STORE) --run $(call name_of,$(1)) \
+	  --report $$(OUT)/report.html)
 endef
 $(foreach d,$(DEGREES),$(eval $(call degree,$(d))))
 

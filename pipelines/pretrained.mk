@@ -2,6 +2,7 @@
 # rounded to half precision.
 #
 #   make pretrained                        builds first
+#   make pretrained-group                  the model of groups (models/group)
 #   make -f pipelines/pretrained.mk BIN=…  with executables that are there already
 
 DATA    ?= tests/data
@@ -34,3 +35,30 @@ pretrained:
 	  cp $$folder/$$version/unet.onnx $$folder/$$version/decoder.onnx $$folder/$$version/model.json $(INTO)/
 	@echo "model   $(INTO)"
 	@echo "report  $(OUT)/report.html"
+
+# The model of groups: songs of tests/data and composed ones, groups of two to five.
+GROUP_STORE  ?= $(OUT)/group-store
+GROUP_CONFIG ?= pipelines/group.toml
+GROUP_TRAIN  ?= --preset small --steps 4000
+GROUP_INTO   ?= models/group
+GROUP        := group
+
+.PHONY: pretrained-group
+pretrained-group:
+	@mkdir -p $(STAMPS)
+	for source in phrases music; do \
+	  $(MOTIONGEN) ingest --config $(GROUP_CONFIG) --source $(DATA)/$$source --store $(GROUP_STORE); done
+	$(MOTIONGEN) extract --config $(GROUP_CONFIG) --store $(GROUP_STORE)
+	$(MOTIONGEN) library --config $(GROUP_CONFIG) --store $(GROUP_STORE) --dancers 2..5
+	$(MOTIONGEN) train --config $(GROUP_CONFIG) --store $(GROUP_STORE) --family group --run $(GROUP) $(GROUP_TRAIN)
+	$(MOTIONGEN) export --store $(GROUP_STORE) --run $(GROUP) --model $(GROUP) --precision fp16 --licence '$(LICENCE)' --force
+	for gamma in -1 0 1; do \
+	  $(MOTIONGEN) generate --config $(GROUP_CONFIG) --store $(GROUP_STORE) --model $(GROUP) --dancers 4 --split test \
+	    --consistency $$gamma --run gamma$$gamma; \
+	  $(MOTIONGEN) evaluate --store $(GROUP_STORE) --run gamma$$gamma --report $(OUT)/group-report.html; done
+	mkdir -p $(GROUP_INTO)
+	folder=$(GROUP_STORE)/models/$(GROUP); \
+	  version=$$(sed -n "s/.*\"folder\": *\"\([0-9a-f]*\)\".*/\1/p" $$folder/current.json 2> /dev/null || true); \
+	  cp $$folder/$$version/denoiser.onnx $$folder/$$version/score.onnx $$folder/$$version/model.json $(GROUP_INTO)/
+	@echo "model   $(GROUP_INTO)"
+	@echo "report  $(OUT)/group-report.html"

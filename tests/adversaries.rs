@@ -40,12 +40,12 @@ const CASES: [(&str, &[&str], &[&str]); 14] = [
 const TAKE_FRAMES: usize = 480;
 
 #[track_caller]
-fn succeeds(output: Output) -> Output {
+pub fn succeeds(output: Output) -> Output {
     assert_eq!(output.code, 0, "{output:?}");
     output
 }
 
-fn data(folder: &str) -> PathBuf {
+pub fn data(folder: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(folder)
 }
 

@@ -1,5 +1,6 @@
 //! `motiongen evaluate`, as a user runs it, on motions whose numbers are known by construction.
 
+mod asked;
 mod verdicts;
 
 use std::collections::BTreeMap;
@@ -46,7 +47,7 @@ fn interval_s(song: usize) -> f64 {
 }
 
 /// A store of songs with motion, features and beats.
-fn make_store(dir: &Dir) -> PathBuf {
+pub fn make_store(dir: &Dir) -> PathBuf {
     let (source, store) = (dir.at("source"), dir.at("store"));
     for (i, id) in all_names().iter().enumerate() {
         let frames = coherent(N_FRAMES, i as u32);
@@ -134,13 +135,24 @@ struct Motion {
 
 /// Writes motions under the name of a run.
 fn put(store: &Path, name: &str, motions: &[Motion]) {
+    put_asked(store, name, motions, &|_| None);
+}
+
+/// The same of motions that were asked to do something.
+fn put_asked(
+    store: &Path,
+    name: &str,
+    motions: &[Motion],
+    asked: &dyn Fn(&Motion) -> Option<String>,
+) {
     let weights = weights(store);
     let known = crate::support::phrases(store);
     let store = Location::local(store).expect("a store");
     let ledger = Ledger::read(&store, "generate").expect("a ledger");
     let mut commit = Commit::new(&store, "generate", name, "phrases");
     let mut found = Vec::new();
-    for Motion { phrase, sample, frames } in motions {
+    for motion in motions {
+        let Motion { phrase, sample, frames } = motion;
         let id = format!("{name}/{phrase}/{sample}");
         let labels = [
             Label::Text(name.to_owned()),
@@ -180,6 +192,7 @@ fn put(store: &Path, name: &str, motions: &[Motion]) {
             velocity_error: 0.0,
             control_error_mm: (*sample == 0).then_some(12.0),
             control_error_deg: None,
+            constraints: asked(motion),
             generate_s: 0.1,
             real_time_factor: 0.01,
             settings: None,

@@ -17,8 +17,10 @@ use motiongen::evaluation::interval::{
     Estimate, clustered_mean_estimate, clustered_share_estimate, jackknife_estimate, mean_estimate,
     paired_difference, share_estimate,
 };
+use motiongen::evaluation::keyframe::{Keyframe, KeyframeMisses, keyframe_misses};
 use motiongen::evaluation::kinetic::{CHUNK_FRAMES, Formula, axis_features, marker_features};
 use motiongen::evaluation::locking::{BarLocking, Passage, r2_at};
+use motiongen::evaluation::metrics::keyframe_numbers;
 use motiongen::evaluation::reference_statistics::{
     FeatureSet, FeatureStatistics, ReferenceStatistics,
 };
@@ -331,6 +333,61 @@ fn misses_are_summed_up_as_omnicontrol_does() {
         let by_sample = found.mean_by_sample.expect("finite");
         assert_near("mean by sample", by_sample, wanted.mean_by_sample);
     }
+}
+
+#[test]
+fn motions_are_measured_at_their_keyframes_as_omnicontrol_does() {
+    let golden = golden();
+    let of_motion = |(row, sample): (&MotionRow, &golden::SampleRow)| {
+        let keyframe = |i: usize| Keyframe {
+            frame: sample.at[i],
+            position_m: sample.position[i].map(Some),
+            orientation: Some(sample.quaternion[i]),
+        };
+        let keyframes: Vec<Keyframe> = (0..sample.at.len()).map(keyframe).collect();
+        let found = keyframe_misses(row.frames().view(), &keyframes);
+        // Motion is kept as f32, and NumPy has it as f64: 1e-7 of a metre.
+        let is_near = |found: &[f64], wanted: &[f64], within: f64| {
+            assert_eq!(found.len(), wanted.len());
+            assert!(found.iter().zip(wanted).all(|(a, b)| (a - b).abs() < within), "{found:?}");
+        };
+        is_near(&found.position_mm, &sample.mm, 1e-3);
+        is_near(&found.orientation_deg, &sample.deg, 1e-4);
+        is_near(&found.timing_s, &sample.timing_s, 1e-12);
+        found
+    };
+    let misses: Vec<KeyframeMisses> =
+        golden.motions.iter().zip(&golden.control.samples).map(of_motion).collect();
+    let motions: Vec<(usize, &KeyframeMisses)> = (0..).zip(&misses).collect();
+    let numbers = keyframe_numbers(&motions);
+    let check = |metric: &str, variant: &str, wanted: f64| {
+        let found = numbers.iter().find(|n| n.metric == metric && n.variant == variant);
+        let found = found.unwrap_or_else(|| panic!("no {metric} {variant}")).estimate;
+        let value = found.value.expect("a value");
+        assert!(
+            (value - wanted).abs() <= 1e-5 * wanted.abs(),
+            "{metric} {variant}: {value}, not {wanted}"
+        );
+        assert!(found.ci_low <= found.value && found.value <= found.ci_high, "{metric} {variant}");
+    };
+    let kinds = [
+        ("position", "mm", &golden.control.position),
+        ("orientation", "deg", &golden.control.rotation),
+    ];
+    for (kind, unit, rows) in kinds {
+        for row in rows {
+            let variant = format!("{kind}_{}{unit}", row.threshold);
+            check("control_trajectory_error", &variant, row.trajectory);
+            check("control_location_error", &variant, row.location);
+            let by_sample = format!("{variant}_by_sample");
+            check("control_location_error", &by_sample, row.location_by_sample);
+            check("control_average_error", kind, row.mean);
+            check("control_average_error", &format!("{kind}_by_sample"), row.mean_by_sample);
+        }
+    }
+    let [pooled, by_sample] = golden.control.timing;
+    check("control_timing_error", "position", pooled);
+    check("control_timing_error", "position_by_sample", by_sample);
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! `motiongen generate`, as a user runs it: tables and files, killed, sharded, and with bad input.
 
+mod asked;
 mod priming;
 mod songs;
 

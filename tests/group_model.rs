@@ -124,7 +124,9 @@ fn groups_are_learned_from_and_danced_in_files() {
     let checks: Vec<OnnxCheckRow> = rows(&store);
     let names: Vec<&str> = checks.iter().map(|row| row.check.as_str()).collect();
     assert_eq!(names.iter().filter(|name| **name == "forward").count(), 4, "{names:?}");
-    assert_eq!(names.iter().filter(|name| **name == "score").count(), 4, "{names:?}");
+    for check in ["score", "agreement"] {
+        assert_eq!(names.iter().filter(|name| **name == check).count(), 4, "{check}: {names:?}");
+    }
     assert!(checks.iter().all(|row| row.passed && row.max_abs <= 1e-4), "{checks:?}");
     let again = export(&store, "run", &[]);
     assert!(again.stdout.contains("up to date"), "{again:?}");
@@ -258,7 +260,7 @@ fn mistakes_are_named() {
     // A model of one dancer makes no group, and a command for soloists takes no model of groups.
     let mut command = motiongen();
     command.arg("generate").arg("--audio").arg(&audio).arg("--output").arg(&out);
-    let output = finish(command.args(["--dancers=5", "--quiet"]));
+    let output = finish(command.args(["--model=pretrained", "--dancers=5", "--quiet"]));
     assert_eq!(output.code, 2, "{output:?}");
     assert!(
         output.stderr.contains(

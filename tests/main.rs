@@ -16,6 +16,7 @@ mod evaluation;
 mod extract;
 mod foreign_models;
 mod generate;
+mod group_adversaries;
 mod group_model;
 mod groups;
 mod help;

@@ -1,5 +1,7 @@
 //! Planners of tokens from training to motion, as a user makes and uses them.
 
+mod evaluation;
+
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -358,9 +360,92 @@ fn motion_passes_where_constraints_ask_it_to() {
     let (w, y) = (at(140, 9), at(140, 11));
     let turn = (2.0 * y.atan2(w)).to_degrees();
     assert!((turn - 40.0).abs() < 0.5 || (turn + 320.0).abs() < 0.5, "{turn}");
+    // A whole path over the floor as a table and as an array, in a width that no table of motion has.
+    let path = |t: usize| [0.3 + 0.01 * t as f64, 0.9, (0.05 * t as f64).sin()];
+    let table: String = (0..211)
+        .map(|t| {
+            let [x, _, z] = path(t);
+            format!("{t},{x},{z}\n")
+        })
+        .collect();
+    let table = dir.write("path.csv", format!("frame,x,z\n{table}")).display().to_string();
+    let values: Vec<f64> = (0..211).flat_map(path).collect();
+    let array = dir.write("path.npy", motiongen::motion::npy::write(&[211, 3], &values));
+    let array = array.display().to_string();
+    let motion_of = |file: &str, more: &[&str]| -> Vec<f32> {
+        let flags = [&["--format=npy", "--constraints", file], more].concat();
+        let output = generate(&store, "m", &audio, &out, &flags);
+        assert_eq!(output.code, 0, "{output:?}");
+        read_f32(&std::fs::read(out.join("song.npy")).expect("a file")).expect("an array").values
+    };
+    let worst_mm = |motion: &[f32], axes: &[usize]| -> f64 {
+        let errors = (0..211).flat_map(|t| axes.iter().map(move |&axis| (t, axis)));
+        let errors = errors
+            .map(|(t, axis)| (f64::from(motion[t * MOTION_DIM + axis]) - path(t)[axis]).abs());
+        1e3 * errors.fold(0.0, f64::max)
+    };
+    for control in [&[][..], &["--control=both"], &["--control=decode"]] {
+        let motion = motion_of(&table, control);
+        assert!(worst_mm(&motion, &[0, 2]) < 0.01, "{control:?}: {}", worst_mm(&motion, &[0, 2]));
+        let motion = motion_of(&array, control);
+        assert!(worst_mm(&motion, &[0, 1, 2]) < 0.01, "{control:?}");
+    }
+    for control in ["--control=plan", "--control=none"] {
+        let motion = motion_of(&array, &[control]);
+        assert!(worst_mm(&motion, &[0, 1, 2]) > 20.0, "{control}: nothing is enforced");
+    }
+    let (both, again) = (motion_of(&array, &[]), motion_of(&array, &["--control=both"]));
+    assert_eq!(both, again);
     let outside = dir.write("d.toml", "[[keyframe]]\nframe = 300\nposition_y = 0.5\n");
     let outside = outside.display().to_string();
     let output = generate(&store, "m", &audio, &out, &["--format=npy", "--constraints", &outside]);
     assert_eq!(output.code, 1, "{output:?}");
     assert!(output.stdout.contains("but the track has 211 frames"), "{output:?}");
+}
+
+#[test]
+fn a_planner_without_constraints_is_used_as_before_and_says_what_it_cannot_do() {
+    let dir = Dir::new();
+    let store = store_with_tokenizer(&dir);
+    assert_eq!(train(&store, "plan", &["--tokenizer=tok", "--no-constraints"]).code, 0);
+    assert_eq!(export(&store, "plan", "m").code, 0);
+    let card = std::fs::read_to_string(store.join("models/m/model.json")).expect("a card");
+    assert!(!card.contains("constraint_dim"), "{card}");
+    let (audio, out) = (song(&dir), dir.at("out"));
+    let asked = dir.write("c.csv", "time_s,x,y,z\n2.5,1.0,0.9,0.5\n").display().to_string();
+    let flags = ["--format=npy", "--constraints", &asked];
+    let output = generate(&store, "m", &audio, &out, &flags);
+    assert_eq!(output.code, 0, "{output:?}");
+    let bytes = std::fs::read(out.join("song.npy")).expect("a file");
+    let motion = read_f32(&bytes).expect("an array").values;
+    for (axis, wanted) in [1.0_f32, 0.9, 0.5].into_iter().enumerate() {
+        assert!((motion[75 * MOTION_DIM + axis] - wanted).abs() < 1e-5);
+    }
+    for control in ["plan", "both"] {
+        let flag = format!("--control={control}");
+        let output = generate(&store, "m", &audio, &out, &[&flags[..], &[&flag]].concat());
+        assert_eq!(output.code, 2, "{output:?}");
+        let expected = format!(
+            "--control {control}: the planner of model m knows nothing of constraints; give decode or none, or train \
+             a planner without --no-constraints"
+        );
+        assert!(output.stderr.contains(&expected), "{output:?}");
+    }
+    let broken = dir.write("d.csv", "time_s,x\n0,left\n").display().to_string();
+    let output = generate(&store, "m", &audio, &out, &["--format=npy", "--constraints", &broken]);
+    assert_eq!(output.code, 2, "{output:?}");
+    assert!(
+        output
+            .stderr
+            .contains("d.csv has no constraints: line 2: x reads \"left\", which is no number"),
+        "{output:?}"
+    );
+    let refused = train(&store, "other", &["--tokenizer=tok", "--constraint-dropout=1"]);
+    assert_eq!(refused.code, 2, "{refused:?}");
+    assert!(
+        refused
+            .stderr
+            .contains("--constraint-dropout 1 is no share; give a number from 0 to below 1"),
+        "{refused:?}"
+    );
 }

@@ -90,6 +90,7 @@ fn generation(run: &str, phrase: &str, sample: i32, candidate: i32) -> Generatio
         velocity_error: 0.125,
         control_error_mm: None,
         control_error_deg: None,
+        constraints: None,
         generate_s: 1.0,
         real_time_factor: 0.5,
         settings: None,

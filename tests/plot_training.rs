@@ -6,7 +6,8 @@ use motiongen::plot::TrainingStage;
 use motiongen::store::tables::TrainingLogRow;
 use motiongen::store::{Commit, Item, Ledger, Location, Row as _, TimestampUs};
 use motiongen::training::{
-    DecoderLearner, DiffusionLearner, FinetuneLearner, Learner as _, RowKind,
+    DecoderLearner, DiffusionLearner, FinetuneLearner, GroupLearner, Learner as _, PlannerLearner,
+    RowKind, TokensLearner,
 };
 
 use crate::support::plots::{self, png_size, svg, text};
@@ -146,7 +147,14 @@ fn store(dir: &Dir) -> String {
 
 #[test]
 fn stages_are_called_what_training_calls_them() {
-    let learners = [DiffusionLearner::STAGE, DecoderLearner::STAGE, FinetuneLearner::STAGE];
+    let learners = [
+        DiffusionLearner::STAGE,
+        DecoderLearner::STAGE,
+        FinetuneLearner::STAGE,
+        GroupLearner::STAGE,
+        TokensLearner::STAGE,
+        PlannerLearner::STAGE,
+    ];
     assert_eq!(TrainingStage::ALL.map(TrainingStage::name), learners);
 }
 
@@ -227,6 +235,46 @@ fn an_svg_has_the_curves_where_the_losses_are() {
     // The same bytes again.
     drawn(&flags);
     assert_eq!(svg(&path), picture);
+}
+
+#[test]
+fn tokenizers_and_planners_have_panels_of_their_own() {
+    let dir = Dir::new();
+    let place = dir.at("store");
+    let of_codes = rows("tok", "tokens", 40).into_iter().map(|row| TrainingLogRow {
+        diffusion: row.loss,
+        commitment: row.loss.map(|loss| 0.3 * loss),
+        perplexity: row.loss.map(|loss| 1.0 / loss),
+        ..row
+    });
+    commit(&place, &of_codes.collect::<Vec<_>>());
+    commit(&place, &rows("plan", "planner", 60));
+    let (store, path) = (text(&place), text(&dir.at("run.svg")));
+    let headings = |run: &str, panels: &[&str]| {
+        let flags = [&["--store", &store, "--run", run, "--output", &path], panels].concat();
+        let summary = drawn(&flags);
+        let picture = svg(&path);
+        let all =
+            ["Loss", "Diffusion", "Commitment", "Perplexity", "Gradient norm", "Learning rate"];
+        let has = |heading: &&str| {
+            picture.contains(&format!("font-size=\"13\" fill=\"#1f2328\">{heading}<"))
+        };
+        (summary, all.into_iter().filter(has).collect::<Vec<_>>())
+    };
+    let (summary, found) = headings("tok", &[]);
+    assert!(summary.starts_with("40 steps of tokens → "), "{summary}");
+    assert_eq!(found, ["Loss", "Commitment", "Perplexity", "Gradient norm", "Learning rate"]);
+    assert_eq!(headings("tok", &["--panel", "all"]).1.len(), 6);
+    let (summary, found) = headings("plan", &[]);
+    assert!(summary.starts_with("60 steps of planner → "), "{summary}");
+    assert_eq!(found, ["Loss", "Gradient norm", "Learning rate"]);
+    assert_eq!(
+        refusal(&["--store", &store, "--run", "plan", "--output", &path, "--panel", "perplexity"]),
+        format!(
+            "store {store}: run \"plan\" has no panel perplexity in planner; ask for one of loss, gradient_norm, \
+             learning_rate"
+        )
+    );
 }
 
 #[test]
@@ -341,8 +389,8 @@ fn what_cannot_be_drawn_is_said_in_a_sentence() {
             "r",
             &[],
             format!(
-                "store {newer}: run \"r\" has no stage that can be drawn (diffusion, decoder or \
-                 finetune); install a newer motiongen"
+                "store {newer}: run \"r\" has no stage that can be drawn (diffusion, decoder, finetune, group, \
+                 tokens, planner); install a newer motiongen"
             ),
         ),
         (
@@ -361,7 +409,7 @@ fn what_cannot_be_drawn_is_said_in_a_sentence() {
             "invalid value 'total' for '--panel <PANEL>': panel \"total\" is unknown; the panels \
              are all, loss, diffusion, decoder_position, velocity_coherence, \
              acceleration_coherence, jerk, decoder_quaternion, quaternion_delta, phase_monotonic, \
-             position_smoothness, gradient_norm, learning_rate"
+             position_smoothness, markers, contrast, commitment, perplexity, gradient_norm, learning_rate"
                 .to_owned(),
         ),
         (

@@ -37,8 +37,13 @@ mod generation {
         pub use card::*;
     }
     mod learned;
+    mod tokens {
+        mod card;
+        pub use card::*;
+    }
     pub use card::*;
     pub use group::GroupCard;
+    pub use tokens::TokensCard;
     pub use learned::*;
 }
 #[path = "../../src/onnx"]
@@ -50,12 +55,20 @@ mod onnx {
 
 use generation::{FamilyCard as _, ModelCard};
 
-/// A card that is taken, whose parts the input replaces.
-const SOUND: &str = include_str!("../../models/pretrained/model.json");
+/// A card of each family that is taken, whose parts the input replaces.
+const SOUND: [&str; 3] = [
+    include_str!("../../models/pretrained/model.json"),
+    include_str!("../seeds/card/group.json"),
+    include_str!("../seeds/card/tokens.json"),
+];
 
 fn check(bytes: &[u8]) {
     if let Ok(card) = generation::GroupCard::read(bytes, "m") {
         let _ = model::GroupNetworks::new(&card.group);
+    }
+    if let Ok(card) = generation::TokensCard::read(bytes, "m") {
+        let _ = model::Tokenizer::new(&card.tokens);
+        let _ = model::Planner::new(&card.planner);
     }
     match ModelCard::read(bytes, "m") {
         Ok(card) => {
@@ -71,10 +84,12 @@ fn check(bytes: &[u8]) {
 
 fuzz_target!(|bytes: &[u8]| {
     check(bytes);
-    // What follows the first two bytes takes the place of a stretch of the settings, which are in front.
-    let [at, n, patch @ ..] = bytes else { return };
-    let settings = SOUND.find("\"alphas_cumprod\"").unwrap_or(SOUND.len());
+    // What follows the first three bytes takes the place of a stretch of the settings, which are in front.
+    let [which, at, n, patch @ ..] = bytes else { return };
+    let sound = SOUND[usize::from(*which) % SOUND.len()];
+    let settings = sound.find("\"alphas_cumprod\"").unwrap_or(sound.len());
     let at = usize::from(*at) * settings / 256;
     let end = (at + usize::from(*n)).min(settings);
-    check(&[&SOUND.as_bytes()[..at], patch, &SOUND.as_bytes()[end..]].concat());
+    let text = sound.as_bytes();
+    check(&[&text[..at], patch, &text[end..]].concat());
 });

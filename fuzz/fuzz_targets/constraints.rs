@@ -1,4 +1,4 @@
-//! Arbitrary bytes through the reader of constraints, as TOML and as JSON: no panic, memory in proportion to the
+//! Arbitrary bytes through the reader of constraints, as TOML, JSON, CSV and array: no panic, memory in proportion to the
 //! track, and constraints within it.
 #![no_main]
 
@@ -26,6 +26,9 @@ mod generation {
 #[allow(dead_code, reason = "this target reaches a part of the module")]
 mod constraints_file;
 
+#[path = "../../src/stages/generate/path_file.rs"]
+mod path_file;
+
 use constraints_file::ConstraintsRequest;
 use motion::ChannelLimits;
 
@@ -33,9 +36,8 @@ use motion::ChannelLimits;
 const N_FRAMES: usize = 31;
 
 fuzz_target!(|bytes: &[u8]| {
-    let text = String::from_utf8_lossy(bytes);
-    for is_json in [false, true] {
-        let Ok(asked) = ConstraintsRequest::of_text(&text, is_json) else { continue };
+    for extension in ["toml", "json", "csv", "npy"] {
+        let Ok(asked) = ConstraintsRequest::of_bytes(bytes.to_vec(), extension) else { continue };
         match asked.of_track(N_FRAMES, ChannelLimits::Wide) {
             Ok(constraints) => {
                 let mut frames = ndarray::Array2::zeros((N_FRAMES, motion::MOTION_DIM));

@@ -14,6 +14,7 @@ pub mod frechet;
 pub mod geometric;
 pub mod group;
 pub mod interval;
+pub mod keyframe;
 pub mod kinetic;
 pub mod locking;
 pub mod measured;

@@ -6,6 +6,7 @@
 //! | like real | does it move as held-out real motion does? |
 //! | follows music | does it rise and fall with the bars of its own music? |
 //! | varied | does other music get other motion? |
+//! | together | of groups: do its dancers belong together, and keep apart? |
 //!
 //! A verdict is won only if every test of it is won, and lost if one is lost. Where something that a test needs was
 //! not measured, the test is open, and with it the verdict. Rules and limits stand here and nowhere else;
@@ -14,6 +15,7 @@
 mod follows;
 mod like_real;
 mod sound;
+mod together;
 mod varied;
 
 use super::interval::Estimate;
@@ -26,11 +28,14 @@ pub enum Quality {
     LikeReal,
     FollowsMusic,
     Varied,
+    /// Of groups alone.
+    Together,
 }
 
 impl Quality {
-    /// Every quality, in the order in which they are told.
-    pub const ALL: [Self; 4] = [Self::Sound, Self::LikeReal, Self::FollowsMusic, Self::Varied];
+    /// Every quality that is asked of a soloist, in the order in which they are told.
+    pub const OF_SOLOISTS: [Self; 4] =
+        [Self::Sound, Self::LikeReal, Self::FollowsMusic, Self::Varied];
 
     /// Returns the name of the verdict in tables.
     pub const fn name(self) -> &'static str {
@@ -39,6 +44,7 @@ impl Quality {
             Self::LikeReal => "like_real",
             Self::FollowsMusic => "follows_music",
             Self::Varied => "varied",
+            Self::Together => "together",
         }
     }
 }
@@ -224,16 +230,31 @@ pub struct Evidence<'a> {
     pub has_raw: bool,
     /// Whether there should be an untrained network.
     pub has_network: bool,
+    /// What is known of groups beside their dancers' own motion; none of soloists.
+    pub group: Option<GroupEvidence<'a>>,
 }
 
-/// Returns all verdicts, in the order of [`Quality::ALL`].
-pub fn verdicts(evidence: &Evidence) -> [Verdict; 4] {
-    [
+/// The numbers of windows of groups, all of one split.
+#[derive(Clone, Copy, Debug)]
+pub struct GroupEvidence<'a> {
+    pub own: &'a [Number],
+    /// Soloists of the same model, each sampled by itself, in the places of the dancers.
+    pub independent: &'a [Number],
+    /// Held-out real groups.
+    pub truth: &'a [Number],
+}
+
+/// Returns all verdicts, in the order of [`Quality::OF_SOLOISTS`], and of groups [`Quality::Together`] behind them.
+pub fn verdicts(evidence: &Evidence) -> Vec<Verdict> {
+    let mut verdicts = vec![
         Verdict::new(Quality::Sound, sound::tests(evidence)),
         Verdict::new(Quality::LikeReal, like_real::tests(evidence)),
         Verdict::new(Quality::FollowsMusic, follows::tests(evidence)),
         Verdict::new(Quality::Varied, varied::tests(evidence)),
-    ]
+    ];
+    let group = evidence.group.as_ref();
+    verdicts.extend(group.map(|group| Verdict::new(Quality::Together, together::tests(group))));
+    verdicts
 }
 
 /// Returns the number of a metric and variant.

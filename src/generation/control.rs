@@ -144,6 +144,11 @@ impl Constraints {
         Ok(Self { wanted: kept })
     }
 
+    /// Returns all that is asked for, in order of frame.
+    pub fn wanted(&self) -> &[(usize, WantedValue)] {
+        &self.wanted
+    }
+
     /// Returns whether nothing is asked for.
     pub fn is_empty(&self) -> bool {
         self.wanted.is_empty()

@@ -29,8 +29,8 @@ pub use control::{Constraints, ControlError, Miss, REACH_FRAMES, WantedValue, co
 pub use eager::EagerEngine;
 pub use engine::{Engine, EngineError, EngineInputs};
 pub use group::{
-    ConsistencyForm, GroupCard, GroupEngine, GroupEngineInputs, GroupGenerator, GroupProvenance,
-    GroupTrack,
+    ConsistencyForm, GroupCard, GroupEngine, GroupEngineInputs, GroupEstimator, GroupGenerator,
+    GroupProvenance, GroupTrack,
 };
 pub use learned::{LearnedFrom, MusicDigests, MusicSplit, Purpose, ShortDigest};
 pub use pool::Pool;
@@ -38,9 +38,10 @@ pub use retrieval::Retrieval;
 pub use runtime::{OnnxEngine, SessionPlan};
 pub use sampling::{Sampling, sample};
 pub use tokens::{
-    OnnxPlanner, OnnxTokenizer, PlanRequest, PlanWindow, PlannerEngine, PlannerNetworks,
-    TokenEngine, TokenGenerator, TokenTrack, TokenizerNetworks, TokensCard, TokensNetworks,
-    TokensProvenance, WindowPlan, tokens_parameters,
+    Control, OnnxPlanner, OnnxTokenizer, PlanRequest, PlanWindow, PlannerEngine, PlannerNetworks,
+    Reconstruction, Steering, TokenEngine, TokenGenerator, TokenTrack, TokenizerNetworks,
+    TokensCard, TokensNetworks, TokensProvenance, WindowPlan, WithheldConditions, shuffle, steer,
+    tokens_parameters,
 };
 pub use track::{
     Generator, OVERLAP_FRAMES, PrimingMotion, RUN_WINDOWS, Track, WeightedConstraints,

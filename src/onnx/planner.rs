@@ -3,8 +3,8 @@
 
 use crate::audio::FeatureScale;
 use crate::model::{
-    Graph as _, KeysAndValues, ParameterId, PlanConditions, Planner, PlannerConfig, PlannerInputs,
-    PlannerStepInputs, Result,
+    ConditionInputs, Graph as _, KeysAndValues, ParameterId, PlanConditions, Planner,
+    PlannerConfig, PlannerInputs, PlannerStepInputs, Result,
 };
 
 use super::builder::{Axes, Builder, Form, Value};
@@ -23,6 +23,10 @@ impl PlannerNames {
     pub const CLOCK: &'static str = MusicNames::CLOCK;
     pub const DROP_AUDIO: &'static str = MusicNames::DROP_AUDIO;
     pub const STYLE: &'static str = MusicNames::STYLE;
+    /// Only in networks that take constraints.
+    pub const CONSTRAINTS: &'static str = "constraints";
+    /// May be left out; only in networks that take constraints.
+    pub const DROP_CONSTRAINTS: &'static str = "drop_constraints";
     pub const LOGITS: &'static str = "logits";
 }
 
@@ -54,6 +58,33 @@ const STEP_AXIS: &str = "tokens - past";
 /// Tokens of the whole window.
 const WINDOW_AXIS: &str = "tokens of the window";
 
+/// What is asked of the motion, of a network that takes it.
+struct Asked {
+    constraints: Value,
+    drop_constraints: Value,
+}
+
+impl Asked {
+    fn inputs(g: &mut Builder<'_>, config: &PlannerConfig) -> Option<Self> {
+        if config.constraint_dim == 0 {
+            return None;
+        }
+        let constraints = g.input(
+            PlannerNames::CONSTRAINTS,
+            Axes::Frames,
+            config.constraint_dim,
+            "what is asked of each frame: x, z, y normalised, the directions of the body's +Z and +Y, and 1 for each of \
+             floor, height and orientation that is asked for; zeros for what is not",
+        );
+        let meaning = "1 for windows that go without constraints, 0 where left out";
+        let drop_constraints =
+            g.optional_input(PlannerNames::DROP_CONSTRAINTS, Axes::Batch, 0, meaning);
+        // It may be given where drop_audio is left out: onnxruntime takes axes of one name to be of one size.
+        g.name_axis(0, "batch or 1 of constraints");
+        Some(Self { constraints, drop_constraints })
+    }
+}
+
 /// Writes a planner: tokens and the music → what is said of each token.
 ///
 /// Features come as the `features` table has them and are scaled within.
@@ -77,11 +108,14 @@ pub fn planner(
     g.name_axis(1, TOKENS_AXIS);
     let Music { audio, drop_audio, style } =
         Music::inputs(&mut g, config.condition(), config.style_dim, "windows", scale)?;
+    let asked = Asked::inputs(&mut g, config);
     let inputs = PlannerInputs {
         tokens: &tokens,
         audio: &audio,
         drop_audio: Some(&drop_audio),
         style: style.as_ref(),
+        constraints: asked.as_ref().map(|asked| &asked.constraints),
+        drop_constraints: asked.as_ref().map(|asked| &asked.drop_constraints),
         mask: None,
     };
     let logits = planner.forward(&mut g, &inputs)?;
@@ -104,9 +138,18 @@ pub fn planner_music(
     let mut g = Builder::new(&list, weights, Form::default(), storage);
     let Music { audio, drop_audio, style } =
         Music::inputs(&mut g, config.condition(), config.style_dim, "windows", scale)?;
-    let PlanConditions { local, global } =
-        planner.conditions(&mut g, &audio, Some(&drop_audio), style.as_ref(), None)?;
-    g.output(PlannerMusicNames::LOCAL, local, "the music at each token, for planner_step.onnx")?;
+    let asked = Asked::inputs(&mut g, config);
+    let inputs = ConditionInputs {
+        audio: &audio,
+        drop_audio: Some(&drop_audio),
+        style: style.as_ref(),
+        constraints: asked.as_ref().map(|asked| &asked.constraints),
+        drop_constraints: asked.as_ref().map(|asked| &asked.drop_constraints),
+        mask: None,
+    };
+    let PlanConditions { local, global } = planner.conditions(&mut g, &inputs)?;
+    let meaning = "the music, and what is asked, at each token, for planner_step.onnx";
+    g.output(PlannerMusicNames::LOCAL, local, meaning)?;
     g.name_output_axis(1, TOKENS_AXIS);
     let meaning = "the music and the style of the window, for planner_step.onnx";
     g.output(PlannerMusicNames::GLOBAL, global, meaning)?;

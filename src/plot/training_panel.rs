@@ -14,11 +14,18 @@ pub enum TrainingStage {
     Decoder,
     /// both, end to end
     Finetune,
+    /// the networks of groups
+    Group,
+    /// a tokenizer
+    Tokens,
+    /// a planner of tokens
+    Planner,
 }
 
 impl TrainingStage {
     /// Every stage, in the order in which they are trained.
-    pub const ALL: [Self; 3] = [Self::Diffusion, Self::Decoder, Self::Finetune];
+    pub const ALL: [Self; 6] =
+        [Self::Diffusion, Self::Decoder, Self::Finetune, Self::Group, Self::Tokens, Self::Planner];
 
     /// Returns the stage's name, as in the log of training.
     pub fn name(self) -> &'static str {
@@ -26,6 +33,9 @@ impl TrainingStage {
             Self::Diffusion => "diffusion",
             Self::Decoder => "decoder",
             Self::Finetune => "finetune",
+            Self::Group => "group",
+            Self::Tokens => "tokens",
+            Self::Planner => "planner",
         }
     }
 
@@ -34,7 +44,13 @@ impl TrainingStage {
     pub fn usual_panels(self) -> &'static [TrainingPanel] {
         use TrainingPanel as P;
         match self {
-            Self::Diffusion | Self::Decoder => &[P::Loss, P::GradientNorm, P::LearningRate],
+            Self::Diffusion | Self::Decoder | Self::Planner => {
+                &[P::Loss, P::GradientNorm, P::LearningRate]
+            }
+            Self::Group => &[P::Loss, P::Diffusion, P::Contrast, P::GradientNorm, P::LearningRate],
+            Self::Tokens => {
+                &[P::Loss, P::Commitment, P::Perplexity, P::GradientNorm, P::LearningRate]
+            }
             Self::Finetune => &[
                 P::Loss,
                 P::Diffusion,
@@ -50,7 +66,7 @@ impl TrainingStage {
     pub fn panels(self) -> &'static [TrainingPanel] {
         use TrainingPanel as P;
         match self {
-            Self::Diffusion => self.usual_panels(),
+            Self::Diffusion | Self::Planner => self.usual_panels(),
             Self::Decoder => &[
                 P::Loss,
                 P::DecoderPosition,
@@ -58,7 +74,31 @@ impl TrainingStage {
                 P::GradientNorm,
                 P::LearningRate,
             ],
-            Self::Finetune => &TrainingPanel::ALL,
+            Self::Finetune => &[
+                P::Loss,
+                P::Diffusion,
+                P::DecoderPosition,
+                P::VelocityCoherence,
+                P::AccelerationCoherence,
+                P::Jerk,
+                P::DecoderQuaternion,
+                P::QuaternionDelta,
+                P::PhaseMonotonic,
+                P::PositionSmoothness,
+                P::GradientNorm,
+                P::LearningRate,
+            ],
+            Self::Group => {
+                &[P::Loss, P::Diffusion, P::Markers, P::Contrast, P::GradientNorm, P::LearningRate]
+            }
+            Self::Tokens => &[
+                P::Loss,
+                P::Diffusion,
+                P::Commitment,
+                P::Perplexity,
+                P::GradientNorm,
+                P::LearningRate,
+            ],
         }
     }
 
@@ -67,6 +107,9 @@ impl TrainingStage {
             Self::Diffusion => "Diffusion",
             Self::Decoder => "Decoder",
             Self::Finetune => "Fine-tuning",
+            Self::Group => "Groups",
+            Self::Tokens => "Tokenizer",
+            Self::Planner => "Planner",
         }
     }
 
@@ -76,6 +119,9 @@ impl TrainingStage {
             Self::Diffusion => "the UNet",
             Self::Decoder => "the motion decoder",
             Self::Finetune => "the UNet and the decoder, end to end",
+            Self::Group => "the denoiser and the score of groups",
+            Self::Tokens => "encoder, codebook, signal and denoiser",
+            Self::Planner => "which tokens go with music",
         }
     }
 }
@@ -93,13 +139,17 @@ pub enum TrainingPanel {
     QuaternionDelta,
     PhaseMonotonic,
     PositionSmoothness,
+    Markers,
+    Contrast,
+    Commitment,
+    Perplexity,
     GradientNorm,
     LearningRate,
 }
 
 impl TrainingPanel {
     /// Every panel, in the order in which they are drawn.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 16] = [
         Self::Loss,
         Self::Diffusion,
         Self::DecoderPosition,
@@ -110,6 +160,10 @@ impl TrainingPanel {
         Self::QuaternionDelta,
         Self::PhaseMonotonic,
         Self::PositionSmoothness,
+        Self::Markers,
+        Self::Contrast,
+        Self::Commitment,
+        Self::Perplexity,
         Self::GradientNorm,
         Self::LearningRate,
     ];
@@ -127,6 +181,10 @@ impl TrainingPanel {
             Self::QuaternionDelta => "quaternion_delta",
             Self::PhaseMonotonic => "phase_monotonic",
             Self::PositionSmoothness => "position_smoothness",
+            Self::Markers => "markers",
+            Self::Contrast => "contrast",
+            Self::Commitment => "commitment",
+            Self::Perplexity => "perplexity",
             Self::GradientNorm => "gradient_norm",
             Self::LearningRate => "learning_rate",
         }
@@ -145,6 +203,10 @@ impl TrainingPanel {
             Self::QuaternionDelta => "Quaternion delta",
             Self::PhaseMonotonic => "Phase",
             Self::PositionSmoothness => "Position smoothness",
+            Self::Markers => "Markers",
+            Self::Contrast => "Contrast",
+            Self::Commitment => "Commitment",
+            Self::Perplexity => "Perplexity",
             Self::GradientNorm => "Gradient norm",
             Self::LearningRate => "Learning rate",
         }
@@ -154,7 +216,7 @@ impl TrainingPanel {
     pub(super) fn meaning(self) -> &'static str {
         match self {
             Self::Loss => "what is minimised",
-            Self::Diffusion => "error of the UNet’s prediction",
+            Self::Diffusion => "error of the denoiser’s prediction",
             Self::DecoderPosition => "squared error of decoded positions",
             Self::VelocityCoherence => "velocities against steps of the position",
             Self::AccelerationCoherence => "accelerations against steps of the velocity",
@@ -163,6 +225,10 @@ impl TrainingPanel {
             Self::QuaternionDelta => "turns that are too far for one frame",
             Self::PhaseMonotonic => "falls of the phase within bars",
             Self::PositionSmoothness => "steps of the position beyond 0.5 m",
+            Self::Markers => "squared error of points fixed to bodies",
+            Self::Contrast => "cross-entropy of telling groups from mixed ones",
+            Self::Commitment => "squared distance of latents from their codes",
+            Self::Perplexity => "codes in use, were all used alike",
             Self::GradientNorm => "before it is clipped",
             Self::LearningRate => "",
         }
@@ -170,7 +236,8 @@ impl TrainingPanel {
 
     pub(super) fn unit(self) -> &'static str {
         match self {
-            Self::DecoderPosition => "m²",
+            Self::DecoderPosition | Self::Markers => "m²",
+            Self::Perplexity => "codes",
             Self::PositionSmoothness => "m",
             _ => "",
         }
@@ -179,7 +246,7 @@ impl TrainingPanel {
     /// Returns how values become heights: losses differ by factors.
     pub(super) fn scale(self) -> ValueScale {
         match self {
-            Self::GradientNorm | Self::LearningRate => ValueScale::Linear,
+            Self::Perplexity | Self::GradientNorm | Self::LearningRate => ValueScale::Linear,
             _ => ValueScale::Log,
         }
     }
@@ -211,7 +278,8 @@ mod tests {
             "total".parse::<TrainingPanel>().unwrap_err().to_string(),
             "panel \"total\" is unknown; the panels are loss, diffusion, decoder_position, \
              velocity_coherence, acceleration_coherence, jerk, decoder_quaternion, \
-             quaternion_delta, phase_monotonic, position_smoothness, gradient_norm, learning_rate"
+             quaternion_delta, phase_monotonic, position_smoothness, markers, contrast, commitment, \
+             perplexity, gradient_norm, learning_rate"
         );
     }
 

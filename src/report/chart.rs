@@ -17,6 +17,8 @@ const OWN_DOT_PX: f64 = 3.4;
 /// Ratios of the largest value to the smallest for which the scale is logarithmic; beyond them the smallest is a
 /// zero that was rounded.
 const LOG_RATIOS: std::ops::Range<f64> = 30.0..1e9;
+/// So begins the protocol of a number that says how many windows it asks for.
+const TOO_FEW: &str = "too few";
 /// Fewer values than this are no comparison.
 const MIN_VALUES: usize = 2;
 
@@ -75,7 +77,10 @@ pub(super) fn told(metric: &Metric) -> String {
         }
         (Some(value), None) => format!("{subject}: {}", number(value)),
         (None, _) if metric.is_by_construction() => format!("{subject}: {BY_CONSTRUCTION}"),
-        (None, _) => format!("{subject}: too few (n = {})", metric.n),
+        (None, _) if metric.protocol.starts_with(TOO_FEW) => {
+            format!("{subject}: {}", metric.protocol)
+        }
+        (None, _) => format!("{subject}: {TOO_FEW} (n = {})", metric.n),
     }
 }
 

@@ -186,5 +186,6 @@ pub(super) fn example() -> Report {
             }],
             settings: vec![("steps".to_owned(), "20".to_owned(), "50".to_owned())],
         }),
+        dial: Vec::new(),
     }
 }

@@ -2,7 +2,7 @@
 
 use super::BetterDirection;
 use BetterDirection::{Higher, Lower, Neither};
-use Section::{Asked, Music, Other, Real, Sound, Varied};
+use Section::{Asked, Group, Music, Other, Real, Sound, Varied};
 
 /// A question that numbers answer, and that of the verdicts which rest on them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -11,13 +11,14 @@ pub(super) enum Section {
     Real,
     Varied,
     Sound,
+    Group,
     Asked,
     Other,
 }
 
 impl Section {
     /// Every section, in the order in which they are shown.
-    pub const ALL: [Self; 6] = [Music, Real, Varied, Sound, Asked, Other];
+    pub const ALL: [Self; 7] = [Music, Real, Varied, Sound, Group, Asked, Other];
 
     pub const fn heading(self) -> &'static str {
         match self {
@@ -25,6 +26,7 @@ impl Section {
             Real => "Is it like real motion?",
             Varied => "Is it varied?",
             Sound => "Is it sound?",
+            Group => "Do its dancers belong together?",
             Asked => "Does it do what was asked?",
             Other => "Other",
         }
@@ -37,6 +39,7 @@ impl Section {
             Real => "real",
             Varied => "varied",
             Sound => "sound",
+            Group => "together",
             Asked => "asked",
             Other => "other",
         }
@@ -46,6 +49,9 @@ impl Section {
 /// Verdicts that are asked of every run, in the order in which they are shown among equals.
 pub(super) const VERDICTS: [(&str, Section); 4] =
     [("sound", Sound), ("like_real", Real), ("follows_music", Music), ("varied", Varied)];
+
+/// The verdict that is asked of groups beside those.
+pub(super) const OF_GROUPS: (&str, Section) = ("together", Group);
 
 /// The meaning of a metric.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -61,7 +67,7 @@ pub(super) struct Meaning {
 
 /// Every metric that is known, in the order in which they are shown.
 #[rustfmt::skip]
-const MEANINGS: [Meaning; 44] = [
+const MEANINGS: [Meaning; 64] = [
     of("locking_r2", Music, Higher,
         "Share of the vertical velocity that repeats with the bar (R²).",
         "1 is perfect; chance is not 0 but locking_wrong_r2."),
@@ -139,6 +145,18 @@ const MEANINGS: [Meaning; 44] = [
     of("channel_distance", Real, Lower,
         "Wasserstein distance of a channel’s values from real motion’s, in its standard deviations.",
         "As low as the held-out truth’s is perfect."),
+    of("reconstruction_position", Real, Lower,
+        "Distance of positions from those that a tokenizer makes of their tokens again.",
+        "0 is perfect."),
+    of("reconstruction_orientation", Real, Lower,
+        "Angle of orientations to those that a tokenizer makes of their tokens again.",
+        "0 is perfect."),
+    of("tokens_per_frame", Real, Lower,
+        "Tokens that stand for a frame.",
+        "1/ρ by construction."),
+    of("code_perplexity", Varied, Higher,
+        "How many codes are in use, were all used alike: in codes, or as a share of the codebook.",
+        "K, or 1, where all are used alike."),
     of("diversity", Varied, Neither,
         "Mean distance of the features of two motions.",
         "Best near the truth’s."),
@@ -179,12 +197,60 @@ const MEANINGS: [Meaning; 44] = [
     of("share_over_limits", Sound, Lower,
         "Share of the frames with a channel beyond its limits.",
         "0 is perfect."),
+    of("unison_index", Group, Neither,
+        "Correlation of the dancers’ velocities, each in its own heading frame, at the lag of up to a bar that the other half \
+         of the bars tells.",
+        "1 for copies, about 0 for independent dancers; best near the truth’s."),
+    of("gmc_correlation", Group, Neither,
+        "Group motion correlation, as a correlation of the dancers’ energies.",
+        "1 where all put in and spare their energy together; best near the truth’s."),
+    of("gmc_published", Group, Neither,
+        "Group motion correlation by the published formula, which has a unit.",
+        "Grows with how much is moved; for comparison with published numbers."),
+    of("tif", Group, Lower,
+        "Share of frames and pairs of dancers whose bodies touch.",
+        "0 is perfect."),
+    of("tif_published", Group, Lower,
+        "Trajectory intersection frequency: touching pairs per frame.",
+        "0 is perfect."),
+    of("least_separation", Group, Neither,
+        "Least distance of two bodies’ centres in a window, mean over windows, or the least of all.",
+        "Bodies touch below 0.7 m."),
+    of("formation_coverage", Group, Neither,
+        "Area of the hull of the group.", "Best near the truth’s."),
+    of("formation_spread", Group, Neither,
+        "Spread of the group about its middle.", "Best near the truth’s."),
+    of("dancer_diversity", Group, Neither,
+        "Distance of the dancers’ kinetic features: how much each moves, not when.",
+        "0 for copies; best near the truth’s."),
+    of("dancer_velocity_difference", Group, Neither,
+        "Difference of two dancers’ velocities at the same moment.",
+        "0 for copies; best near the truth’s."),
+    of("group_locking", Group, Higher,
+        "R² of the dancers’ vertical velocities with the bar, above that at wrong tempi: their mean, the least dancer’s, and \
+         with the bars of another song.",
+        "About 0 by chance; best near the truth’s."),
+    of("gmr", Group, Lower,
+        "Group motion realism: Fréchet distance of groups’ kinetic features from the training groups’.",
+        "As low as the held-out truth’s is perfect."),
     of("control_position", Asked, Lower,
         "Distance from where the body was asked to be.",
         "0 is perfect."),
     of("control_orientation", Asked, Lower,
         "Angle from how the body was asked to be turned.",
         "0 is perfect."),
+    of("control_trajectory_error", Asked, Lower,
+        "Share of the motions with a keyframe that is off by more than a threshold (Traj. err.).",
+        "0 is perfect."),
+    of("control_location_error", Asked, Lower,
+        "Share of the keyframes that are off by more than a threshold (Loc. err.).",
+        "0 is perfect."),
+    of("control_average_error", Asked, Lower,
+        "Mean miss over keyframes (Avg. err.).",
+        "0 is perfect."),
+    of("control_timing_error", Asked, Lower,
+        "How long before or after its time the body is nearest to the place of a keyframe.",
+        "0 is perfect; at most half a second, beyond which nothing is looked for."),
 ];
 
 const fn of(
@@ -256,6 +322,8 @@ mod tests {
             ("fid_k", Real, Lower),
             ("diversity", Varied, Neither),
             ("pass_rate", Sound, Higher),
+            ("tif", Group, Lower),
+            ("unison_index", Group, Neither),
             ("control_position", Asked, Lower),
             ("control_of_something_new", Asked, Neither),
             ("something_new", Other, Neither),
@@ -271,7 +339,7 @@ mod tests {
     fn metrics_of_a_section_stand_together_and_all_say_something() {
         let mut order: Vec<&str> = MEANINGS.iter().map(|m| m.section.id()).collect();
         order.dedup();
-        assert_eq!(order, ["music", "real", "varied", "sound", "asked"]);
+        assert_eq!(order, ["music", "real", "varied", "sound", "together", "asked"]);
         for meaning in MEANINGS {
             assert!(meaning.text.ends_with('.') && meaning.ideal.ends_with('.'), "{meaning:?}");
             assert_eq!(MEANINGS.iter().filter(|m| m.metric == meaning.metric).count(), 1);

@@ -10,6 +10,7 @@ mod against;
 mod channels;
 mod chart;
 mod comparison;
+mod dial;
 #[cfg(test)]
 mod example;
 mod meaning;
@@ -87,7 +88,7 @@ pub struct VerdictTest {
 /// The answer of several tests to one question about a run.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Verdict {
-    /// `sound`, `like_real`, `follows_music` or `varied`.
+    /// `sound`, `like_real`, `follows_music` or `varied`; of groups also `together`.
     pub verdict: String,
     /// Which music, as a metric has it.
     pub split: String,
@@ -212,6 +213,17 @@ pub struct ComparedRun {
     pub settings: Vec<(String, String, String)>,
 }
 
+/// A run of groups of the same model, at its consistency.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct DialRun {
+    pub run: String,
+    /// γ, from -1 to 1.
+    pub consistency: f64,
+    /// Whether it is the run that the report is about.
+    pub is_this: bool,
+    pub metrics: Vec<Metric>,
+}
+
 /// The content of a report.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Report {
@@ -226,4 +238,6 @@ pub struct Report {
     pub metrics: Vec<Metric>,
     pub worst: Vec<WorstMotion>,
     pub against: Option<ComparedRun>,
+    /// Runs of groups at several degrees of consistency, this one among them, in order of γ.
+    pub dial: Vec<DialRun>,
 }

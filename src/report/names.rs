@@ -15,7 +15,7 @@ pub(super) const HELD_OUT: &str = "held_out";
 
 /// Subjects in the order in which they are shown, with what they are.
 #[rustfmt::skip]
-pub(super) const SUBJECTS: [(&str, &str); 10] = [
+pub(super) const SUBJECTS: [(&str, &str); 14] = [
     (OWN, "the motions of this run"),
     ("shuffled", "the same motions with the music of other songs: what following its own music must beat"),
     ("shifted", "the same motions with the bars of their own music shifted by a beat: what knowing where the \
@@ -23,8 +23,14 @@ pub(super) const SUBJECTS: [(&str, &str); 10] = [
     ("untrained", "the run’s own network with its first weights: what sampler and post-processing give \
                    before anything is learned"),
     ("no_music", "the trained network without its music: what it does whatever is played"),
+    ("shuffled_plan", "the plans of the trained model with their tokens in an order of chance: what is owed to which \
+                       tokens there are, not to where they stand"),
+    ("reconstructed", "real motion that was written as tokens and made again"),
     ("retrieval", "the library’s phrase with the nearest music"),
     ("mean_motion", "the mean of the training motion, standing still: the best constant"),
+    ("independent", "soloists who were sampled one by one, in the places of the dancers of a group: what belonging \
+                     together must beat"),
+    ("copied", "one dancer of each group in the places of all: what dancers with ways of their own must beat"),
     (HELD_OUT_TRUTH, "real motion of songs that nothing was learned from: how good a number can be"),
     (TRAINING_TRUTH, "real motion that the reference statistics come from"),
     (GROUND_TRUTH, "all real motion, as evaluations of release 0.1 have it"),

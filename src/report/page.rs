@@ -5,6 +5,7 @@ use base64::display::Base64Display;
 use base64::engine::general_purpose::{GeneralPurpose, STANDARD};
 
 use super::against::AgainstSection;
+use super::dial::DialSection;
 use super::panel::VerdictsSection;
 use super::sanity::SanitySection;
 use super::tables::{self, MetricsSections};
@@ -25,6 +26,7 @@ struct Page<'a> {
     links: Vec<(&'static str, &'static str)>,
     sanity: Option<SanitySection<'a>>,
     metrics: Option<MetricsSections<'a>>,
+    dial: Option<DialSection<'a>>,
     against: Option<AgainstSection<'a>>,
     worst: &'a [WorstMotion],
 }
@@ -41,6 +43,7 @@ pub fn page(report: &Report) -> String {
         links: links(report),
         sanity: SanitySection::new(report),
         metrics: MetricsSections::new(report),
+        dial: DialSection::new(report),
         against: report.against.as_ref().map(|other| AgainstSection::new(report, other)),
         worst: &report.worst,
     };
@@ -59,6 +62,9 @@ fn links(report: &Report) -> Vec<(&'static str, &'static str)> {
         links.push((tables::SUBJECTS_ID, tables::SUBJECTS_HEADING));
     }
     links.extend(tables::sections(report).iter().map(|section| (section.id(), section.heading())));
+    if report.dial.len() > 1 {
+        links.push(("consistency", "What consistency does"));
+    }
     if report.against.is_some() {
         links.push(("against", "Comparison"));
     }
@@ -82,7 +88,7 @@ mod tests {
     use super::super::example::{example, metric, with_interval};
     use super::super::names::SUBJECTS;
     use super::super::{
-        BY_CONSTRUCTION, CheckLine, ComparedRun, Metric, Outcome, PairedNumber, Verdict,
+        BY_CONSTRUCTION, CheckLine, ComparedRun, DialRun, Metric, Outcome, PairedNumber, Verdict,
         VerdictTest,
     };
     use super::*;
@@ -249,6 +255,14 @@ mod tests {
                 failed: vec![own()],
                 svg: own(),
             }],
+            dial: [-1.0, 1.0]
+                .map(|consistency| DialRun {
+                    run: own(),
+                    consistency,
+                    is_this: consistency > 0.0,
+                    metrics: metrics.clone(),
+                })
+                .into(),
             against: Some(ComparedRun {
                 run: own(),
                 paired: vec![PairedNumber {

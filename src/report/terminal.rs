@@ -3,6 +3,7 @@
 use std::fmt::Write as _;
 
 use super::comparison::{Pair, counts, family, pairs};
+use super::dial;
 use super::names::{ALL, music, words};
 use super::numbers::{difference, short, value};
 use super::rows::{Row, rows, subjects, telling_split};
@@ -22,7 +23,7 @@ const INDENT: &str = "      ";
 const MAX_PAIRS: usize = 12;
 
 /// Numbers that a terminal shows, by metric and the variant that is preferred; the page has all.
-const KEY: [[&str; 2]; 14] = [
+const KEY: [[&str; 2]; 19] = [
     ["pass_rate", "reference"],
     ["pass_rate", "strict"],
     ["window_pass_rate", "strict"],
@@ -37,6 +38,11 @@ const KEY: [[&str; 2]; 14] = [
     ["jerk_ratio", ""],
     ["jerk_mean", ""],
     ["diversity", "axes"],
+    ["unison_index", ""],
+    ["gmc_correlation", ""],
+    ["gmr", ""],
+    ["tif", ""],
+    ["group_locking", "least_dancer"],
 ];
 
 /// Returns the report as plain text of at most 120 columns.
@@ -46,6 +52,9 @@ pub fn terminal(report: &Report) -> String {
     out.push('\n');
     sanity(&mut out, report);
     numbers(&mut out, report);
+    for line in dial::lines(report) {
+        put_wrapped(&mut out, &line);
+    }
     if let Some(against) = &report.against {
         compared(&mut out, report, against);
     }

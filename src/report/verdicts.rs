@@ -1,6 +1,6 @@
 //! The verdicts as both pages show them: lost ones first, then open ones, then won ones.
 
-use super::meaning::VERDICTS;
+use super::meaning::{OF_GROUPS, VERDICTS};
 use super::names::{songs, split_order, words};
 use super::numbers::{short, value};
 use super::{Outcome, Report, Verdict, VerdictTest};
@@ -146,7 +146,7 @@ impl<'a> VerdictView<'a> {
 }
 
 fn question(verdict: &str) -> String {
-    let known = VERDICTS.into_iter().find(|(name, _)| *name == verdict);
+    let known = VERDICTS.into_iter().chain([OF_GROUPS]).find(|(name, _)| *name == verdict);
     known.map_or_else(|| words(verdict), |(_, section)| section.heading().to_owned())
 }
 

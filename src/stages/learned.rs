@@ -6,7 +6,7 @@ use super::generate::{weights_digest, weights_digest_of_tokens};
 use super::model_files::{current_folder, folder_of, is_model_name};
 use super::train::session::{MachineParams, ProgressWatch, read_phrases};
 use super::trained::{FinetuneData, TrainedRun};
-use super::{Progress, Stage as _, finetune::Finetune, pretrained, train::Train};
+use super::{Progress, Stage as _, finetune::Finetune, model_files::shipped_as, train::Train};
 
 use crate::generation::{
     CardError, FamilyCard as _, GroupCard, LearnedFrom, MAX_CARD_BYTES, ModelCard, Purpose,
@@ -140,6 +140,15 @@ pub fn of_planner(
     Ok(learned_by(tokenizer)?.map(|of_tokenizer| of_planner.and(of_tokenizer)))
 }
 
+/// Returns what train says that a run learns from; none where it left no list.
+///
+/// # Errors
+/// [`StoreError`] when the store cannot be read.
+pub fn listed(store: &Location, run: &str) -> Result<Option<LearnedFrom>, StoreError> {
+    let text = store.read_if_there(&learned_path(run, Train::NAME))?;
+    Ok(text.and_then(|text| serde_json::from_slice(&text).ok()))
+}
+
 /// Returns what a command learned from the data with a fingerprint: from its list, and where that is missing or has
 /// gaps from the store.
 fn of_command(
@@ -246,15 +255,19 @@ fn weights_and_music(card: &[u8], place: &str) -> Result<(String, Option<Learned
     })
 }
 
-/// Returns whether the store has the model that made a motion, with the same weights.
+/// Returns the family of the model that made a motion; none where the store does not have it with the same weights.
 ///
 /// # Errors
 /// [`StoreError`] when the store cannot be read.
-pub fn has_weights(store: &Location, model: &str, weights: &str) -> Result<bool, StoreError> {
-    let path = format!("{}/{}", folder_of(model), file_names::CARD);
-    let card = card_of(store, model)?;
-    let card = card.and_then(|bytes| ModelCard::read(&bytes, &store.url_of(&path)).ok());
-    Ok(card.is_some_and(|card| weights_digest(&card) == weights))
+pub fn family_with_weights(
+    store: &Location,
+    model: &str,
+    weights: &str,
+) -> Result<Option<Family>, StoreError> {
+    let place = store.url_of(&format!("{}/{}", folder_of(model), file_names::CARD));
+    let Some(card) = card_of(store, model)? else { return Ok(None) };
+    let found = weights_and_music(&card, &place).ok().filter(|(found, _)| found == weights);
+    Ok(found.and_then(|_| family_of(&card, &place).ok()))
 }
 
 /// Returns the digest of the weights that a model has now, as its card says; none where there is no such model.
@@ -276,10 +289,10 @@ fn card_of(store: &Location, model: &str) -> Result<Option<Bytes>, StoreError> {
         return Ok(None);
     }
     let path = format!("{}/{}", current_folder(store, &folder_of(model))?, file_names::CARD);
-    let pretrained_card =
-        || (model == pretrained::NAME).then(|| pretrained::file(file_names::CARD));
     match store.read_regular(&path, MAX_CARD_BYTES) {
-        Err(StoreError::NotFound { .. }) => Ok(pretrained_card().flatten()),
+        Err(StoreError::NotFound { .. }) => {
+            Ok(shipped_as(model).and_then(|shipped| shipped.file(file_names::CARD)))
+        }
         read => read.map(Some),
     }
 }

@@ -7,6 +7,7 @@ use anyhow::Context as _;
 
 pub use super::model_folder::{
     ModelFolder, POINTER, current_folder, folder_of, is_model_name, pointer_to, sha256, sha256_of,
+    shipped_as,
 };
 use super::{RARE, all_threads};
 use crate::autodiff::Parameters;
@@ -106,7 +107,7 @@ impl OpenModel {
             Ok(Box::new(self.eager(n_workers, n_threads)?))
         };
         // What the program has in itself needs nothing beside it.
-        let needs_nothing = params.engine == EngineChoice::Auto && self.files.is_pretrained();
+        let needs_nothing = params.engine == EngineChoice::Auto && self.files.is_shipped();
         if params.engine == EngineChoice::Eager || needs_nothing {
             return Ok((eager()?, None));
         }

@@ -7,7 +7,7 @@ use anyhow::{Context as _, bail};
 use bytes::Bytes;
 use sha2::{Digest as _, Sha256};
 
-use super::pretrained;
+use super::pretrained::ShippedModel;
 pub use crate::generation::is_name as is_model_name;
 use crate::generation::{
     CardError, FamilyCard as _, FileEntry, GroupCard, MAX_CARD_BYTES, ModelCard, ModelFileName,
@@ -35,7 +35,7 @@ pub struct ModelFolder {
 enum Source {
     Folder(PathBuf),
     /// Within the program.
-    Pretrained,
+    Shipped(ShippedModel),
 }
 
 /// Returns where a model lies below a store.
@@ -99,14 +99,14 @@ impl ModelFolder {
         let folder = current_folder(store, &folder_of(name))?;
         let path = format!("{folder}/{}", file_names::CARD);
         let bytes = match store.read_regular(&path, MAX_CARD_BYTES) {
-            Err(StoreError::NotFound { .. }) if name == pretrained::NAME => {
-                return Self::pretrained();
-            }
-            Err(StoreError::NotFound { .. }) => bail!(
-                "store {store} has no model \"{name}\"{}; run motiongen export --store {store} --run RUN \
+            Err(StoreError::NotFound { .. }) => match shipped_as(name) {
+                Some(model) => return Self::shipped(model),
+                None => bail!(
+                    "store {store} has no model \"{name}\"{}; run motiongen export --store {store} --run RUN \
                  --model {name} first",
-                others(store)?
-            ),
+                    others(store)?
+                ),
+            },
             read => read?,
         };
         let (card_place, place) = (store.url_of(&path), store.url_of(&folder));
@@ -136,9 +136,10 @@ impl ModelFolder {
         if [file_names::CARD, POINTER].iter().any(|name| folder.join(name).is_file()) {
             return Self::of_folder(folder);
         }
-        match store {
-            Some(store) => Self::of_store(store, model, cache),
-            None => bail!(
+        match (store, shipped_as(model)) {
+            (Some(store), _) => Self::of_store(store, model, cache),
+            (None, Some(shipped)) => Self::shipped(shipped),
+            (None, None) => bail!(
                 "there is no model in the folder {model}; name the folder of a model (STORE/models/NAME), or give \
                  --store beside its name"
             ),
@@ -164,19 +165,19 @@ impl ModelFolder {
         Ok(Self::new(bytes, store.url_of(file_names::CARD), (source, place))?)
     }
 
-    /// Opens the model that ships with the program.
+    /// Opens a model that ships with the program.
     ///
     /// # Errors
     /// When the program was built without it.
-    pub fn pretrained() -> anyhow::Result<Self> {
-        let Some(bytes) = pretrained::file(file_names::CARD) else {
+    pub fn shipped(model: ShippedModel) -> anyhow::Result<Self> {
+        let Some(bytes) = model.file(file_names::CARD) else {
             bail!(
                 "this program was built without a model (feature pretrained); name one: --model NAME of a store, or \
                  the folder of one"
             )
         };
-        let place = pretrained::PLACE.to_owned();
-        Ok(Self::new(bytes, place.clone(), (Source::Pretrained, place))?)
+        let place = model.place().to_owned();
+        Ok(Self::new(bytes, place.clone(), (Source::Shipped(model), place))?)
     }
 
     /// Returns the folder of the files; those of the program are written into the cache first.
@@ -200,7 +201,8 @@ impl ModelFolder {
     fn bytes(&self, file: &FileEntry) -> anyhow::Result<Bytes> {
         match &self.source {
             Source::Folder(folder) => read_listed(&Location::local(folder)?, "", file, &self.place),
-            Source::Pretrained => pretrained::file(file.name.name())
+            Source::Shipped(model) => model
+                .file(file.name.name())
                 .with_context(|| format!("{} has no file {}", self.place, file.name)),
         }
     }
@@ -240,9 +242,9 @@ impl ModelFolder {
         format!("{}/{name}", self.place)
     }
 
-    /// Returns whether the model is the one within the program.
-    pub fn is_pretrained(&self) -> bool {
-        matches!(self.source, Source::Pretrained)
+    /// Returns whether the model is one within the program.
+    pub fn is_shipped(&self) -> bool {
+        matches!(self.source, Source::Shipped(_))
     }
 
     /// Returns what the card says of a file.
@@ -280,6 +282,11 @@ impl ModelFolder {
         }
         Ok(())
     }
+}
+
+/// Returns the model of a name that is within this program.
+pub fn shipped_as(name: &str) -> Option<ShippedModel> {
+    ShippedModel::named(name).filter(|model| model.file(file_names::CARD).is_some())
 }
 
 /// Reads a file that a card lists, if it is a regular one of the size that the card says.

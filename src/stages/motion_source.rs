@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use anyhow::{anyhow, bail, ensure};
-use ndarray::{Array2, Array3};
+use ndarray::Array3;
 
 use super::Stage as _;
 use super::beats;
@@ -312,26 +312,6 @@ fn of_dancers(
         Ok(DisplayedMotion { name, motion, facts })
     });
     shown.collect()
-}
-
-/// Reads the frames of a generated motion of a soloist, `[T, 25]`.
-///
-/// # Errors
-/// [`StoreError`], or one sentence where the table has no such motion, or one of a group.
-pub fn generated_frames(
-    store: &Location,
-    run: &str,
-    phrase: &str,
-    sample: usize,
-) -> anyhow::Result<Array2<f32>> {
-    let group = generated_group(store, run, phrase, sample)?;
-    let n_dancers = group.len_of(ndarray::Axis(0));
-    ensure!(
-        n_dancers == 1,
-        "store {store}: {} has {n_dancers} dancers where one is read",
-        generation_id(run, phrase, sample)
-    );
-    Ok(group.index_axis_move(ndarray::Axis(0), 0))
 }
 
 /// Reads the frames of all dancers of a generated motion, `[N, T, 25]`: the one place that knows how `generated` names

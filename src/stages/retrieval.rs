@@ -21,7 +21,8 @@ pub fn read_dataset(
     store: &Location,
     threads: NonZeroUsize,
 ) -> Result<Dataset, crate::training::DatasetError> {
-    let (dataset, left_out) = dataset_of(&StoreSnapshot::take(store)?, threads)?;
+    let (dataset, left_out) =
+        dataset_of(&StoreSnapshot::take(store)?, Ensemble::Soloists, threads)?;
     let n_groups = left_out.iter().filter(|one| one.is_for_other_models()).count();
     if n_groups > 0 {
         tracing::info!(
@@ -31,20 +32,28 @@ pub fn read_dataset(
     Ok(dataset)
 }
 
-/// Reads the phrases of a snapshot that there is for a soloist to learn from, and those that are left out.
+/// Most training phrases of groups that are read: their frames count once for each dancer.
+const MAX_TRAIN_GROUPS: usize = 800;
+
+/// Reads the phrases of a snapshot that there is for soloists or groups to learn from, and those that are left out.
 ///
 /// # Errors
 /// As [`Dataset::read`].
 pub fn dataset_of(
     snapshot: &StoreSnapshot,
+    ensemble: Ensemble,
     threads: NonZeroUsize,
 ) -> Result<(Dataset, Vec<ExcludedPhrase>), crate::training::DatasetError> {
+    let most = match ensemble {
+        Ensemble::Soloists => MAX_TRAIN_PHRASES,
+        Ensemble::Groups { .. } => MAX_TRAIN_GROUPS,
+    };
     let reading = DatasetOptions {
-        ensemble: Ensemble::Soloists,
+        ensemble,
         in_memory: false,
         n_threads: threads,
         patience: Patience::default(),
-        max_train_phrases: Some(MAX_TRAIN_PHRASES),
+        max_train_phrases: Some(most),
     };
     Dataset::of(snapshot, &reading, &|_, _| {}, &|_, _| {})
 }

@@ -2,12 +2,16 @@
 
 mod tokens;
 
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use super::train::survey::first_stage;
 use crate::autodiff::Parameters;
 use crate::model::{MotionDecoder, ParameterList, UNet1D};
 use crate::store::Location;
 use crate::training::{
-    CheckpointKind, Checkpoints, DecoderLearner, DiffusionLearner, FinetuneLearner, Learner as _,
-    State, TrainConfig, TrainingError,
+    CheckpointKind, Checkpoints, DecoderLearner, DiffusionLearner, FinetuneLearner, GroupLearner,
+    Learner as _, PlannerLearner, State, TokensLearner, TrainConfig, TrainingError,
 };
 pub use tokens::{TrainedPlanner, TrainedTokenizer};
 
@@ -61,12 +65,7 @@ impl TrainedRun {
         let checkpoints_of = |stage: &'static str| Checkpoints::new(store, run, stage);
         let diffusion = checkpoints_of(DiffusionLearner::STAGE);
         let Some(&step) = diffusion.steps(CheckpointKind::Best)?.last() else {
-            let way_out = format!("run motiongen train --run {run} first");
-            return Err(TrainingError::Missing {
-                run: run.to_owned(),
-                what: "trained UNet",
-                way_out,
-            });
+            return Err(without_unet(store, run)?);
         };
         let state: State<TrainConfig> = diffusion.read(CheckpointKind::Best, step, State::of)?;
         let network = &state.config.network;
@@ -105,6 +104,34 @@ impl TrainedRun {
     }
 }
 
+/// Returns what a run lacks that has no trained UNet, in terms of the family that it is of.
+fn without_unet(store: &Location, run: &str) -> Result<TrainingError, TrainingError> {
+    let family = first_stage(store, run)?.and_then(|stage| match stage {
+        GroupLearner::STAGE => Some((stage, "trained denoiser of groups", "--family group")),
+        TokensLearner::STAGE => Some((stage, "trained tokenizer", "--family tokens")),
+        PlannerLearner::STAGE => {
+            Some((stage, "trained planner", "--family tokens --tokenizer RUN"))
+        }
+        _ => None,
+    });
+    let run = run.to_owned();
+    let Some((stage, trained, flags)) = family else {
+        let way_out = format!("run motiongen train --run {run} first");
+        return Ok(TrainingError::Missing { run, what: "trained UNet", way_out });
+    };
+    let is_trained = has_best(store, &run, stage)?;
+    let (what, way_out) = match is_trained {
+        true => ("trained UNet", format!("it has a {trained}; name a run of the family unet")),
+        false => (
+            trained,
+            format!(
+                "its training ended before anything was validated, so go on with motiongen train {flags} --run {run}"
+            ),
+        ),
+    };
+    Ok(TrainingError::Missing { run, what, way_out })
+}
+
 /// Returns the weights of a stage that validated best.
 ///
 /// # Errors
@@ -123,6 +150,36 @@ pub fn best(
     Ok(BestWeights { parameters: section(checkpoints, step, prefix, list)?, step })
 }
 
+/// Returns whether a stage of a run validated anything.
+///
+/// # Errors
+/// When the store cannot be listed.
+pub fn has_best(store: &Location, run: &str, stage: &str) -> Result<bool, TrainingError> {
+    Ok(!Checkpoints::new(store, run, stage).steps(CheckpointKind::Best)?.is_empty())
+}
+
+/// Returns the state of a stage at the step at which it validated best, and its weights; `list` names them by the
+/// configuration.
+///
+/// # Errors
+/// A checkpoint that is damaged or of another configuration, and what `list` says.
+pub fn read_best<C: Serialize + DeserializeOwned>(
+    checkpoints: &Checkpoints,
+    step: u64,
+    prefix: &str,
+    list: impl FnOnce(&C) -> Result<ParameterList, TrainingError>,
+) -> Result<(State<C>, Parameters<f32>), TrainingError> {
+    checkpoints.read(CheckpointKind::Best, step, |archive, place| {
+        let state: State<C> = State::of(archive, place)?;
+        let list = list(&state.config)?;
+        let place = place.to_owned();
+        let parameters = archive
+            .section(prefix, list)
+            .map_err(|source| TrainingError::Weights { place, source })?;
+        Ok((state, parameters))
+    })
+}
+
 fn section(
     checkpoints: &Checkpoints,
     step: u64,
@@ -133,4 +190,57 @@ fn section(
         let place = place.to_owned();
         archive.section(prefix, list).map_err(|source| TrainingError::Weights { place, source })
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_that_was_not_validated_lacks_what_its_family_has() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let store = Location::local(folder.path()).expect("a store");
+        let begun = |run: &str, config: &str| {
+            let path = format!("runs/{run}/train.json");
+            store.put_new(&path, config.to_owned().into()).expect("written");
+        };
+        let refused = |run: &str| {
+            let refused = TrainedRun::read(&store, run, WeightsChoice::Latest);
+            refused.err().expect("no UNet").to_string()
+        };
+        for (run, config) in [
+            ("g", r#"{"group": {}}"#),
+            ("t", r#"{"network": {"tokens": {}}, "tokens": {}}"#),
+            ("p", r#"{"planner": {}}"#),
+            ("u", r#"{"diffusion": {}}"#),
+        ] {
+            begun(run, config);
+        }
+        let goes_on =
+            "its training ended before anything was validated, so go on with motiongen train";
+        assert_eq!(
+            refused("g"),
+            format!("run g has no trained denoiser of groups; {goes_on} --family group --run g")
+        );
+        assert_eq!(
+            refused("t"),
+            format!("run t has no trained tokenizer; {goes_on} --family tokens --run t")
+        );
+        assert_eq!(
+            refused("p"),
+            format!(
+                "run p has no trained planner; {goes_on} --family tokens --tokenizer RUN --run p"
+            )
+        );
+        for run in ["u", "x"] {
+            let expected =
+                format!("run {run} has no trained UNet; run motiongen train --run {run} first");
+            assert_eq!(refused(run), expected);
+        }
+        store.put_new("runs/t/tokens/best-00000007.safetensors", "".into()).expect("written");
+        assert_eq!(
+            refused("t"),
+            "run t has no trained UNet; it has a trained tokenizer; name a run of the family unet"
+        );
+    }
 }

@@ -43,9 +43,20 @@ impl Ledger {
     }
 
     pub(super) fn of(log: &StageLog) -> Result<Self, StoreError> {
+        Self::of_items(log, |_| true)
+    }
+
+    /// Reads what a stage has committed of the items that `is_wanted` names; the others take no memory.
+    pub(super) fn of_items(
+        log: &StageLog,
+        is_wanted: impl Fn(&str) -> bool,
+    ) -> Result<Self, StoreError> {
         let mut ledger = Self::default();
         let mut headers: HashMap<Header, Arc<Header>> = HashMap::new();
         log.visit(|word| {
+            if !is_wanted(&word.item.id) {
+                return;
+            }
             let header = match headers.get(word.header) {
                 Some(header) => Arc::clone(header),
                 None => {
@@ -99,5 +110,38 @@ impl Ledger {
     pub fn iter(&self) -> impl Iterator<Item = &SettledItem> {
         let is_latest = |known: &&SettledItem| !self.added.contains_key(&known.item.id);
         self.settled.iter().filter(is_latest).chain(self.added.values())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Commit, StoreSnapshot, checkpoint};
+    use super::*;
+
+    #[test]
+    fn a_ledger_of_some_items_says_of_them_what_the_whole_one_says() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let store = Location::local(folder.path()).expect("a store");
+        for (n, ids) in [(0, ["a", "b", "c"]), (1, ["b", "d", "e"])] {
+            let before = Ledger::read(&store, "ingest").expect("a ledger");
+            let mut commit = Commit::new(&store, "ingest", "", "");
+            for id in ids {
+                let (id, input_hash) = (id.to_owned(), format!("{id}{n}"));
+                let item = Item { id, fingerprint: String::new(), input_hash, failure: None };
+                commit.settle(item, &before);
+            }
+            commit.publish().expect("published");
+        }
+        let known_of = |snapshot: &StoreSnapshot| {
+            let ledger = snapshot.ledger_where("ingest", |id| id > "a" && id < "e").expect("read");
+            let mut known: Vec<String> = ledger.iter().map(|s| s.item.input_hash.clone()).collect();
+            known.sort();
+            assert!(ledger.get("a").is_none() && ledger.get("b").is_some());
+            known
+        };
+        let expected = ["b1", "c0", "d1"];
+        assert_eq!(known_of(&StoreSnapshot::take(&store).expect("manifests")), expected);
+        checkpoint(&store, &["ingest"]);
+        assert_eq!(known_of(&StoreSnapshot::take(&store).expect("a catalogue")), expected);
     }
 }

@@ -113,6 +113,21 @@ impl StoreSnapshot {
         }
     }
 
+    /// Returns what a stage has committed of the items that `is_wanted` names, such as those of a shard.
+    ///
+    /// # Errors
+    /// [`StoreError`] when the commits cannot be read.
+    pub fn ledger_where(
+        &self,
+        stage: &str,
+        is_wanted: impl Fn(&str) -> bool,
+    ) -> Result<Ledger, StoreError> {
+        match self.stages.iter().find(|log| log.stage == stage) {
+            Some(log) => Ledger::of_items(log, is_wanted),
+            None => Ok(Ledger::default()),
+        }
+    }
+
     /// Writes catalogues of stages whose last one is behind, as [`checkpoint`] does.
     pub fn checkpoint(&self) {
         for log in self.stages.iter() {

@@ -170,7 +170,7 @@ rows! {
     {
         model: String, "", "Name of the model.";
         run: String, "", "The run that it was exported from.";
-        check: String, "", "`forward` (one prediction of the UNet), `sample` (all steps of DDIM), `guided_sample` (the same with guidance), `decode` (the decoder on what was sampled), `rounding` (all steps of DDIM with rounded weights against the trained ones); of a model of tokens also `tokens` (share of the encoder's that are others), `signal`, `planner`, and `planner_step` (position by position with what is kept, against the whole planner).";
+        check: String, "", "`forward` (one prediction of the UNet), `sample` (all steps of DDIM), `guided_sample` (the same with guidance), `decode` (the decoder on what was sampled), `rounding` (all steps of DDIM with rounded weights against the trained ones); of a model of groups `score` (log f) and `agreement` (the part of it that is the dancers'); of a model of tokens also `tokens` (share of the encoder's that are others), `signal`, `planner`, and `planner_step` (position by position with what is kept, against the whole planner).";
         precision: String, "", "How the weights are stored: `fp32`, `fp16` or `int8`.";
         n_samples: i32, "samples", "Motions of the batch.";
         n_frames: i32, "frames", "Frames of each.";
@@ -189,7 +189,7 @@ rows! {
 
 rows! {
     "One row per motion that generate sampled, kept or not; measured times differ from run to run, nothing else does."
-    GenerationRow in "generations" version 4 reads 1 sorted by [generation, candidate]
+    GenerationRow in "generations" version 5 reads 1 sorted by [generation, candidate]
     {
         generation: String, "", "The motion: `RUN/PHRASE/SAMPLE`.";
         run: String, "", "Name of the generation (--run), by default that of the model.";
@@ -215,6 +215,7 @@ rows! {
         velocity_error: f64, "m/s", "Mean |v − 30 Δp| of the motion as it was decoded, before post-processing.";
         control_error_mm: Option<f64>, "mm", "Largest distance from a constraint on the position.";
         control_error_deg: Option<f64>, "°", "Largest angle from a constraint on the orientation.";
+        constraints: Option<String>, "JSON", "What the motion was asked to do, frame by frame, as `generate --constraints` reads it; none where it was asked for nothing, and in rows of versions before 5.";
         generate_s: f64, "s", "Time that sampling, decoding and post-processing took.";
         real_time_factor: f64, "", "That time over the length of the motion.";
         settings: Option<String>, "JSON", "What determines the motion beside its music, the model's weights and the seed: sampler, guidance, candidates, style, overlap, priming, post-processing, and of constraints the digest. None where release 0.1 made it.";
@@ -289,7 +290,7 @@ rows! {
     {
         run: String, "", "The run of generate that was evaluated, or the name of motions of another program; evaluating it again replaces its rows.";
         model: String, "", "Name of the model; empty for motions of another program.";
-        subject: String, "", "Whose number it is: `generated`, or a baseline: `shuffled` (the same motions with the music of other songs), `shifted` (with the bars shifted by beats), `untrained` (motion of the same network with its first weights), `no_music` (of the trained network, its music withheld), `retrieval` (the library's phrase with the nearest features), `mean_motion`, `held_out_truth`, `training_truth`.";
+        subject: String, "", "Whose number it is: `generated`, or a baseline: `shuffled` (the same motions with the music of other songs), `shifted` (with the bars shifted by beats), `untrained` (motion of the same network with its first weights), `no_music` (of the trained network, its music withheld), `shuffled_plan` (of a model of tokens, the tokens of each window in an order of chance), `reconstructed` (real motion that a tokenizer made again of its tokens), `retrieval` (the library's phrase with the nearest features), `mean_motion`, `held_out_truth`, `training_truth`; of groups also `independent` (soloists who were sampled one by one, in the places of the dancers) and `copied` (one dancer in the places of all).";
         split: String, "", "Which music: `held_out` (the model met none of it), `validation` (its checkpoints were chosen by it), `trained_on`, `unknown` (nobody knows), or `all` of these.";
         metric: String, "", "Name of the number: see docs/evaluate.md.";
         variant: String, "", "Which of several ways to measure it; empty where there is one. `raw` is of motion as it was decoded.";
@@ -310,7 +311,7 @@ rows! {
         run: String, "", "The run of generate that was evaluated, or the name of motions of another program; evaluating it again replaces its rows.";
         model: String, "", "Name of the model; empty for motions of another program.";
         split: String, "", "Which music, as in `metrics`.";
-        verdict: String, "", "`sound`, `like_real`, `follows_music` or `varied`.";
+        verdict: String, "", "`sound`, `like_real`, `follows_music` or `varied`; of groups also `together`.";
         verdict_outcome: String, "", "`won` (every test is won), `lost` (one is lost) or `open` (too little was measured).";
         test: String, "", "Name of the test: see docs/evaluate.md.";
         outcome: String, "", "`won`, `lost` or `open`.";

@@ -112,6 +112,8 @@ pub struct ControlRows {
     pub samples: Vec<SampleRow>,
     pub position: Vec<ControlRow>,
     pub rotation: Vec<ControlRow>,
+    /// Mean over keyframes, and over the means of samples, s.
+    pub timing: [f64; 2],
 }
 
 #[derive(Deserialize)]
@@ -121,6 +123,7 @@ pub struct SampleRow {
     pub quaternion: Vec<[f64; 4]>,
     pub mm: Vec<f64>,
     pub deg: Vec<f64>,
+    pub timing_s: Vec<f64>,
 }
 
 #[derive(Deserialize)]

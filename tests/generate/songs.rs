@@ -110,6 +110,31 @@ fn a_song_is_danced_to_by_the_model_of_the_program() {
     assert_eq!(generations.len(), 16);
 }
 
+/// Five dancers with nothing but the executable and a song, with the model named or not.
+#[cfg(feature = "pretrained")]
+#[test]
+fn five_dance_to_a_song_by_the_model_of_groups_of_the_program() {
+    let dir = Dir::new();
+    let song = dir.write("song.wav", wav(3.1)).display().to_string();
+    let dance = |out: &str, more: &[&str]| {
+        let mut command = motiongen();
+        command.env_remove("ORT_DYLIB_PATH").env("HOME", dir.at("home"));
+        command.args(["generate", "--audio", &song, "--consistency", "0.5", "--quiet"]);
+        command.args(["--steps=2", "--format=npy,html", "--output"]).arg(dir.at(out)).args(more);
+        let output = finish(&mut command);
+        assert_eq!(output.code, 0, "{output:?}");
+        let made_by = "model group (family group), 5 dancers, consistency 0.5, eager (";
+        assert!(output.stdout.contains(made_by), "{output:?}");
+        assert!(dir.at(out).join("song.html").exists());
+        std::fs::read(dir.at(out).join("song.npy")).expect("a motion")
+    };
+    let unnamed = dance("unnamed", &["--dancers=5"]);
+    // 94 frames of five dancers: a header of 128 bytes and 25 numbers of 4 bytes each.
+    assert_eq!(unnamed.len(), 128 + 5 * 94 * 25 * 4);
+    assert_eq!(dance("named", &["--dancers=5", "--model=group"]), unnamed);
+    assert!(!dir.at("home").exists(), "nothing is written but the output");
+}
+
 #[cfg(feature = "pretrained")]
 fn command_of_store(store: &Path) -> Command {
     let mut command = motiongen();

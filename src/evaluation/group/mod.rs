@@ -7,6 +7,7 @@ pub mod contact;
 pub mod correlation;
 pub mod difference;
 pub mod formation;
+pub mod numbers;
 pub mod realism;
 #[cfg(test)]
 mod tests;

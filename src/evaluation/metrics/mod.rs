@@ -1,18 +1,21 @@
 //! The numbers of a set of windows: how far they follow the music, and how they compare with real motion.
 
+mod control;
 mod motion;
 mod music;
 mod ratio;
+mod reconstruction;
 
+pub use control::{control_numbers, keyframe_numbers};
 pub use motion::{
-    MotionContext, channel_numbers, control_numbers, motion_numbers, soundness_numbers,
-    whole_numbers,
+    MotionContext, channel_numbers, motion_numbers, soundness_numbers, whole_numbers,
 };
 pub use music::{
     MusicContext, N_WRONG_TEMPI, PhaseOrigin, music_numbers, phase_numbers, shifted_numbers,
     song_harmonics,
 };
 pub use ratio::{coupling_ratio, motion_ratios};
+pub use reconstruction::{CodeUse, ReconstructedPhrase, reconstruction_numbers};
 
 use std::collections::BTreeMap;
 
@@ -91,7 +94,7 @@ pub struct Number {
 }
 
 impl Number {
-    fn new(
+    pub(in crate::evaluation) fn new(
         metric: &'static str,
         variant: impl Into<String>,
         unit: &'static str,
@@ -102,7 +105,7 @@ impl Number {
         Self { metric, variant, unit, estimate, by_song: BTreeMap::new(), protocol }
     }
 
-    fn with_songs(self, by_song: BTreeMap<usize, f64>) -> Self {
+    pub(in crate::evaluation) fn with_songs(self, by_song: BTreeMap<usize, f64>) -> Self {
         Self { by_song, ..self }
     }
 }
@@ -112,16 +115,26 @@ fn mean_over(
     danced: &[MotionWindow],
     value: impl Fn(&MotionWindow) -> Option<f64>,
 ) -> (Estimate, BTreeMap<usize, f64>) {
-    let (values, songs): (Vec<f64>, Vec<usize>) =
-        danced.iter().filter_map(|item| Some((value(item)?, item.song))).unzip();
+    mean_by_song(danced.iter().filter_map(|item| Some((value(item)?, item.song))))
+}
+
+/// Mean over values with the number of their songs, with songs as clusters, and the mean of each song.
+pub(in crate::evaluation) fn mean_by_song(
+    known: impl Iterator<Item = (f64, usize)>,
+) -> (Estimate, BTreeMap<usize, f64>) {
+    let (values, songs): (Vec<f64>, Vec<usize>) = known.unzip();
+    (clustered_mean_estimate(&values, &songs), by_song(&values, &songs))
+}
+
+/// Mean of the values of each song.
+fn by_song(values: &[f64], songs: &[usize]) -> BTreeMap<usize, f64> {
     let mut sums: BTreeMap<usize, (f64, f64)> = BTreeMap::new();
-    for (value, song) in values.iter().zip(&songs) {
+    for (value, song) in values.iter().zip(songs) {
         let (sum, n) = sums.entry(*song).or_default();
         *sum += value;
         *n += 1.0;
     }
-    let by_song = sums.into_iter().map(|(song, (sum, n))| (song, sum / n)).collect();
-    (clustered_mean_estimate(&values, &songs), by_song)
+    sums.into_iter().map(|(song, (sum, n))| (song, sum / n)).collect()
 }
 
 /// Returns a variant with the stage of the making of motion that it is of: `strict_raw`, `raw`; plain without one.

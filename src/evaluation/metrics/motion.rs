@@ -6,14 +6,13 @@ use ndarray::{Array2, ArrayView2, Axis, concatenate};
 
 use super::{MotionWindow, Number, SEED, mean_over, staged};
 use crate::evaluation::consistency::Consistency;
-use crate::evaluation::control::{POSITION_THRESHOLDS_MM, ROTATION_THRESHOLDS_DEG, control_errors};
 use crate::evaluation::distribution::channel_distances;
 use crate::evaluation::diversity::{
     DIVERSITY_PAIRS, MULTIMODALITY_PAIRS, distance, diversity, mean_distance, multimodality,
 };
 use crate::evaluation::frechet::{Gaussian, frechet_distance};
 use crate::evaluation::interval::{
-    Estimate, clustered_mean_estimate, clustered_share_estimate, jackknife_estimate, share_estimate,
+    Estimate, clustered_mean_estimate, clustered_share_estimate, jackknife_estimate,
 };
 use crate::evaluation::kinetic::CHUNK_FRAMES;
 use crate::evaluation::measured::WindowMeasures;
@@ -360,35 +359,4 @@ pub fn channel_numbers(motion: ArrayView2<f32>, truth: ArrayView2<f32>) -> Vec<N
             Number::new("channel_distance", *name, "deviations", estimate, &*protocol)
         })
         .collect()
-}
-
-/// Sums up the largest misses of motions that had constraints: of positions, mm, and of orientations, °.
-///
-/// `songs` names the song of each.
-pub fn control_numbers(misses: [&[f64]; 2], songs: [&[usize]; 2]) -> Vec<Number> {
-    let kinds = [
-        ("control_position", "mm", POSITION_THRESHOLDS_MM[1]),
-        ("control_orientation", "°", ROTATION_THRESHOLDS_DEG[1]),
-    ];
-    let mut numbers = Vec::new();
-    for (i, (metric, unit, threshold)) in kinds.into_iter().enumerate() {
-        if misses[i].is_empty() {
-            continue;
-        }
-        let mean = clustered_mean_estimate(misses[i], songs[i]).non_negative();
-        let protocol = "largest miss of a motion, mean over motions";
-        numbers.push(Number::new(metric, "largest", unit, mean, protocol));
-        let samples: Vec<[f64; 1]> = misses[i].iter().map(|miss| [*miss]).collect();
-        if let Some(errors) = control_errors(&samples, threshold) {
-            let n_missed = (errors.trajectory * errors.n_samples as f64).round() as usize;
-            numbers.push(Number::new(
-                metric,
-                format!("share above {threshold} {unit}"),
-                "",
-                share_estimate(n_missed, errors.n_samples),
-                "share of motions with a miss above the threshold (Traj. err.)",
-            ));
-        }
-    }
-    numbers
 }

@@ -1,6 +1,6 @@
 //! Does it follow its music?
 
-use super::{Evidence, Outcome, Rule, Test, estimate, find, real, rounded};
+use super::{Evidence, GroupEvidence, Outcome, Rule, Test, estimate, find, real, rounded};
 use crate::evaluation::interval::{Estimate, holm, paired_difference};
 use crate::evaluation::metrics::Number;
 
@@ -8,9 +8,11 @@ use crate::evaluation::metrics::Number;
 const ALPHA: f64 = 0.05;
 /// Locked amplitude over that of real motion.
 const AMPLITUDE: [f64; 2] = [0.5, 2.0];
+/// Least R² of the dancer of a group who keeps the bar worst, over that of real groups.
+const LEAST_DANCER_RATIO: f64 = 0.5;
 
 /// The coefficient on the known coupling against chance, wrong tempi, other music, shifted bars and the untrained
-/// network; and its size.
+/// network; and its size. Of groups also whether each dancer keeps the bar.
 pub(super) fn tests(evidence: &Evidence) -> Vec<Test> {
     let Evidence { own, truth, .. } = evidence;
     let coupling = own.iter().find(|number| number.metric == "coupling");
@@ -34,7 +36,26 @@ pub(super) fn tests(evidence: &Evidence) -> Vec<Test> {
             |number| real(truth, "coupling", &number.variant),
         ),
     ));
+    tests.extend(evidence.group.as_ref().map(every_dancer));
     tests
+}
+
+/// A test of whether the dancer who keeps the bar worst of a window's keeps it as in real groups.
+fn every_dancer(group: &GroupEvidence) -> Test {
+    let (metric, variant) = ("group_locking", "least_dancer");
+    let held_out = estimate(group.truth, metric, variant).value;
+    let value = match held_out {
+        Some(_) => estimate(group.own, metric, variant),
+        None => Estimate::default(),
+    };
+    Test::of_value(
+        "every_dancer",
+        "R² with the bar, above chance, of the dancer of each window who keeps it worst",
+        value,
+        "",
+        Rule::AtLeast(LEAST_DANCER_RATIO * held_out.unwrap_or(0.0).max(0.0)),
+        real(group.truth, metric, variant),
+    )
 }
 
 /// A test of a probability that the bar has nothing to do with it.

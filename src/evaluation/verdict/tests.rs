@@ -87,6 +87,7 @@ fn outcomes(
         truth: &truth,
         has_raw: true,
         has_network: true,
+        group: None,
     };
     verdicts(&evidence)
         .into_iter()
@@ -149,12 +150,11 @@ fn what_was_not_measured_leaves_a_verdict_open() {
         truth: &truth,
         has_raw: false,
         has_network: false,
+        group: None,
     };
     let found = verdicts(&evidence);
-    assert_eq!(
-        found.each_ref().map(|verdict| verdict.outcome.name()),
-        ["won", "won", "open", "won"]
-    );
+    let outcomes: Vec<&str> = found.iter().map(|verdict| verdict.outcome.name()).collect();
+    assert_eq!(outcomes, ["won", "won", "open", "won"]);
     let open: Vec<_> = found[2].tests.iter().filter(|test| test.outcome == Outcome::Open).collect();
     assert_eq!(open.len(), 1);
     assert_eq!(
@@ -178,6 +178,7 @@ fn a_test_says_both_values_and_what_it_is_held_against() {
         truth: &truth,
         has_raw: true,
         has_network: false,
+        group: None,
     };
     let found = verdicts(&evidence);
     assert_eq!(
@@ -194,4 +195,72 @@ fn a_test_says_both_values_and_what_it_is_held_against() {
         ),
         "{message}"
     );
+}
+
+/// Numbers of a group that wins everything.
+fn good_group() -> Vec<Number> {
+    vec![
+        number("tif", "", 0.0),
+        number("least_separation", "least", 0.7),
+        number("formation_spread", "", 1.6),
+        number("dancer_velocity_difference", "", 0.5),
+        number("group_locking", "least_dancer", 0.4),
+        by_song("unison_index", "", &[0.5, 0.6, 0.55, 0.62]),
+    ]
+}
+
+/// Outcomes of the tests of [`Quality::Together`], and of each dancer's bar, of numbers of which one is replaced.
+fn group_outcomes(change: Option<Number>, alone: &[f64]) -> BTreeMap<&'static str, Outcome> {
+    let mut own = good_group();
+    if let Some(change) = change {
+        own.retain(|n| (n.metric, &n.variant) != (change.metric, &change.variant));
+        own.push(change);
+    }
+    let (good, truth, group_truth) = (good(), truth(), good_group());
+    let independent = match alone {
+        [] => Vec::new(),
+        songs => vec![by_song("unison_index", "", songs)],
+    };
+    let evidence = Evidence {
+        own: &good,
+        shuffled: &[],
+        shifted: &[],
+        untrained: &[],
+        truth: &truth,
+        has_raw: false,
+        has_network: false,
+        group: Some(GroupEvidence { own: &own, independent: &independent, truth: &group_truth }),
+    };
+    let verdicts = verdicts(&evidence);
+    assert_eq!(verdicts.len(), 5);
+    let of_group = |test: &&Test| test.name == "every_dancer";
+    let tests = verdicts[2].tests.iter().filter(of_group).chain(&verdicts[4].tests);
+    let mut found: BTreeMap<_, _> = tests.map(|test| (test.name, test.outcome)).collect();
+    found.insert("together", verdicts[4].outcome);
+    found
+}
+
+#[test]
+fn each_fault_of_a_group_is_seen_by_its_test() {
+    let alone = [0.1, 0.15, 0.05, 0.2];
+    let won = group_outcomes(None, &alone);
+    assert!(won.values().all(|outcome| *outcome == Outcome::Won), "{won:?}");
+    for (test, change) in [
+        ("tif", number("tif", "", 0.021)),
+        ("least_separation", number("least_separation", "least", 0.34)),
+        ("stage", number("formation_spread", "", 0.7)),
+        ("stage", number("formation_spread", "", 3.3)),
+        ("own_ways", number("dancer_velocity_difference", "", 0.0)),
+        ("own_ways", number("dancer_velocity_difference", "", 2.1)),
+        ("belong_together", by_song("unison_index", "", &[0.1, 0.2, 0.05, 0.15])),
+    ] {
+        let found = group_outcomes(Some(change), &alone);
+        assert_eq!(found[test], Outcome::Lost, "{test}");
+        assert_eq!(found["together"], Outcome::Lost, "{test}");
+    }
+    let late = number("group_locking", "least_dancer", 0.19);
+    assert_eq!(group_outcomes(Some(late), &alone)["every_dancer"], Outcome::Lost);
+    // Without soloists to compare with nothing is known of belonging together.
+    let open = group_outcomes(None, &[]);
+    assert_eq!((open["belong_together"], open["together"]), (Outcome::Open, Outcome::Open));
 }

@@ -31,6 +31,21 @@ struct GroupWorker {
     arena: Arena<f32>,
 }
 
+/// What estimates the clean motion of groups.
+pub trait GroupEstimator: Sync {
+    /// Returns the name that flags and tables use.
+    fn name(&self) -> &'static str;
+
+    /// Returns the length of the noise of the group embedding.
+    fn embedding_dim(&self) -> usize;
+
+    /// Estimates clean motion, normalised: \[B N, T, 25\], moved along the gradient of the score where that is asked.
+    ///
+    /// # Errors
+    /// Shapes that do not fit.
+    fn predict(&self, inputs: &GroupEngineInputs) -> Result<Array3<f32>, EngineError>;
+}
+
 /// The inputs of an estimate of B groups of N dancers.
 #[derive(Clone, Copy, Debug)]
 pub struct GroupEngineInputs<'a> {
@@ -139,19 +154,9 @@ impl GroupEngine {
         })
     }
 
-    /// Returns the name that flags and tables use.
-    pub fn name(&self) -> &'static str {
-        "eager"
-    }
-
     /// Returns how many calls run at once.
     pub fn n_workers(&self) -> usize {
         self.workers.len()
-    }
-
-    /// Returns the length of the noise of the group embedding.
-    pub fn embedding_dim(&self) -> usize {
-        self.config.width
     }
 
     /// Returns the sizes of the networks.
@@ -159,11 +164,7 @@ impl GroupEngine {
         &self.config
     }
 
-    /// Estimates clean motion, normalised: \[B N, T, 25\], moved along the gradient of the score where that is asked.
-    ///
-    /// # Errors
-    /// Shapes that do not fit.
-    pub fn predict(&self, inputs: &GroupEngineInputs) -> Result<Array3<f32>, EngineError> {
+    fn moved_estimate(&self, inputs: &GroupEngineInputs) -> Result<Array3<f32>, EngineError> {
         let (groups, frames, dim) = inputs.audio.dim();
         let expected = [groups * inputs.n_dancers, frames, self.config.motion_dim];
         for (what, found, expected) in [
@@ -313,6 +314,20 @@ impl GroupEngine {
         let number = given.number(g, &self.config);
         let inputs = GroupScoreInputs { x0, t: &t, w, number: &number, mask: None, there: None };
         self.networks.score.forward(g, &inputs)
+    }
+}
+
+impl GroupEstimator for GroupEngine {
+    fn name(&self) -> &'static str {
+        "eager"
+    }
+
+    fn embedding_dim(&self) -> usize {
+        self.config.width
+    }
+
+    fn predict(&self, inputs: &GroupEngineInputs) -> Result<Array3<f32>, EngineError> {
+        self.moved_estimate(inputs)
     }
 }
 

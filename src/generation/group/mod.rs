@@ -5,5 +5,5 @@ mod engine;
 mod track;
 
 pub use card::{GroupCard, GroupProvenance};
-pub use engine::{ConsistencyForm, GroupEngine, GroupEngineInputs};
+pub use engine::{ConsistencyForm, GroupEngine, GroupEngineInputs, GroupEstimator};
 pub use track::{GroupGenerator, GroupTrack};

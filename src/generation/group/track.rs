@@ -7,7 +7,7 @@
 
 use ndarray::{Array3, ArrayView2, ArrayView3, Axis, s};
 
-use super::engine::{ConsistencyForm, GroupEngine, GroupEngineInputs};
+use super::engine::{ConsistencyForm, GroupEngineInputs, GroupEstimator};
 use crate::autodiff::Stream;
 use crate::diffusion::{SamplerConfig, Schedule, sample_refined};
 use crate::generation::engine::EngineError;
@@ -22,7 +22,7 @@ const EMBEDDING_DRAW: u64 = u64::MAX;
 /// The model and settings that motion of a group is generated with.
 #[derive(Clone, Copy)]
 pub struct GroupGenerator<'a> {
-    pub engine: &'a GroupEngine,
+    pub engine: &'a dyn GroupEstimator,
     pub sampler: &'a SamplerConfig,
     pub schedule: &'a Schedule,
     /// 1 follows the music, more exaggerates it, 0 ignores it.
@@ -202,3 +202,6 @@ fn with_phase(motion: ArrayView3<f32>, phase: Option<&[f64]>, first: usize) -> A
     }
     motion
 }
+
+#[cfg(test)]
+mod tests;

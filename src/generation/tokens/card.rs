@@ -9,7 +9,7 @@ use crate::generation::card::{
     check_sizes, most_bytes,
 };
 use crate::generation::learned::LearnedFrom;
-use crate::model::{Family, Planner, PlannerConfig, Tokenizer, TokensConfig};
+use crate::model::{CONSTRAINT_DIM, Family, Planner, PlannerConfig, Tokenizer, TokensConfig};
 use crate::motion::rates::MotionRange;
 use crate::motion::style::STYLE_DIM;
 use crate::motion::{MOTION_DIM, Normalizer};
@@ -116,6 +116,9 @@ impl FamilyCard for TokensCard {
         ])?;
         if planner.style_dim > 0 {
             check_sizes(&[("style_dim", planner.style_dim, STYLE_DIM)])?;
+        }
+        if planner.constraint_dim > 0 {
+            check_sizes(&[("constraint_dim", planner.constraint_dim, CONSTRAINT_DIM)])?;
         }
         if diffusion.prediction != Prediction::Sample {
             return Err("the denoiser of a model of tokens predicts clean motion, and the diffusion says otherwise; \

@@ -5,18 +5,30 @@
 //! frames before it; here positions are channels of their own, and the gradient of (p_t − p*_t)² moves one frame and
 //! makes it a spike. L_ctrl therefore has terms for the size and the jerk of what is moved, and velocities and
 //! accelerations go along ([`crate::motion::correction`]). Since it is quadratic, a step goes along H⁻¹ ∇L instead of ∇L,
-//! with which one step of length 1 is at its least.
+//! with which one step of length 1 is at its least. There poses are met as nearly as is smooth: the estimates of a step
+//! are noisy, and who meets them exactly follows their noise. Exactly they are met at the end, by motion that
+//! post-processing has made smooth.
+
+use std::f64::consts::TAU;
 
 use ndarray::Array2;
 
 use crate::generation::control::{Constraints, WantedValue, orientation, rotation_vector};
-use crate::motion::correction::{Missing, rates, smoothest};
+use crate::motion::correction::{Closeness, Missing, rates, smoothest};
 use crate::motion::quaternion::{from_rotation_vector, make_sign_continuous, mul};
 use crate::motion::{Channel, MOTION_DIM};
 
-/// Moves frames a share of the way to where constraints are met: x̂0 ← x̂0 − η H⁻¹ ∇L_ctrl(x̂0).
-///
-/// The first `n_pinned` frames stay where they are, but for what is asked of themselves.
+/// A step towards constraints.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Steering {
+    /// Of an estimate: x̂0 ← x̂0 − η H⁻¹ ∇L_ctrl(x̂0), η the share of the way. The first frames stay where they are, but for
+    /// what is asked of themselves.
+    Estimate { n_pinned: usize, share: f64 },
+    /// Of finished motion, all the way: poses are met exactly.
+    Finish,
+}
+
+/// Moves frames to where constraints are met.
 ///
 /// # Shapes
 /// `frames`: \[T, 25\] in the world, of which the first is frame `first` of the track
@@ -24,9 +36,12 @@ pub fn steer(
     constraints: &Constraints,
     frames: &mut Array2<f32>,
     first: usize,
-    n_pinned: usize,
-    share: f64,
+    steering: Steering,
 ) {
+    let share = match steering {
+        Steering::Estimate { share, .. } => share,
+        Steering::Finish => 1.0,
+    };
     let n = frames.nrows();
     let asked: Vec<(usize, WantedValue)> = constraints.in_range(first, n).collect();
     for axis in 0..3 {
@@ -40,14 +55,14 @@ pub fn steer(
             }
             WantedValue::Orientation(_) => None,
         });
-        let Some(u) = correction(n, missing.collect(), n_pinned) else { continue };
+        let Some(u) = correction(n, &missing.collect::<Vec<_>>(), steering) else { continue };
         let v = rates(&u);
         let a = rates(&v);
         for (column, change) in columns.into_iter().zip([u, v, a]) {
             move_column(frames, column, &change, share);
         }
     }
-    turn(&asked, frames, n_pinned, share);
+    turn(&asked, frames, steering, share);
     let with_others = [Channel::AngularVelocity, Channel::Phase, Channel::Style];
     for channel in with_others.into_iter().flat_map(|group| group.range()) {
         debug_assert!(channel < MOTION_DIM);
@@ -58,15 +73,15 @@ pub fn steer(
             }
             _ => None,
         });
-        let Some(u) = correction(n, missing.collect(), n_pinned) else { continue };
+        let Some(u) = correction(n, &missing.collect::<Vec<_>>(), steering) else { continue };
         move_column(frames, channel, &u, share);
     }
 }
 
 /// Turns frames to the orientations that are asked for, and their angular velocities with them.
-fn turn(asked: &[(usize, WantedValue)], frames: &mut Array2<f32>, n_pinned: usize, share: f64) {
+fn turn(asked: &[(usize, WantedValue)], frames: &mut Array2<f32>, steering: Steering, share: f64) {
     let n = frames.nrows();
-    let missing: Vec<(usize, [f64; 3])> = asked
+    let mut missing: Vec<(usize, [f64; 3])> = asked
         .iter()
         .filter_map(|&(t, wanted)| match wanted {
             WantedValue::Orientation(q) => {
@@ -75,12 +90,13 @@ fn turn(asked: &[(usize, WantedValue)], frames: &mut Array2<f32>, n_pinned: usiz
             WantedValue::Value { .. } => None,
         })
         .collect();
+    continue_turns(&mut missing);
     let turns: Option<Vec<Vec<f64>>> = (0..3)
         .map(|axis| {
             let of_axis = missing.iter();
             let of_axis =
                 of_axis.map(|&(frame, v)| Missing { frame, derivative: 0, value: v[axis] });
-            correction(n, of_axis.collect(), n_pinned)
+            correction(n, &of_axis.collect::<Vec<_>>(), steering)
         })
         .collect();
     let Some(turns) = turns else { return };
@@ -101,17 +117,33 @@ fn turn(asked: &[(usize, WantedValue)], frames: &mut Array2<f32>, n_pinned: usiz
     }
 }
 
-/// Returns the smoothest correction of an axis; none where nothing is asked of it.
-fn correction(n: usize, mut missing: Vec<Missing>, n_pinned: usize) -> Option<Vec<f64>> {
-    if missing.is_empty() {
-        return None;
-    }
-    for frame in 0..n_pinned.min(n) {
-        if !missing.iter().any(|of| of.frame == frame && of.derivative == 0) {
-            missing.push(Missing { frame, derivative: 0, value: 0.0 });
+/// Takes of each turn the one of the two, this way or the other way round, that is nearer to the turn before: between two
+/// of nearly half a turn a body is not turned all the way back.
+fn continue_turns(turns: &mut [(usize, [f64; 3])]) {
+    let mut before: Option<[f64; 3]> = None;
+    for (_, turn) in turns {
+        let angle = turn.iter().map(|x| x * x).sum::<f64>().sqrt();
+        if let Some(before) = before
+            && angle > 0.0
+        {
+            let other = turn.map(|x| x * (1.0 - TAU / angle));
+            let apart =
+                |v: [f64; 3]| -> f64 { v.iter().zip(before).map(|(a, b)| (a - b) * (a - b)).sum() };
+            if apart(other) < apart(*turn) {
+                *turn = other;
+            }
         }
+        before = Some(*turn);
     }
-    Some(smoothest(n, &missing))
+}
+
+/// Returns the smoothest correction of an axis; none where nothing is asked of it.
+fn correction(n: usize, missing: &[Missing], steering: Steering) -> Option<Vec<f64>> {
+    let (n_pinned, closeness) = match steering {
+        Steering::Estimate { n_pinned, .. } => (n_pinned, Closeness::Near),
+        Steering::Finish => (0, Closeness::Exact),
+    };
+    (!missing.is_empty()).then(|| smoothest(n, n_pinned, missing, closeness))
 }
 
 fn move_column(frames: &mut Array2<f32>, column: usize, change: &[f64], share: f64) {
@@ -148,23 +180,54 @@ mod tests {
             // Beyond these frames.
             (350, value(0, 2.0)),
         ]);
+        let estimate = |n_pinned, share| Steering::Estimate { n_pinned, share };
         let mut moved = before.clone();
-        steer(&asked, &mut moved, 200, 3, 1.0);
+        steer(&asked, &mut moved, 200, Steering::Finish);
         for miss in asked.errors_from(moved.view(), 200) {
-            assert!(miss.error < 2e-4, "{miss:?}");
+            // f32 of some metres; of angles what its cosine keeps.
+            assert!(miss.error < 1e-6, "{miss:?}");
+        }
+        let mut moved = before.clone();
+        steer(&asked, &mut moved, 200, estimate(3, 1.0));
+        for miss in asked.errors_from(moved.view(), 200) {
+            assert!(miss.error < 3e-3, "{miss:?}");
         }
         for t in 0..3 {
             for channel in 0..3 {
                 let apart = (moved[[t, channel]] - before[[t, channel]]).abs();
-                assert!(apart < 2e-4, "frame {t}: {apart}");
+                assert!(apart < 1e-6, "frame {t}: {apart}");
             }
         }
         let mut half = before.clone();
-        steer(&asked, &mut half, 200, 3, 0.5);
-        assert!((half[[50, 0]] - before[[50, 0]] - 0.15).abs() < 1e-3);
+        steer(&asked, &mut half, 200, estimate(3, 0.5));
+        assert!((half[[50, 0]] - before[[50, 0]] - 0.15).abs() < 3e-3);
         let mut none = before.clone();
-        steer(&asked, &mut none, 0, 3, 1.0);
+        steer(&asked, &mut none, 0, estimate(3, 1.0));
         assert_eq!(none, before, "nothing is asked of these frames");
+    }
+
+    #[test]
+    fn a_body_is_not_turned_back_and_forth_between_turns_of_nearly_half() {
+        let mut before = walk(121);
+        for mut row in before.rows_mut() {
+            for (i, x) in Channel::Quaternion.range().zip([1.0, 0.0, 0.0, 0.0]) {
+                row[i] = x;
+            }
+        }
+        // 179° and 181°, which is −179°.
+        let asked = constraints(vec![
+            (40, WantedValue::Orientation(facing(179.0_f64.to_radians()))),
+            (60, WantedValue::Orientation(facing(181.0_f64.to_radians()))),
+        ]);
+        let mut moved = before;
+        steer(&asked, &mut moved, 0, Steering::Finish);
+        for t in 40..=60 {
+            let q = orientation(moved.view(), t);
+            let apart = rotation_vector(facing(std::f64::consts::PI), q);
+            let apart = apart.iter().map(|x| x * x).sum::<f64>().sqrt().to_degrees();
+            // It fades a little between the two; turned back it would pass 0°.
+            assert!(apart < 40.0, "frame {t}: {apart}° from half a turn");
+        }
     }
 
     #[test]
@@ -172,7 +235,7 @@ mod tests {
         let before = walk(121);
         let x = f64::from(before[[60, 0]]) + 0.4;
         let mut moved = before.clone();
-        steer(&constraints(vec![(60, value(0, x))]), &mut moved, 0, 1, 1.0);
+        steer(&constraints(vec![(60, value(0, x))]), &mut moved, 0, Steering::Finish);
         let change =
             |t: usize, channel: usize| f64::from(moved[[t, channel]] - before[[t, channel]]);
         for t in 0..119 {

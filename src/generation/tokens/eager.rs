@@ -10,8 +10,8 @@ use crate::autodiff::{Arena, Eager, Interpreter as _, Parameters, Tensor, Thread
 use crate::generation::engine::EngineError;
 use crate::generation::pool::Pool;
 use crate::model::{
-    KeysAndValues, PlanConditions, Planner, PlannerConfig, PlannerKind, PlannerStepInputs,
-    Tokenizer, TokensConfig, condition_scale,
+    ConditionInputs, KeysAndValues, PlanConditions, Planner, PlannerConfig, PlannerKind,
+    PlannerStepInputs, Tokenizer, TokensConfig, condition_scale,
 };
 use crate::motion::MOTION_DIM;
 use crate::motion::style::STYLE_DIM;
@@ -163,19 +163,33 @@ impl PlannerNetworks for EagerPlanner {
     }
 
     fn begin<'a>(&'a self, window: &PlanWindow) -> Result<Box<dyn WindowPlan + 'a>, EngineError> {
-        let n = window.without_music.len();
+        let n = window.withheld.len();
         let mut condition = window.condition.to_owned();
         self.scale.apply(condition.view_mut());
         let [frames, channels] = [condition.nrows(), condition.ncols()];
         let condition = condition.into_iter().collect::<Vec<f32>>().repeat(n);
-        let dropped: Vec<f32> =
-            window.without_music.iter().map(|&is| f32::from(u8::from(is))).collect();
+        let dropped = window.drops(|withheld| withheld.music);
         let style = window.style.unwrap_or_default().repeat(n);
+        let asked = window.constraints.filter(|_| self.config.constraint_dim > 0).map(|asked| {
+            let values: Vec<f32> = asked.iter().copied().collect();
+            ([n, asked.nrows(), asked.ncols()], values.repeat(n))
+        });
+        let without = window.drops(|withheld| withheld.constraints);
         let conditions = self.run(|g| {
             let audio = g.constant(&[n, frames, channels], &condition);
             let drop_audio = g.constant(&[n], &dropped);
             let style = (self.config.style_dim > 0).then(|| g.constant(&[n, STYLE_DIM], &style));
-            Ok(self.planner.conditions(g, &audio, Some(&drop_audio), style.as_ref(), None)?)
+            let asked = asked.as_ref().map(|(shape, values)| g.constant(shape, values));
+            let drop_constraints = asked.is_some().then(|| g.constant(&[n], &without));
+            let inputs = ConditionInputs {
+                audio: &audio,
+                drop_audio: Some(&drop_audio),
+                style: style.as_ref(),
+                constraints: asked.as_ref(),
+                drop_constraints: drop_constraints.as_ref(),
+                mask: None,
+            };
+            Ok(self.planner.conditions(g, &inputs)?)
         })?;
         Ok(Box::new(EagerPlan { of: self, n_answers: n, conditions, past: None }))
     }

@@ -1,20 +1,27 @@
 //! Motion by tokens: the card of a model of the family `tokens`, the engines that run its networks, and motion for a
 //! track of any length.
 
+mod asked;
 mod card;
 mod control;
 mod eager;
 mod engine;
 mod networks;
 mod planner;
+mod reconstruct;
 mod runtime;
 mod track;
 mod weights;
 
+pub use asked::Control;
 pub use card::{TokensCard, TokensNetworks, TokensProvenance};
+pub use control::{Steering, steer};
 pub use engine::TokenEngine;
-pub use networks::{PlanWindow, PlannerNetworks, TokenizerNetworks, WindowPlan};
-pub use planner::{PlanRequest, PlannerEngine};
+pub use networks::{
+    PlanWindow, PlannerNetworks, TokenizerNetworks, WindowPlan, WithheldConditions,
+};
+pub use planner::{PlanRequest, PlannerEngine, shuffle};
+pub use reconstruct::Reconstruction;
 pub use runtime::{OnnxPlanner, OnnxTokenizer};
 pub use track::{TokenGenerator, TokenTrack};
 pub use weights::tokens_parameters;

@@ -46,8 +46,24 @@ pub struct PlanWindow<'a> {
     pub condition: ArrayView2<'a, f32>,
     /// Normalised style, for a network that takes one.
     pub style: Option<[f32; STYLE_DIM]>,
-    /// For each answer that is wanted, whether the music is withheld.
-    pub without_music: &'a [bool],
+    /// What is asked of its motion, for a network that takes constraints, \[T, 12\]; nothing where absent.
+    pub constraints: Option<ArrayView2<'a, f32>>,
+    /// For each answer that is wanted, what is withheld.
+    pub withheld: &'a [WithheldConditions],
+}
+
+/// The conditions of which an answer knows nothing.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct WithheldConditions {
+    pub music: bool,
+    pub constraints: bool,
+}
+
+impl PlanWindow<'_> {
+    /// Returns 1 for each answer of which `is_withheld` is true, else 0.
+    pub(super) fn drops(&self, is_withheld: impl Fn(&WithheldConditions) -> bool) -> Vec<f32> {
+        self.withheld.iter().map(|withheld| f32::from(u8::from(is_withheld(withheld)))).collect()
+    }
 }
 
 /// Runs a planner; calls may come from several threads.

@@ -5,7 +5,7 @@ use std::num::NonZeroUsize;
 use ndarray::{Array2, ArrayView2};
 
 use super::eager::EagerPlanner;
-use super::networks::{PlanWindow, PlannerNetworks};
+use super::networks::{PlanWindow, PlannerNetworks, WithheldConditions};
 use crate::audio::FeatureScale;
 use crate::autodiff::{Parameters, Stream};
 use crate::diffusion::{TokenSampling, sample_autoregressive, sample_masked};
@@ -17,6 +17,8 @@ use crate::motion::style::STYLE_DIM;
 pub struct PlannerEngine {
     config: PlannerConfig,
     networks: Box<dyn PlannerNetworks + Send>,
+    /// Whether the tokens of a plan come in an order of chance.
+    is_shuffled: bool,
 }
 
 /// A window whose tokens are asked for.
@@ -26,9 +28,12 @@ pub struct PlanRequest<'a> {
     pub condition: ArrayView2<'a, f32>,
     /// Normalised style, for a network that takes one.
     pub style: Option<[f32; STYLE_DIM]>,
+    /// What is asked of the motion, \[T, 12\] (`AskedPose::channels`), of a planner that takes it; none where nothing
+    /// is asked.
+    pub constraints: Option<ArrayView2<'a, f32>>,
     /// The first tokens, where they are known.
     pub given: &'a [u32],
-    /// 1 follows the music, more exaggerates it, 0 ignores it.
+    /// 1 follows the music, more exaggerates it, 0 ignores it; of two conditions it is that of both.
     pub guidance: f64,
     pub seed: u64,
     /// Number of the window among those of the seed.
@@ -38,6 +43,12 @@ pub struct PlanRequest<'a> {
 /// Streams of random numbers of plans, apart from those of the noise that motion is made of; 2^20 draws for each window.
 const PLANS: u64 = 1 << 62;
 const DRAWS_OF_A_WINDOW: u64 = 1 << 20;
+/// Draws of a window that choose what guidance withholds, behind those that choose tokens.
+const PAIRS: usize = 1 << 19;
+
+const NOTHING: WithheldConditions = WithheldConditions { music: false, constraints: false };
+const MUSIC: WithheldConditions = WithheldConditions { music: true, constraints: false };
+const CONSTRAINTS: WithheldConditions = WithheldConditions { music: false, constraints: true };
 
 impl PlannerEngine {
     /// Makes an engine of the interpreter that trains, of so many workers of so many threads each; `parameters` are those
@@ -57,7 +68,14 @@ impl PlannerEngine {
 
     /// Makes an engine of networks, whatever runs them.
     pub fn with(config: &PlannerConfig, networks: Box<dyn PlannerNetworks + Send>) -> Self {
-        Self { config: config.clone(), networks }
+        Self { config: config.clone(), networks, is_shuffled: false }
+    }
+
+    /// Puts the tokens of every plan, but for those that are given, in an order of chance: what such motion still has
+    /// is owed to which tokens there are, and not to where they stand.
+    #[must_use]
+    pub fn with_shuffled_plans(self) -> Self {
+        Self { is_shuffled: true, ..self }
     }
 
     /// Returns the name that flags and tables use of what runs the network.
@@ -79,25 +97,56 @@ impl PlannerEngine {
         sampling: &TokenSampling,
         request: &PlanRequest,
     ) -> Result<Vec<u32>, EngineError> {
+        let mut tokens = self.drawn(sampling, request)?;
+        if self.is_shuffled {
+            // The last draw of the window, which no plan reaches.
+            let draw = PLANS + (request.window + 1) * DRAWS_OF_A_WINDOW - 1;
+            let n_given = request.given.len().min(tokens.len());
+            shuffle(&mut tokens[n_given..], Stream::new(request.seed, draw));
+        }
+        Ok(tokens)
+    }
+
+    fn drawn(
+        &self,
+        sampling: &TokenSampling,
+        request: &PlanRequest,
+    ) -> Result<Vec<u32>, EngineError> {
         let PlanRequest { condition, style, guidance: s, .. } = *request;
         let (codes, n) = (self.config.codes, self.config.n_tokens(condition.nrows()));
         let first = PLANS + request.window * DRAWS_OF_A_WINDOW;
         let stream = |draw: usize| Stream::new(request.seed, first + draw as u64);
-        // With the music, without it, or both: u + s (c − u).
-        let without_music: &[bool] = match s {
-            1.0 => &[false],
-            0.0 => &[true],
-            _ => &[false, true],
+        // What is said is c of everything, u of what is left without one condition, or both: u + s (c − u). With two
+        // conditions either is withheld by chance, each as often (paper, eq. 10 and 11); with one it is the music.
+        let constraints = request.constraints.filter(|_| self.config.constraint_dim > 0);
+        let is_constrained = constraints.is_some();
+        let withheld: &[WithheldConditions] = match (s, is_constrained) {
+            (1.0, _) => &[NOTHING],
+            (0.0, false) => &[MUSIC],
+            (0.0, true) => &[MUSIC, CONSTRAINTS],
+            (_, false) => &[NOTHING, MUSIC],
+            (_, true) => &[NOTHING, MUSIC, CONSTRAINTS],
         };
-        let mut plan = self.networks.begin(&PlanWindow { condition, style, without_music })?;
+        let mut plan =
+            self.networks.begin(&PlanWindow { condition, style, constraints, withheld })?;
+        let mut n_asked = 0;
         let mut logits = |tokens: &[u32]| -> Result<Vec<f32>, EngineError> {
-            let mut found = plan.logits(tokens)?;
-            if without_music.len() == 2 {
-                let without = found.split_off(found.len() / 2);
-                let (to, away) = (s as f32, (1.0 - s) as f32);
-                found.iter_mut().zip(without).for_each(|(c, u)| *c = *c * to + u * away);
-            }
-            Ok(found)
+            let mut number = [0.0_f64];
+            stream(PAIRS + n_asked).uniform(0, &mut number);
+            n_asked += 1;
+            let without = if is_constrained && number[0] >= 0.5 { CONSTRAINTS } else { MUSIC };
+            let found = plan.logits(tokens)?;
+            let of_answer = found.len() / withheld.len();
+            let said = |answer: WithheldConditions| {
+                let place = withheld.iter().position(|known| *known == answer)?;
+                Some(&found[place * of_answer..][..of_answer])
+            };
+            let (to, away) = (s as f32, (1.0 - s) as f32);
+            Ok(match (said(NOTHING), said(without)) {
+                (Some(c), Some(u)) => c.iter().zip(u).map(|(c, u)| *c * to + u * away).collect(),
+                (Some(only), None) | (None, Some(only)) => only.to_vec(),
+                (None, None) => Vec::new(),
+            })
         };
         match self.config.kind {
             PlannerKind::Masked => {
@@ -124,5 +173,32 @@ impl PlannerEngine {
                 sample_autoregressive(sampling, request.given, n, codes, logits, uniform)
             }
         }
+    }
+}
+
+/// Puts tokens in an order of chance, each as likely (Fisher and Yates).
+pub fn shuffle(tokens: &mut [u32], stream: Stream) {
+    let mut numbers = vec![0.0_f64; tokens.len()];
+    stream.uniform(0, &mut numbers);
+    for (i, number) in numbers.iter().enumerate().skip(1) {
+        tokens.swap(i, ((number * (i + 1) as f64) as usize).min(i));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_order_of_tokens_is_as_likely() {
+        let mut counts = std::collections::BTreeMap::new();
+        for seed in 0..6000 {
+            let mut tokens = [7, 8, 9];
+            shuffle(&mut tokens, Stream::new(seed, 1));
+            *counts.entry(tokens).or_insert(0_i32) += 1;
+        }
+        // Of 6000 draws each of six orders has 1000, with a deviation of 29.
+        assert_eq!(counts.len(), 6);
+        assert!(counts.values().all(|n| (n - 1000).abs() < 130), "{counts:?}");
     }
 }

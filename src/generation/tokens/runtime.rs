@@ -199,7 +199,7 @@ impl OnnxPlanner {
 
     /// Returns what a window hears as inputs, the same for each answer.
     fn heard(&self, window: &PlanWindow) -> Vec<NamedTensor<'static>> {
-        let (n, frames) = (window.without_music.len(), window.condition.nrows());
+        let (n, frames) = (window.withheld.len(), window.condition.nrows());
         let columns = |range: std::ops::Range<usize>| -> Vec<f32> {
             let part = window.condition.slice(ndarray::s![.., range]);
             part.iter().copied().collect::<Vec<f32>>().repeat(n)
@@ -210,8 +210,20 @@ impl OnnxPlanner {
             let clock = columns(FEATURE_DIM..FEATURE_DIM + CLOCK_DIM);
             given.push(floats(PlannerNames::CLOCK, vec![n, frames, CLOCK_DIM], clock));
         }
-        let dropped = window.without_music.iter().map(|&is| f32::from(u8::from(is))).collect();
+        let dropped = window.drops(|withheld| withheld.music);
         given.push(floats(PlannerNames::DROP_AUDIO, vec![n], dropped));
+        let width = self.config.constraint_dim;
+        if width > 0 {
+            let (asked, without) = match window.constraints {
+                Some(asked) => (
+                    asked.iter().copied().collect::<Vec<f32>>().repeat(n),
+                    window.drops(|withheld| withheld.constraints),
+                ),
+                None => (vec![0.0; n * frames * width], vec![1.0; n]),
+            };
+            given.push(floats(PlannerNames::CONSTRAINTS, vec![n, frames, width], asked));
+            given.push(floats(PlannerNames::DROP_CONSTRAINTS, vec![n], without));
+        }
         if let Some(style) = window.style.filter(|_| self.config.style_dim > 0) {
             given.push(floats(PlannerNames::STYLE, vec![n, STYLE_DIM], style.repeat(n)));
         }
@@ -225,7 +237,7 @@ impl PlannerNetworks for OnnxPlanner {
     }
 
     fn begin<'a>(&'a self, window: &PlanWindow) -> Result<Box<dyn WindowPlan + 'a>, EngineError> {
-        let n = window.without_music.len();
+        let n = window.withheld.len();
         let heard = self.heard(window);
         match &self.sessions {
             PlannerSessions::Masked(planner) => {

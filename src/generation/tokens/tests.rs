@@ -6,15 +6,19 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use ndarray::{Array2, Array3, ArrayView3};
 
+use super::asked::Control;
 use super::eager::{EagerPlanner, EagerTokenizer};
-use super::networks::{PlanWindow, PlannerNetworks, TokenizerNetworks, WindowPlan};
+use super::networks::{
+    PlanWindow, PlannerNetworks, TokenizerNetworks, WindowPlan, WithheldConditions,
+};
 use super::*;
 use crate::audio::{FEATURE_DIM, FeatureScale};
 use crate::autodiff::{Arena, Eager, Interpreter as _, Parameters};
 use crate::diffusion::{DiffusionConfig, Prediction, SamplerConfig, Schedule, TokenSampling};
 use crate::generation::engine::EngineError;
 use crate::model::{
-    Planner, PlannerConfig, PlannerInputs, PlannerKind, Preset, Tokenizer, TokensConfig,
+    CONSTRAINT_DIM, Planner, PlannerConfig, PlannerInputs, PlannerKind, Preset, Tokenizer,
+    TokensConfig,
 };
 use crate::motion::style::STYLE_DIM;
 use crate::motion::{CLOCK_DIM, Normalizer};
@@ -127,7 +131,9 @@ struct WholePlan<'a> {
     of: &'a WholePlanner,
     condition: Array2<f32>,
     style: [f32; STYLE_DIM],
+    asked: Option<Array2<f32>>,
     dropped: Vec<f32>,
+    without: Vec<f32>,
 }
 
 impl PlannerNetworks for WholePlanner {
@@ -140,7 +146,9 @@ impl PlannerNetworks for WholePlanner {
             of: self,
             condition: window.condition.to_owned(),
             style: window.style.unwrap_or_default(),
-            dropped: window.without_music.iter().map(|&is| f32::from(u8::from(is))).collect(),
+            asked: window.constraints.map(|asked| asked.to_owned()),
+            dropped: window.drops(|withheld| withheld.music),
+            without: window.drops(|withheld| withheld.constraints),
         }))
     }
 }
@@ -159,11 +167,18 @@ impl WindowPlan for WholePlan<'_> {
         let audio = g.constant(&[n, frames, self.condition.ncols()], &audio.repeat(n));
         let dropped = g.constant(&[n], &self.dropped);
         let style = g.constant(&[n, STYLE_DIM], &self.style.repeat(n));
+        let asked = self.asked.as_ref().map(|asked| {
+            let values: Vec<f32> = asked.iter().copied().collect();
+            g.constant(&[n, frames, asked.ncols()], &values.repeat(n))
+        });
+        let without = asked.is_some().then(|| g.constant(&[n], &self.without));
         let inputs = PlannerInputs {
             tokens: &seen,
             audio: &audio,
             drop_audio: Some(&dropped),
             style: (config.style_dim > 0).then_some(&style),
+            constraints: asked.as_ref(),
+            drop_constraints: without.as_ref(),
             mask: None,
         };
         let logits = planner.forward(&mut g, &inputs)?;
@@ -175,7 +190,10 @@ impl WindowPlan for WholePlan<'_> {
 
 #[test]
 fn what_is_kept_of_a_plan_changes_no_bit() {
-    for (style_dim, n_threads) in [(0, 1), (STYLE_DIM, 3)] {
+    let asked = Array2::from_shape_fn((39, CONSTRAINT_DIM), |(t, i)| ((t + i * 5) as f32).cos());
+    for (style_dim, n_threads, asked) in
+        [(0, 1, None), (STYLE_DIM, 3, None), (0, 2, Some(asked.view()))]
+    {
         let config = planner_config(PlannerKind::Autoregressive, style_dim);
         let whole = WholePlanner {
             planner: Planner::new(&config).0,
@@ -185,8 +203,16 @@ fn what_is_kept_of_a_plan_changes_no_bit() {
         let kept = eager_planner(&config, n_threads);
         let condition = condition(39);
         let style = (style_dim > 0).then_some([0.5, -1.0, 0.25, 0.0, 1.0, -0.5, 0.75, 0.1]);
-        let window =
-            PlanWindow { condition: condition.view(), style, without_music: &[false, true] };
+        let window = PlanWindow {
+            condition: condition.view(),
+            style,
+            constraints: asked,
+            withheld: &[
+                WithheldConditions::default(),
+                WithheldConditions { music: true, constraints: false },
+                WithheldConditions { music: false, constraints: true },
+            ],
+        };
         let tokens: Vec<u32> = (0..10).map(|i| i * 7 % 32).collect();
         // From nothing token by token, and from several at once that are given.
         for first in [0, 1, 4] {
@@ -194,8 +220,11 @@ fn what_is_kept_of_a_plan_changes_no_bit() {
             let mut whole = whole.begin(&window).expect("a plan");
             for n in first..tokens.len() {
                 let found = kept.logits(&tokens[..n]).expect("logits");
-                assert_eq!(found.len(), 2 * 32);
-                assert_ne!(found[..32], found[32..], "guidance has two answers");
+                assert_eq!(found.len(), 3 * 32);
+                assert_ne!(found[..32], found[32..64], "music is heard");
+                // Where nothing is asked, nothing can be withheld.
+                let is_heard = found[..32] != found[64..];
+                assert_eq!(is_heard, asked.is_some(), "constraints");
                 assert_eq!(found, whole.logits(&tokens[..n]).expect("logits"), "token {n}");
             }
         }
@@ -205,6 +234,7 @@ fn what_is_kept_of_a_plan_changes_no_bit() {
             let request = PlanRequest {
                 condition: condition.view(),
                 style,
+                constraints: asked,
                 given,
                 guidance,
                 seed: 11,
@@ -247,6 +277,7 @@ fn run(kind: PlannerKind, n_frames: usize) -> ([usize; 5], usize) {
         phase: None,
         style: None,
         constraints: None,
+        control: Control::None,
         seed: 7,
     };
     let (mut n_given, mut begun_at_first) = (0, 0);

@@ -10,7 +10,8 @@ use std::ops::Range;
 
 use ndarray::{Array2, Array3, ArrayView2, Axis, s};
 
-use super::control::steer;
+use super::asked::{Control, asked_of_window};
+use super::control::{Steering, steer};
 use super::engine::TokenEngine;
 use super::planner::{PlanRequest, PlannerEngine};
 use crate::autodiff::Stream;
@@ -49,6 +50,8 @@ pub struct TokenTrack<'a> {
     pub style: Option<[f32; STYLE_DIM]>,
     /// What the motion must do; the strength is the length of a step of the descent.
     pub constraints: Option<WeightedConstraints<'a>>,
+    /// Where they act.
+    pub control: Control,
     pub seed: u64,
 }
 
@@ -159,7 +162,13 @@ impl TokenGenerator<'_> {
             Some(before) => self.tokens_from(before, shift)?,
             None => Vec::new(),
         };
+        let normalizer = self.tokens.normalizer();
+        let asked = track
+            .constraints
+            .filter(|_| track.control.plans())
+            .and_then(|of| asked_of_window(of.constraints, &frames, place, normalizer));
         let request = PlanRequest {
+            constraints: asked.as_ref().map(|asked| asked.view()),
             condition: track.condition.slice(s![frames.clone(), ..]),
             style: track.style,
             given: &given,
@@ -174,8 +183,8 @@ impl TokenGenerator<'_> {
         };
         let mut x = Array3::zeros((1, frames.len(), MOTION_DIM));
         fill(0, x.as_slice_mut().expect("an array made in order"));
-        let normalizer = self.tokens.normalizer();
-        let steered = track.constraints.filter(|c| c.constraints.touch(&frames));
+        let steered =
+            track.constraints.filter(|c| track.control.decodes() && c.constraints.touch(&frames));
         let mut refine = |x0: &mut Array3<f32>| {
             let mut motion = x0.index_axis(Axis(0), 0).to_owned();
             normalizer.denormalize(motion.view_mut());
@@ -185,7 +194,8 @@ impl TokenGenerator<'_> {
             if let Some(WeightedConstraints { constraints, strength }) = steered {
                 let n_pinned = PINNED_FRAMES[usize::from(before.is_some())];
                 place.restore(&mut motion);
-                steer(constraints, &mut motion, frames.start, n_pinned, strength);
+                let steering = Steering::Estimate { n_pinned, share: strength };
+                steer(constraints, &mut motion, frames.start, steering);
                 place.remove(&mut motion);
             }
             set_phase(&mut motion, track.phase, frames.start);

@@ -14,8 +14,8 @@ pub use self::coder::{Encoder, SignalDecoder};
 pub use self::config::TokensConfig;
 pub use self::denoiser::SignalDenoiser;
 pub use self::planner::{
-    KeysAndValues, PlanConditions, Planner, PlannerConfig, PlannerInputs, PlannerKind, PlannerStep,
-    PlannerStepInputs,
+    AskedPose, CONSTRAINT_DIM, ConditionInputs, KeysAndValues, PlanConditions, Planner,
+    PlannerConfig, PlannerInputs, PlannerKind, PlannerStep, PlannerStepInputs,
 };
 use super::graph::{Graph, Result};
 use super::parameter::{Init, ParameterId, ParameterList, Role, Scope};

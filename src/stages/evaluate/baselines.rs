@@ -4,9 +4,10 @@
 //! Sampling takes minutes, so that what was sampled is kept in the store under a digest of everything that
 //! determines it: `baselines/<digest>.npy`.
 
-mod cache;
+pub(super) mod cache;
 #[cfg(test)]
 mod tests;
+pub mod tokens;
 
 use std::num::NonZeroUsize;
 use std::sync::Mutex;
@@ -21,7 +22,7 @@ use crate::generation::{
     Track,
 };
 use crate::model::condition;
-use crate::motion::postprocess::process;
+use crate::motion::postprocess::{PostProcessConfig, process};
 use crate::stages::Progress;
 use crate::stages::generate::{MotionSettings, PostProcessParams, seed_of};
 use crate::stages::model_files::OpenModel;
@@ -111,6 +112,7 @@ impl RunSettings {
         settings.best_of = 1;
         settings.prime = None;
         settings.constraints = None;
+        settings.uncontrolled = false;
         let check = || -> anyhow::Result<()> {
             settings.sampler.check(Schedule::new(&card.diffusion)?.len())?;
             settings.postprocess.check()?;
@@ -163,7 +165,27 @@ fn of_columns(row: &GenerationRow, card: &ModelCard) -> anyhow::Result<MotionSet
         no_clock: false,
         decoder_derives: card.decoder.fusion.is_some(),
         phase_given: false,
+        uncontrolled: false,
     })
+}
+
+/// Refuses windows that are no music.
+fn check_windows(windows: &[MusicWindow]) -> anyhow::Result<()> {
+    for MusicWindow { phrase_id, first_frame, features, phase, .. } in windows {
+        let (n_frames, n_features) = features.dim();
+        ensure!(
+            n_frames > 0 && n_features == FEATURE_DIM,
+            "features of {phrase_id} from frame {first_frame} are {n_frames} frames of {n_features}; give \
+             one or more frames of {FEATURE_DIM}"
+        );
+        let n_phases = phase.as_ref().map_or(n_frames, Vec::len);
+        ensure!(
+            n_phases == n_frames,
+            "{phrase_id} from frame {first_frame} has {n_phases} phases for {n_frames} frames; give one \
+             for each"
+        );
+    }
+    Ok(())
 }
 
 /// Returns motion for each window, in order: what the store keeps, else sampled, and kept.
@@ -179,20 +201,7 @@ pub fn sample(
     progress: &dyn Progress,
 ) -> anyhow::Result<Vec<BaselineMotion>> {
     let BaselineRequest { store, model, settings, windows, .. } = request;
-    for MusicWindow { phrase_id, first_frame, features, phase, .. } in *windows {
-        let (n_frames, n_features) = features.dim();
-        ensure!(
-            n_frames > 0 && n_features == FEATURE_DIM,
-            "features of {phrase_id} from frame {first_frame} are {n_frames} frames of {n_features}; give \
-             one or more frames of {FEATURE_DIM}"
-        );
-        let n_phases = phase.as_ref().map_or(n_frames, Vec::len);
-        ensure!(
-            n_phases == n_frames,
-            "{phrase_id} from frame {first_frame} has {n_phases} phases for {n_frames} frames; give one \
-             for each"
-        );
-    }
+    check_windows(windows)?;
     if windows.is_empty() {
         return Ok(Vec::new());
     }
@@ -237,34 +246,48 @@ fn sample_all(
         window_frames: card.window_frames,
         overlap_frames: settings.overlap_frames,
     };
+    let decode = |window: &MusicWindow, parts: &mut Vec<Array2<f32>>| {
+        let clock = window.clock.as_ref().filter(|_| !settings.no_clock);
+        let clock = clock.map(|clock| clock.view());
+        let heard = condition(&card.unet, window.features.view(), clock);
+        let track = Track {
+            condition: heard.view(),
+            // A network without training, or without music, would get from the phase what it is asked to make.
+            phase: None,
+            seed: seed_of(*seed, &window.phrase_id, window.first_frame, 0),
+            style: settings.style,
+            constraints: None,
+            primed: None,
+        };
+        generator.run(&track, |frames| -> Result<(), EngineError> {
+            parts.push(frames);
+            Ok(())
+        })
+    };
+    decoded_windows((windows, *threads), &settings.postprocess, decode, progress)
+}
+
+/// Makes motion for each window, in order and several at once, and processes it; `decode` gives the frames of a window
+/// in parts.
+fn decoded_windows(
+    (windows, threads): (&[MusicWindow], NonZeroUsize),
+    postprocess: &PostProcessConfig,
+    decode: impl Fn(&MusicWindow, &mut Vec<Array2<f32>>) -> Result<(), EngineError> + Sync,
+    progress: &dyn Progress,
+) -> anyhow::Result<Vec<BaselineMotion>> {
     progress.start("baselines", "windows", windows.len() as u64);
     let motions: Mutex<Vec<Option<BaselineMotion>>> = Mutex::new(vec![None; windows.len()]);
     let mut queue = windows.iter().enumerate();
     pool::run(
-        *threads,
+        threads,
         || queue.next(),
         |(i, window): (usize, &MusicWindow)| -> anyhow::Result<()> {
-            let clock = window.clock.as_ref().filter(|_| !settings.no_clock);
-            let clock = clock.map(|clock| clock.view());
-            let heard = condition(&card.unet, window.features.view(), clock);
-            let track = Track {
-                condition: heard.view(),
-                // A network without training, or without music, would get from the phase what it is asked to make.
-                phase: None,
-                seed: seed_of(*seed, &window.phrase_id, window.first_frame, 0),
-                style: settings.style,
-                constraints: None,
-                primed: None,
-            };
             let mut parts: Vec<Array2<f32>> = Vec::new();
-            generator.run(&track, |frames| -> Result<(), EngineError> {
-                parts.push(frames);
-                Ok(())
-            })?;
+            decode(window, &mut parts)?;
             let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
             let decoded = concatenate(Axis(0), &views).context("while joining windows")?;
             let mut frames = decoded.clone();
-            process(&settings.postprocess, &mut frames, window.phase.as_deref());
+            process(postprocess, &mut frames, window.phase.as_deref());
             lock(&motions)[i] = Some(BaselineMotion { decoded, frames });
             progress.advance(1);
             Ok(())

@@ -19,6 +19,7 @@ const MAX_RETRIEVED: usize = 500;
 pub(super) struct SampledBaselines {
     pub untrained: Vec<MeasuredWindow>,
     pub no_music: Vec<MeasuredWindow>,
+    pub shuffled_plan: Vec<MeasuredWindow>,
 }
 
 impl EvaluationJob<'_> {
@@ -145,6 +146,7 @@ impl EvaluationJob<'_> {
         SampledBaselines {
             untrained: windows_of(Subject::Untrained),
             no_music: windows_of(Subject::NoMusic),
+            shuffled_plan: windows_of(Subject::ShuffledPlan),
         }
     }
 }

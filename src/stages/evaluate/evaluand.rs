@@ -1,14 +1,18 @@
 //! What is evaluated: the motions of a run of generate, or those of any program.
 
+mod folder;
+mod measured;
+
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
 
-use anyhow::{Context as _, bail, ensure};
-use ndarray::Array2;
+use anyhow::{Context as _, bail};
+use ndarray::{Array2, Axis};
 
-use super::foreign::{self, ForeignMotions, RefusedFile};
+use super::foreign::{ForeignMotions, RefusedFile};
+use super::group::GroupMeasurer;
 use super::job::{EvaluatedMotion, EvaluationJob, EvaluationMotion, MotionStage};
-use super::measure::{MeasuredMotion, stride_for};
+use super::making::{Making, keyframes};
+use super::measure::over_dancers;
 use super::motions::{self, PhraseIndex, is_held_out};
 use super::params::Params;
 use super::rows::{self, EvaluationRows, RunName};
@@ -16,17 +20,18 @@ use super::splits::{MusicSplit, telling};
 use super::truth::{self, Truth};
 use crate::evaluation::metrics::PhaseOrigin;
 use crate::evaluation::window::own_window_frames;
-use crate::evaluation::{holds_by_construction, holds_by_derivation};
+use crate::evaluation::{Check, holds_by_construction, holds_by_derivation};
 use crate::generation::LearnedFrom;
+use crate::motion::group::MAX_DANCERS;
 use crate::motion::postprocess::PostProcessConfig;
 use crate::stages::Progress;
-use crate::stages::generate::MotionSettings;
 use crate::stages::learned;
-use crate::stages::motion_source::generated_frames;
+use crate::stages::motion_source::generated_group;
 use crate::store::tables::{self, GenerationRow};
 use crate::store::{
     Location, StoreError, StoreSnapshot, digest, outdated_features, outdated_generations,
 };
+use crate::training::Ensemble;
 use crate::units::frames_to_s;
 
 /// Songs whose activity is read; that of others counts as its mean.
@@ -38,7 +43,7 @@ pub struct Evaluand {
     pub model: String,
     pub phrases: PhraseIndex,
     pub motions: Vec<EvaluationMotion>,
-    /// What generate said of them, in the same order; none of motions of another program.
+    /// What generate said of them, one row for all dancers of a group; none of motions of another program.
     pub generations: Vec<GenerationRow>,
     /// Candidates that each motion was chosen from, at most.
     pub n_candidates: usize,
@@ -56,6 +61,8 @@ pub struct Evaluand {
     phase_given: bool,
     /// Files of motions of another program.
     files: Option<ForeignMotions>,
+    /// Whether motions are of dancers of groups.
+    pub is_of_groups: bool,
     /// Whether motions say a phase.
     has_phase: bool,
     /// The tables as they are for the whole evaluation.
@@ -83,8 +90,12 @@ impl Evaluand {
     pub fn of_run(snapshot: StoreSnapshot, run: &str, most: Option<usize>) -> anyhow::Result<Self> {
         let store = snapshot.store();
         let (generations, n_groups) = motions::of_run(&snapshot, run, most)?;
-        let phrases =
+        let is_of_groups = generations.iter().any(|row| row.count_dancers() > 1);
+        let mut phrases =
             PhraseIndex::read(&snapshot, generations.iter().map(|row| row.phrase_id.as_str()))?;
+        if is_of_groups {
+            phrases.hold_against(Ensemble::Groups { most: MAX_DANCERS });
+        }
         refuse_outdated(&snapshot, run, &phrases, &generations)?;
         let (splits, mut notes) = splits_of(store, &phrases, &generations)?;
         if n_groups > 0 {
@@ -92,143 +103,77 @@ impl Evaluand {
                 "{n_groups} motions of groups of dancers are left out; what is measured is a soloist's."
             ));
         }
-        let motions = generations
-            .iter()
-            .zip(splits)
-            .map(|(row, split)| EvaluationMotion {
-                phrase_id: row.phrase_id.clone(),
-                sample: row.sample,
-                split,
-                misses: [row.control_error_mm, row.control_error_deg],
-            })
-            .collect();
-        let settings = |row: &GenerationRow| -> Option<MotionSettings> {
-            row.settings.as_ref().and_then(|text| serde_json::from_str(text).ok())
-        };
-        let settings: Vec<MotionSettings> = generations.iter().filter_map(settings).collect();
+        let mut motions = Vec::new();
+        let mut n_frames = Vec::new();
+        for (item, (row, split)) in generations.iter().zip(splits).enumerate() {
+            let keyframes = keyframes(row)?;
+            for dancer in 0..row.count_dancers().max(1) {
+                motions.push(EvaluationMotion {
+                    phrase_id: row.phrase_id.clone(),
+                    sample: row.sample,
+                    item,
+                    dancer,
+                    split,
+                    misses: [row.control_error_mm, row.control_error_deg],
+                    keyframes: keyframes.clone(),
+                });
+                n_frames.push(usize::try_from(row.n_frames).unwrap_or(0));
+            }
+        }
+        let settings: Vec<Making> = generations.iter().filter_map(Making::of_row).collect();
+        let phase_given = settings.iter().any(|settings| settings.phase_given);
+        let n_candidates = settings.iter().map(|settings| settings.n_candidates).max().unwrap_or(1);
+        let decoder_derives = settings.iter().any(|settings| settings.decoder_derives);
+        let postprocess = settings.into_iter().next().map(|settings| settings.postprocess);
         Ok(Self {
             run: run.to_owned(),
             model: generations[0].model.clone(),
             phrases,
             motions,
-            n_candidates: settings.iter().map(|settings| settings.best_of).max().unwrap_or(1),
+            n_candidates,
             notes,
             refused: Vec::new(),
-            n_frames: generations
-                .iter()
-                .map(|row| usize::try_from(row.n_frames).unwrap_or(0))
-                .collect(),
-            decoder_derives: settings.iter().any(|settings| settings.decoder_derives),
-            phase_given: settings.iter().any(|settings| settings.phase_given),
-            postprocess: settings.into_iter().next().map(|s| s.postprocess).unwrap_or_default(),
+            n_frames,
+            decoder_derives,
+            phase_given,
+            postprocess: postprocess.unwrap_or_default(),
             generations,
             files: None,
+            is_of_groups,
             has_phase: true,
             snapshot,
         })
     }
 
-    /// Reads the names of the files of a folder; motions are read when they are measured.
-    fn of_folder(snapshot: StoreSnapshot, folder: &Path, params: &Params) -> anyhow::Result<Self> {
-        let store = snapshot.store();
-        let named = |path: &Path| path.file_name().map(|name| name.to_string_lossy().into_owned());
-        let absolute = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
-        let Some(run) = params.name.clone().or_else(|| named(&absolute)) else {
-            bail!("--motions {} has no name; give one with --name", folder.display());
-        };
-        crate::stages::train::session::check_run_name(&run)
-            .with_context(|| format!("--name {run}"))?;
-        let known = motions::has_run(&snapshot, &run)?;
-        ensure!(
-            !known,
-            "store {store} has a run \"{run}\" of generate, whose evaluation this one would replace; give \
-             another --name"
-        );
-        let all = PhraseIndex::read(&snapshot, [])?;
-        let mut files = foreign::read(folder, &all.foreign_phrases())?;
-        if let Some(n) = params.num_samples {
-            files.keep(n.get());
-        }
-        let phrases =
-            PhraseIndex::read(&snapshot, files.files.iter().map(|file| file.phrase_id.as_str()))?;
-        let mut refused = RefusedFile::all(folder, std::mem::take(&mut files.failures));
-        // A look at every file, so that what holds no motion is known before the others are measured.
-        let (mut motions, mut n_frames, mut notes) = (Vec::new(), Vec::new(), Vec::new());
-        let mut has_phase = true;
-        let mut derived: BTreeMap<&'static str, usize> = BTreeMap::new();
-        let mut read = Vec::new();
-        for file in std::mem::take(&mut files.files) {
-            match file.read() {
-                Ok(motion) => {
-                    motions.push(EvaluationMotion {
-                        phrase_id: file.phrase_id.clone(),
-                        sample: i32::try_from(file.sample).unwrap_or(i32::MAX),
-                        split: MusicSplit::Unknown,
-                        misses: [None; 2],
-                    });
-                    n_frames.push(motion.frames.nrows());
-                    has_phase &= motion.has_phase;
-                    if let Some(what) = motion.content.derived() {
-                        *derived.entry(what).or_default() += 1;
-                    }
-                    notes.extend(motion.note);
-                    read.push(file);
-                }
-                Err(failure) => refused.extend(RefusedFile::all(folder, [(file.path, failure)])),
-            }
-        }
-        files.files = read;
-        ensure!(
-            !motions.is_empty(),
-            "--motions {} has no file that holds a motion for a phrase of the store: {}",
-            folder.display(),
-            refused.first().map_or_else(|| "it is empty".to_owned(), |r| r.failure.message.clone())
-        );
-        notes.truncate(MAX_NOTES);
-        notes.extend(derived.into_iter().map(|(what, n)| format!("Of {n} files {what}.")));
-        notes.push(
-            "Nobody knows which of these songs the motions were learned from, since another program made them."
-                .to_owned(),
-        );
-        Ok(Self {
-            run,
-            model: String::new(),
-            phrases,
-            motions,
-            generations: Vec::new(),
-            n_candidates: 1,
-            notes,
-            refused,
-            n_frames,
-            postprocess: PostProcessConfig::nothing(),
-            decoder_derives: false,
-            phase_given: false,
-            files: Some(files),
-            has_phase,
-            snapshot,
-        })
-    }
-
-    /// Returns the length of all motions together, s.
+    /// Returns the length of all motions together, s; that of a group counts once.
     pub fn length_s(&self) -> f64 {
-        frames_to_s(self.n_frames.iter().sum())
+        let motions = self.motions.iter().zip(&self.n_frames);
+        frames_to_s(motions.filter(|(motion, _)| motion.dancer == 0).map(|(_, n)| n).sum())
     }
 
-    /// Reads the frames of a motion.
+    /// Returns the number of motions; a group is one.
+    pub fn n_items(&self) -> usize {
+        self.motions.iter().filter(|motion| motion.dancer == 0).count()
+    }
+
+    /// Reads the frames of a motion, of a group those of its dancer.
     ///
     /// # Errors
     /// One sentence where it is not there any more.
     pub fn frames(&self, store: &Location, i: usize) -> anyhow::Result<Array2<f32>> {
         if let Some(files) = &self.files {
-            let file = files.files.get(i).context("motions changed while they were evaluated")?;
+            let changed = "motions changed while they were evaluated";
+            let file = files.files.get(self.motions[i].item).context(changed)?;
             return match file.read() {
-                Ok(motion) => Ok(motion.frames),
+                Ok(motion) => motion.into_dancers().nth(self.motions[i].dancer).context(changed),
                 Err(failure) => bail!(failure.message),
             };
         }
         let motion = &self.motions[i];
         let sample = usize::try_from(motion.sample).unwrap_or(0);
-        generated_frames(store, &self.run, &motion.phrase_id, sample)
+        let group = generated_group(store, &self.run, &motion.phrase_id, sample)?;
+        let dancer = group.axis_iter(Axis(0)).nth(motion.dancer);
+        Ok(dancer.context("motions changed while they were evaluated")?.to_owned())
     }
 
     /// Returns a digest of the motions, of the splits that they are in, and of real motion.
@@ -237,7 +182,8 @@ impl Evaluand {
     /// When a file cannot be read.
     pub fn input_hash(&self, data_hash: &str) -> anyhow::Result<String> {
         let mut text = data_hash.to_owned();
-        for (row, motion) in self.generations.iter().zip(&self.motions) {
+        for motion in self.motions.iter().filter(|motion| motion.dancer == 0) {
+            let Some(row) = self.generations.get(motion.item) else { continue };
             text.push_str(&format!(
                 "\n{} {} {} {} {}",
                 row.generation,
@@ -271,19 +217,31 @@ impl Evaluand {
     ) -> anyhow::Result<EvaluationRows> {
         let truth = match params.quick {
             true => None,
-            false => truth::read(&self.snapshot, data_hash, params.threads, progress)?,
+            false => truth::read(
+                &self.snapshot,
+                (data_hash, self.phrases.ensemble()),
+                params.threads,
+                progress,
+            )?,
         };
         if let Some(truth) = &truth {
             self.hear(truth)?;
         }
         let told = telling(self.motions.iter().map(|motion| motion.split));
-        let sampled = match (params.quick, told) {
-            (false, Some(split)) => self.sampled(store, params, truth.as_ref(), split, progress)?,
+        let mut groups = (self.is_of_groups && !params.quick)
+            .then(|| GroupMeasurer::new(&self.n_frames, truth.as_ref()));
+        let sampled = match (params.quick, told, &mut groups) {
+            (false, Some(split), Some(groups)) => {
+                self.sampled_groups(store, params, (split, groups), progress)?
+            }
+            (false, Some(split), None) => {
+                self.sampled(store, params, truth.as_ref(), split, progress)?
+            }
             _ => None,
         };
         let has_music = self.phrases.has_beats();
         let holds = |check: &str| holds_by_construction(check, &self.postprocess, has_music);
-        let job = EvaluationJob {
+        let mut job = EvaluationJob {
             params,
             snapshot: &self.snapshot,
             motions: &self.motions,
@@ -298,13 +256,20 @@ impl Evaluand {
             has_raw: self.files.is_none(),
             has_network: self.files.is_none(),
             sampled_split: told,
+            groups: None,
         };
-        let evaluated = self.measured(store, &job, progress)?;
+        let evaluated = self.measured(store, &job, groups.as_mut(), progress)?;
+        let groups = groups.map(|groups| groups.finish(&self.phrases, truth.as_ref()));
+        job.groups = groups.as_ref();
         let name = RunName { run: &self.run, model: &self.model };
         let mut rows = EvaluationRows::default();
-        for (motion, found) in self.motions.iter().zip(&evaluated) {
-            let (id, sample) = (motion.phrase_id.as_str(), motion.sample);
-            if let Some(decoded) = &found.decoded {
+        let pairs: Vec<(&EvaluationMotion, &EvaluatedMotion)> =
+            self.motions.iter().zip(&evaluated).collect();
+        for dancers in pairs.chunk_by(|(a, _), (b, _)| a.item == b.item) {
+            let (id, sample) = (dancers[0].0.phrase_id.as_str(), dancers[0].0.sample);
+            let decoded =
+                dancers.iter().map(|(_, found)| Some(&found.decoded.as_ref()?.checks[..]));
+            if let Some(decoded) = decoded.collect::<Option<Vec<&[Check]>>>() {
                 let has_phase = self.phase_given && has_music;
                 let derived = |check: &str| match check {
                     "phase" | "phase_monotonic" => has_phase,
@@ -312,11 +277,13 @@ impl Evaluand {
                     "angular_velocity" => false,
                     check => self.decoder_derives && holds_by_derivation(check),
                 };
-                let raw =
-                    rows::checks(name, id, sample, MotionStage::Raw, &decoded.checks, &derived);
+                let checks = over_dancers(&decoded);
+                let raw = rows::checks(name, id, sample, MotionStage::Raw, &checks, &derived);
                 rows.checks.extend(raw);
             }
-            let is = rows::checks(name, id, sample, MotionStage::Final, &found.is.checks, &holds);
+            let is: Vec<&[Check]> = dancers.iter().map(|(_, found)| &found.is.checks[..]).collect();
+            let checks = over_dancers(&is);
+            let is = rows::checks(name, id, sample, MotionStage::Final, &checks, &holds);
             rows.checks.extend(is);
         }
         if !params.quick {
@@ -362,67 +329,6 @@ impl Evaluand {
             self.phrases.add_features(&id, features.view());
         }
         Ok(())
-    }
-
-    /// Reads and measures the motions, as they are and as they were decoded.
-    fn measured(
-        &self,
-        store: &Location,
-        job: &EvaluationJob,
-        progress: &dyn Progress,
-    ) -> anyhow::Result<Vec<EvaluatedMotion>> {
-        let stride = stride_for(self.n_frames.iter().sum());
-        let measurer = job.measurer(stride);
-        progress.start("evaluate", "motions", self.motions.len() as u64);
-        if let Some(files) = &self.files {
-            let found = measurer.run(files.files.len(), |give| {
-                for (i, file) in files.files.iter().enumerate() {
-                    let motion = file.read().map_err(|failure| anyhow::anyhow!(failure.message))?;
-                    give(i, motion.frames);
-                    progress.advance(1);
-                }
-                anyhow::Ok(())
-            })?;
-            progress.finish();
-            return Ok(found
-                .into_iter()
-                .flatten()
-                .map(|is| EvaluatedMotion { is, decoded: None })
-                .collect());
-        }
-        let places: BTreeMap<&str, usize> =
-            self.generations.iter().map(|row| row.generation.as_str()).zip(0..).collect();
-        let names: BTreeSet<String> =
-            self.generations.iter().map(|row| row.generation.clone()).collect();
-        let read = |schema, advances: bool| -> Result<Vec<Option<MeasuredMotion>>, StoreError> {
-            let table = self.snapshot.table(schema)?;
-            measurer.run(self.motions.len(), |give| {
-                table.visit_items(&names, |name, frames: Array2<f32>| {
-                    if let Some(&i) = places.get(name) {
-                        give(i, frames);
-                        progress.advance(u64::from(advances));
-                    }
-                    Ok::<_, StoreError>(())
-                })
-            })
-        };
-        let decoded = read(tables::decoded(), false)?;
-        let is = read(tables::generated(), true)?;
-        progress.finish();
-        let missing = self.generations.iter().zip(&is).find(|(_, found)| found.is_none());
-        if let Some((row, _)) = missing {
-            bail!(
-                "store {store} has no frames of {}, though it lists the motion; run motiongen generate \
-                 again with --force",
-                row.generation
-            );
-        }
-        Ok(is
-            .into_iter()
-            .flatten()
-            .zip(decoded)
-            .map(|(is, decoded)| EvaluatedMotion { is, decoded })
-            .collect())
     }
 }
 

@@ -105,12 +105,26 @@ pub struct ForeignMotion {
     pub phrase_id: String,
     pub sample: usize,
     pub path: PathBuf,
-    /// \[T, 25\], T ≥ 1
+    /// Of the soloist, or of the first dancer of a group, \[T, 25\], T ≥ 1.
     pub frames: Array2<f32>,
+    /// Of the other dancers of a group, as many frames each.
+    pub others: Vec<Array2<f32>>,
     pub content: FileContent,
     pub has_phase: bool,
     /// Notes on what is unusual about the file, but no reason to refuse it.
     pub note: Option<String>,
+}
+
+impl ForeignMotion {
+    /// Returns how many dancers there are.
+    pub fn n_dancers(&self) -> usize {
+        1 + self.others.len()
+    }
+
+    /// Returns the frames of each dancer.
+    pub fn into_dancers(self) -> impl Iterator<Item = Array2<f32>> {
+        std::iter::once(self.frames).chain(self.others)
+    }
 }
 
 /// Lists the motions in a folder and below it, without reading them, in order of phrase and sample.
@@ -219,13 +233,16 @@ impl ForeignFile {
     /// One sentence that names the file, whatever its bytes are.
     pub fn read(&self) -> Result<ForeignMotion, Failure> {
         let place = self.path.display().to_string();
-        let (frames, content) = guarded(&place, || content::read(&self.path))?;
+        let (mut dancers, content) = guarded(&place, || content::read(&self.path))?;
+        let others = dancers.split_off(1);
+        let frames = dancers.pop().unwrap_or_default();
         let note = self.length_note(frames.nrows());
         Ok(ForeignMotion {
             phrase_id: self.phrase_id.clone(),
             sample: self.sample,
             path: self.path.clone(),
             frames,
+            others,
             content,
             has_phase: content.has_phase(),
             note,

@@ -1,93 +1,34 @@
-//! Runs of groups: how dancers move together, keep apart and follow the music, beside real groups and made-up ones.
+//! Groups as groups: how their dancers move together and keep apart, beside real groups and made-up ones.
 
 mod made_up;
-mod summary;
+mod sampled;
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::time::Instant;
+use std::collections::BTreeMap;
 
-use anyhow::bail;
-use ndarray::{Array2, Array3, ArrayView3, Axis, concatenate, s};
+use ndarray::{Array2, Array3, ArrayView3, Axis, s};
 
-use super::Evaluate;
-use super::evaluand::splits_of;
 use super::motions::PhraseIndex;
-use super::params::Params;
-use super::rows::{EvaluationRows, RunIdentity};
-use super::splits::MusicSplit;
-use crate::evaluation::frechet::{Gaussian, frechet_distance};
-use crate::evaluation::group::realism::kinetic_features;
-use crate::evaluation::group::{GroupMeasures, dancers, measure};
-use crate::evaluation::interval::{Estimate, clustered_mean_estimate};
-use crate::evaluation::score::locking_above_chance;
+use super::splits::{ALL, MusicSplit};
+use super::subjects::{Finding, Subject};
+use super::truth::{Truth, TruthPhrase};
+use crate::evaluation::frechet::Gaussian;
+use crate::evaluation::group::numbers::{
+    GroupWindow, WindowBars, feature_distribution, group_numbers,
+};
+use crate::evaluation::metrics::Number;
+use crate::evaluation::verdict::GroupEvidence;
 use crate::motion::group::RADIUS_M;
 use crate::motion::{Channel, bar_phase};
-use crate::stages::{Progress, Stage as _, Summary, lease};
-use crate::store::tables::{self, GenerationRow, MetricRow, PhraseRow};
-use crate::store::{self, Location, Row as _, StoreError, StoreSnapshot, TimestampUs, digest};
-use crate::units::{FPS, frames_to_s};
-use made_up::{copied, independent};
-use summary::GroupEvaluationSummary;
+use crate::training::Split;
+use crate::units::frames_to_s;
+use made_up::{Place, copied, independent, placed, places};
 
-/// Raised when this evaluation writes something else for the same motions.
-const OUTPUT_VERSION: u32 = 1;
-/// Frames of a window, unless real groups have fewer: 8 s, the least span of one kind of unison.
+/// Frames of a window, unless groups have fewer: 8 s, the least span of one kind of unison.
 const WINDOW_FRAMES: usize = 240;
-/// Most real groups that are looked at.
+/// Most real groups of a split that are looked at, evenly among all.
 const MAX_REAL: usize = 400;
-
-/// What motions are held against, and they themselves.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-enum GroupSubject {
-    Generated,
-    /// Every dancer is one of another group, in the place of the one who was there.
-    Independent,
-    /// One dancer of the group, copied to the places of all.
-    Copied,
-    HeldOutTruth,
-    TrainingTruth,
-}
-
-impl GroupSubject {
-    fn name(self) -> &'static str {
-        match self {
-            Self::Generated => "generated",
-            Self::Independent => "independent",
-            Self::Copied => "copied",
-            Self::HeldOutTruth => "held_out_truth",
-            Self::TrainingTruth => "training_truth",
-        }
-    }
-}
-
-/// A number of every window: its name, its unit, and where it is.
-type Measure = (&'static str, &'static str, fn(&GroupMeasures) -> Option<f64>);
-
-/// The numbers of windows of groups.
-const MEASURES: [Measure; 10] = [
-    ("unison_index", "", |m| m.unison),
-    ("gmc_correlation", "", |m| m.gmc_correlation),
-    ("gmc_published", "", |m| m.gmc_published),
-    ("tif", "", |m| m.tif),
-    ("tif_published", "", |m| m.touching_pairs_per_frame),
-    ("least_separation", "m", |m| m.least_separation_m),
-    ("formation_coverage", "m²", |m| m.coverage_m2),
-    ("formation_spread", "m", |m| m.spread_m),
-    ("dancer_diversity", "", |m| m.dancer_diversity),
-    ("dancer_velocity_difference", "m/s", |m| m.dancer_velocity_difference_m_s),
-];
-
-/// Windows of one subject.
-#[derive(Default)]
-struct Windows {
-    measures: Vec<GroupMeasures>,
-    /// R² of each dancer's vertical velocity with the bar, above chance; and with the bars of another song.
-    locking: Vec<Option<f64>>,
-    other_locking: Vec<Option<f64>>,
-    /// Kinetic features of groups, \[chunks, 12\].
-    features: Vec<Array2<f64>>,
-    songs: Vec<usize>,
-}
+/// Dancers of groups before, of whom groups are made up where no soloists are sampled.
+const MAX_STRANGERS: usize = 16;
 
 /// The music of a window.
 #[derive(Clone)]
@@ -97,386 +38,245 @@ struct WindowMusic {
     phase: Vec<f64>,
 }
 
-impl Windows {
-    /// Measures a window of a group, and holds it against its own bars and those of another song.
-    fn add(&mut self, group: ArrayView3<f32>, music: &WindowMusic, other: Option<&WindowMusic>) {
-        self.measures.push(measure(group, music.bar_frames, RADIUS_M));
-        if let Some(poses) = dancers(group) {
-            self.features.push(kinetic_features(&poses));
-        }
-        let mean_locking = |music: &WindowMusic| {
-            let locking = group.outer_iter().map(|dancer| {
-                let vertical = dancer.column(Channel::Velocity.range().start + 1);
-                let vertical: Vec<f64> = vertical.iter().map(|&v| f64::from(v)).collect();
-                let n = vertical.len().min(music.phase.len());
-                locking_above_chance(&vertical[..n], &music.phase[..n])
-            });
-            let locking: Vec<f64> = locking.collect();
-            (!locking.is_empty()).then(|| locking.iter().sum::<f64>() / locking.len() as f64)
-        };
-        self.locking.push(mean_locking(music));
-        self.other_locking.push(other.and_then(mean_locking));
-        self.songs.push(music.song);
+impl WindowMusic {
+    fn bars(&self) -> WindowBars<'_> {
+        WindowBars { song: self.song, bar_frames: self.bar_frames, phase: &self.phase }
     }
 
-    /// Returns a clustered mean over windows that have a number.
-    fn mean(&self, values: Vec<Option<f64>>) -> Estimate {
-        let known: Vec<(f64, usize)> = values
-            .into_iter()
-            .zip(&self.songs)
-            .filter_map(|(value, &song)| Some((value.filter(|x| x.is_finite())?, song)))
-            .collect();
-        let (values, songs): (Vec<f64>, Vec<usize>) = known.into_iter().unzip();
-        clustered_mean_estimate(&values, &songs)
-    }
-
-    fn gaussian(&self) -> Option<Gaussian> {
-        let views: Vec<_> = self.features.iter().map(|features| features.view()).collect();
-        let all = concatenate(Axis(0), &views).ok()?;
-        Gaussian::fit(all.view())
+    fn window(&self, first: usize, n_frames: usize) -> Option<WindowBars<'_>> {
+        Some(WindowBars { phase: self.phase.get(first..first + n_frames)?, ..self.bars() })
     }
 }
 
-/// A generated group and what is known of it.
-struct GeneratedGroup {
-    split: &'static str,
-    music: WindowMusic,
+/// A group that was sampled as a baseline for a window of music.
+pub(super) struct SampledGroup {
+    subject: Subject,
+    phrase_id: String,
+    first_frame: usize,
+    split: MusicSplit,
+    /// \[N, T, 25\]
     frames: Array3<f32>,
 }
 
-/// Real groups with their music.
-type RealGroups = BTreeMap<GroupSubject, Vec<(WindowMusic, Array3<f32>)>>;
-
-/// Returns whether all motions of a run are of groups.
-///
-/// # Errors
-/// [`StoreError`].
-pub fn is_of_groups(store: &Location, run: &str) -> Result<bool, StoreError> {
-    let snapshot = StoreSnapshot::take(store)?;
-    let table = snapshot.table(GenerationRow::schema())?;
-    let (mut n_groups, mut n_soloists) = (0_usize, 0_usize);
-    table.rows_where(|row: &GenerationRow| {
-        if row.run == run {
-            match row.count_dancers() {
-                1 => n_soloists += 1,
-                _ => n_groups += 1,
-            }
-        }
-        false
-    })?;
-    Ok(n_groups > 0 && n_soloists == 0)
-}
-
-/// The motions of a run of groups, and what they are held against.
-pub struct GroupEvaluand {
-    snapshot: StoreSnapshot,
-    generations: Vec<GenerationRow>,
-    phrases: PhraseIndex,
-    splits: Vec<MusicSplit>,
-    notes: Vec<String>,
-    real_rows: Vec<PhraseRow>,
-    /// Digest of the motions, of the splits that they are in, and of real groups.
-    pub input_hash: String,
-}
-
-impl GroupEvaluand {
-    /// Reads what is known of the motions of a run, without their frames.
-    ///
-    /// # Errors
-    /// When the store cannot be read.
-    pub fn read(snapshot: StoreSnapshot, run: &str) -> anyhow::Result<Self> {
-        let mut generations: Vec<GenerationRow> = snapshot
-            .table(GenerationRow::schema())?
-            .rows_where(|row: &GenerationRow| row.run == run && row.selected)?;
-        generations.sort_by(|a, b| a.generation.cmp(&b.generation));
-        let ids = generations.iter().map(|row| row.phrase_id.as_str());
-        let phrases = PhraseIndex::read(&snapshot, ids)?;
-        let (splits, notes) = splits_of(snapshot.store(), &phrases, &generations)?;
-        let lines: Vec<String> = generations
-            .iter()
-            .zip(&splits)
-            .map(|(row, split)| {
-                format!("{} {} {} {}", row.generation, row.weights, row.time.0, split.name())
-            })
-            .collect();
-        let real_rows = real_groups(&snapshot)?;
-        let data = digest(
-            real_rows
-                .iter()
-                .map(|row| format!("{} {}\n", row.phrase_id, row.content_hash))
-                .collect::<String>()
-                .as_bytes(),
-        );
-        let input_hash = digest(format!("{data}\n{}", lines.join("\n")).as_bytes());
-        Ok(Self { snapshot, generations, phrases, splits, notes, real_rows, input_hash })
-    }
-}
-
-/// Runs the stage on a run of groups.
-///
-/// # Errors
-/// What the store says, and a run without motion.
-pub fn run(
-    params: &Params,
-    store: &Location,
-    run: &str,
-    progress: &dyn Progress,
-) -> anyhow::Result<Box<dyn Summary>> {
-    let started = Instant::now();
-    let GroupEvaluand { snapshot, generations, phrases, splits, notes, real_rows, input_hash } =
-        GroupEvaluand::read(StoreSnapshot::take(store)?, run)?;
-    for note in &notes {
-        progress.note(note);
-    }
-    let params_hash = digest(format!("groups {OUTPUT_VERSION}").as_bytes());
-    let identity = RunIdentity {
-        store,
-        run,
-        params_hash: &params_hash,
-        whole_hash: &params_hash,
-        input_hash: &input_hash,
-    };
-    let is_up_to_date = !params.force && identity.is_up_to_date(Evaluate::NAME)?;
-    let n_frames: i64 = generations.iter().map(|row| row.n_frames).sum();
-    let length_s = n_frames as f64 / FPS;
-    let mut summary = GroupEvaluationSummary {
-        store: store.to_string(),
-        run: run.to_owned(),
-        n_motions: generations.len(),
-        length_s,
-        is_up_to_date,
-        dry_run: params.dry_run,
-        metrics: Vec::new(),
-        took_s: 0.0,
-    };
-    if params.dry_run {
-        return Ok(Box::new(summary));
-    }
-    if is_up_to_date {
-        summary.metrics = EvaluationRows::read(store, run, false)?.metrics;
-        summary.took_s = started.elapsed().as_secs_f64();
-        return Ok(Box::new(summary));
-    }
-    let (name, what) = (format!("{}/{run}", Evaluate::NAME), format!("evaluation of {run}"));
-    let (lease, _) = lease::take(store, &name, &what, &|text| progress.note(text))?;
-    store.sweep();
-    let real = real_windows(&snapshot, &phrases, &real_rows)?;
-    let window = real
-        .values()
-        .flatten()
-        .map(|(_, frames)| frames.dim().1)
-        .min()
-        .unwrap_or(WINDOW_FRAMES)
-        .min(WINDOW_FRAMES);
-    let split_names: BTreeMap<&str, &'static str> = generations
-        .iter()
-        .map(|row| row.generation.as_str())
-        .zip(splits.iter().map(|split| split.name()))
-        .collect();
-    let generated = generated_groups(&snapshot, &phrases, &generations, &split_names)?;
-    let model = generations.first().map(|row| row.model.clone()).unwrap_or_default();
-    progress.start("evaluate", "groups", generated.len() as u64);
-    let found = measured(&generated, &real, window, progress);
-    progress.finish();
-    let mut rows = EvaluationRows {
-        metrics: metric_rows(run, &model, window, &found),
-        ..EvaluationRows::default()
-    };
-    rows.metrics.sort_by_cached_key(|row| {
-        [&row.metric, &row.variant, &row.split, &row.subject].map(String::clone)
-    });
-    lease.check()?;
-    identity.commit_numbers(&rows)?;
-    store::checkpoint(store, &[Evaluate::NAME]);
-    summary.metrics = rows.metrics;
-    summary.took_s = started.elapsed().as_secs_f64();
-    Ok(Box::new(summary))
-}
-
-/// Returns the phrases of real groups, at most [`MAX_REAL`] of each split, in order of the digests of their names.
-fn real_groups(snapshot: &StoreSnapshot) -> Result<Vec<PhraseRow>, StoreError> {
-    let mut rows: Vec<PhraseRow> = snapshot
-        .table(PhraseRow::schema())?
-        .rows_where(|row: &PhraseRow| row.count_dancers() > 1)?;
-    rows.sort_by_cached_key(|row| digest(row.phrase_id.as_bytes()));
-    let mut n_of_split: BTreeMap<String, usize> = BTreeMap::new();
-    rows.retain(|row| {
-        let n = n_of_split.entry(row.split.clone()).or_default();
-        *n += 1;
-        *n <= MAX_REAL
-    });
-    rows.sort_by(|a, b| a.phrase_id.cmp(&b.phrase_id));
-    Ok(rows)
-}
-
-/// Reads real groups with their music, by subject.
-fn real_windows(
-    snapshot: &StoreSnapshot,
-    phrases: &PhraseIndex,
-    rows: &[PhraseRow],
-) -> anyhow::Result<RealGroups> {
-    let wanted: BTreeSet<String> = rows.iter().map(|row| row.phrase_id.clone()).collect();
-    let mut found = RealGroups::new();
-    snapshot.table(tables::motion())?.visit_groups(&wanted, |id, frames| {
-        let subject = match phrases.row(id).map(|row| row.split.as_str()) {
-            Some("train") => GroupSubject::TrainingTruth,
-            _ => GroupSubject::HeldOutTruth,
-        };
-        // The bars of real motion are those of its own phase.
-        let phase: Vec<f64> = frames
-            .slice(s![0, .., Channel::Phase.range().start])
-            .iter()
-            .map(|&x| f64::from(x))
-            .collect();
-        if let Some(bar_frames) = bar_frames(phrases, id) {
-            let music = WindowMusic { song: phrases.song(id), bar_frames, phase };
-            found.entry(subject).or_default().push((music, frames));
-        }
-        Ok::<_, StoreError>(())
-    })?;
-    Ok(found)
-}
-
-/// Returns the length of a bar of a phrase's music; none where its tempo is not known.
-fn bar_frames(phrases: &PhraseIndex, phrase_id: &str) -> Option<f64> {
-    if let Some(beats) = phrases.beats(phrase_id) {
-        return Some(FPS * 60.0 / beats.tempo_bpm() * f64::from(beats.beats_per_bar()));
-    }
-    let row = phrases.row(phrase_id)?;
-    Some(FPS * 60.0 / row.tempo_bpm? * f64::from(row.beats_per_bar?))
-}
-
-fn generated_groups(
-    snapshot: &StoreSnapshot,
-    phrases: &PhraseIndex,
-    generations: &[GenerationRow],
-    splits: &BTreeMap<&str, &'static str>,
-) -> anyhow::Result<Vec<GeneratedGroup>> {
-    let names: BTreeSet<String> = generations.iter().map(|row| row.generation.clone()).collect();
-    let phrase_of: BTreeMap<&str, &str> =
-        generations.iter().map(|row| (row.generation.as_str(), row.phrase_id.as_str())).collect();
-    let mut found = Vec::new();
-    snapshot.table(tables::generated())?.visit_groups(&names, |name, frames| {
-        let (Some(&id), Some(&split)) = (phrase_of.get(name), splits.get(name)) else {
-            return Ok(());
-        };
-        if let Some(bar_frames) = bar_frames(phrases, id)
-            && let Some(beats) = phrases.beats(id)
-        {
-            let times_s: Vec<f64> = (0..frames.dim().1).map(frames_to_s).collect();
-            let phase = bar_phase(&times_s, &beats);
-            let music = WindowMusic { song: phrases.song(id), bar_frames, phase };
-            found.push(GeneratedGroup { split, music, frames });
-        }
-        Ok::<_, StoreError>(())
-    })?;
-    if found.is_empty() {
-        bail!(
-            "store {}: no group of the run has music whose beats are known; run motiongen extract first",
-            snapshot.store()
-        );
-    }
-    Ok(found)
-}
-
-/// Windows by split and subject.
-type SubjectWindows = BTreeMap<(&'static str, GroupSubject), Windows>;
-
-/// Measures windows of generated groups, of groups made up from them, and of real groups.
-fn measured(
-    generated: &[GeneratedGroup],
-    real: &RealGroups,
+/// Measures groups as they come.
+pub(super) struct GroupMeasurer {
     window: usize,
-    progress: &dyn Progress,
-) -> SubjectWindows {
-    let mut found = SubjectWindows::new();
-    for (i, group) in generated.iter().enumerate() {
-        let n_frames = group.frames.dim().1;
-        let other = (1..generated.len())
-            .map(|k| &generated[(i + k) % generated.len()])
-            .find(|other| other.music.song != group.music.song);
-        for first in (0..).step_by(window).take_while(|first| first + window <= n_frames) {
-            let cut = |group: &GeneratedGroup| {
-                let frames = group.frames.slice(s![.., first..first + window, ..]).to_owned();
-                let phase = group.music.phase[first..first + window].to_vec();
-                (frames, WindowMusic { phase, ..group.music.clone() })
-            };
-            let is_long = |group: &&GeneratedGroup| first + window <= group.frames.dim().1;
-            let (frames, music) = cut(group);
-            let other = other.filter(is_long).map(|other| cut(other).1);
-            let other = other.as_ref();
-            let mut add = |subject, frames: ArrayView3<f32>| {
-                found.entry((group.split, subject)).or_default().add(frames, &music, other);
-            };
-            add(GroupSubject::Generated, frames.view());
-            add(GroupSubject::Copied, copied(frames.view()).view());
-            let others: Vec<Array3<f32>> = (0..generated.len())
-                .map(|k| &generated[(i + k) % generated.len()])
-                .filter(is_long)
-                .take(frames.dim().0)
-                .map(|group| cut(group).0)
-                .collect();
-            if others.len() == frames.dim().0 {
-                add(GroupSubject::Independent, independent(frames.view(), &others).view());
-            }
-        }
-        progress.advance(1);
-    }
-    for (subject, groups) in real {
-        for (i, (music, frames)) in groups.iter().enumerate() {
-            let other = (1..groups.len())
-                .map(|k| &groups[(i + k) % groups.len()].0)
-                .find(|other| other.song != music.song);
-            for first in (0..).step_by(window).take_while(|first| first + window <= frames.dim().1)
-            {
-                let cut = |music: &WindowMusic| WindowMusic {
-                    phase: music.phase.get(first..first + window).unwrap_or(&music.phase).to_vec(),
-                    ..music.clone()
-                };
-                let group = frames.slice(s![.., first..first + window, ..]);
-                let windows = found.entry(("all", *subject)).or_default();
-                windows.add(group, &cut(music), other.map(cut).as_ref());
-            }
-        }
-    }
-    found
+    windows: BTreeMap<(&'static str, Subject), Vec<GroupWindow>>,
+    sampled: Vec<SampledGroup>,
+    /// Where the dancers of a group stood for whom soloists were sampled, by phrase and first frame.
+    places: BTreeMap<(String, usize), Vec<Place>>,
+    /// Dancers of groups before, the latest last, and their songs.
+    strangers: Vec<(usize, Array2<f32>)>,
+    /// The music of the group before of another song.
+    others: Vec<WindowMusic>,
 }
 
-fn metric_rows(run: &str, model: &str, window: usize, found: &SubjectWindows) -> Vec<MetricRow> {
-    let time = TimestampUs::now();
-    let protocol =
-        format!("windows of {window} frames, bodies of {RADIUS_M} m, intervals over songs");
-    let truth = found.get(&("all", GroupSubject::TrainingTruth)).and_then(Windows::gaussian);
-    let mut rows = Vec::new();
-    for ((split, subject), windows) in found {
-        let mut row = |metric: &str, variant: &str, unit: &str, estimate: Estimate| {
-            rows.push(MetricRow {
-                run: run.to_owned(),
-                model: model.to_owned(),
-                subject: subject.name().to_owned(),
-                split: (*split).to_owned(),
-                metric: metric.to_owned(),
-                variant: variant.to_owned(),
-                unit: unit.to_owned(),
-                value: estimate.value,
-                ci_low: estimate.ci_low,
-                ci_high: estimate.ci_high,
-                n: estimate.n as i64,
-                protocol: protocol.clone(),
-                time,
-            });
-        };
-        for (metric, unit, of) in MEASURES {
-            row(metric, "", unit, windows.mean(windows.measures.iter().map(of).collect()));
+impl GroupMeasurer {
+    /// `n_frames` are the lengths of the motions, `truth` is real groups'.
+    pub fn new(n_frames: &[usize], truth: Option<&Truth>) -> Self {
+        let real = truth.into_iter().flat_map(|truth| &truth.phrases).map(|p| p.motion.nrows());
+        let longest = n_frames.iter().copied().max().unwrap_or(WINDOW_FRAMES);
+        Self {
+            window: real.min().unwrap_or(WINDOW_FRAMES).min(longest).min(WINDOW_FRAMES),
+            windows: BTreeMap::new(),
+            sampled: Vec::new(),
+            places: BTreeMap::new(),
+            strangers: Vec::new(),
+            others: Vec::new(),
         }
-        row("group_locking", "", "", windows.mean(windows.locking.clone()));
-        row("group_locking", "other_song", "", windows.mean(windows.other_locking.clone()));
-        let least = windows.measures.iter().filter_map(|m| m.least_separation_m);
-        let least = least.reduce(f64::min);
-        row("least_separation", "least", "m", Estimate::plain(least, windows.measures.len()));
-        let gmr = truth.as_ref().zip(windows.gaussian()).and_then(|(a, b)| frechet_distance(a, &b));
-        let n = windows.features.iter().map(Array2::nrows).sum();
-        row("gmr", "", "", Estimate::plain(gmr, n));
     }
-    rows
+
+    /// Returns the frames of a window.
+    pub fn window_frames(&self) -> usize {
+        self.window
+    }
+
+    /// Takes in baselines that were sampled before the groups come for whose music they are.
+    pub fn expect(&mut self, sampled: Vec<SampledGroup>) {
+        self.sampled.extend(sampled);
+    }
+
+    /// Measures a group, \[N, T, 25\], in windows, and what is made up from it; none where its beats are not known.
+    pub fn add(
+        &mut self,
+        phrases: &PhraseIndex,
+        (phrase_id, split): (&str, MusicSplit),
+        group: ArrayView3<f32>,
+    ) {
+        let (n_dancers, n_frames, _) = group.dim();
+        let Some(music) = music_of(phrases, phrase_id, n_frames) else { return };
+        let other = self.others.iter().rev().find(|other| other.song != music.song).cloned();
+        let window = self.window;
+        let strangers: Vec<Array2<f32>> = {
+            let of_others = self.strangers.iter().rev().filter(|(song, _)| *song != music.song);
+            of_others.take(n_dancers).map(|(_, frames)| frames.clone()).collect()
+        };
+        for first in (0..).step_by(window).take_while(|first| first + window <= n_frames) {
+            let frames = group.slice(s![.., first..first + window, ..]);
+            let Some(own) = music.window(first, window) else { continue };
+            let other = other.as_ref().and_then(|other| other.window(first, window));
+            let mut add = |subject, frames: ArrayView3<f32>| {
+                let found = GroupWindow::new(frames, RADIUS_M, own, other);
+                self.windows.entry((split.name(), subject)).or_default().push(found);
+            };
+            add(Subject::Generated, frames);
+            add(Subject::Copied, copied(frames).view());
+            let is_sampled = self.sampled.iter().any(|s| s.subject == Subject::Independent);
+            let last = first + window;
+            let others: Option<Vec<_>> = strangers
+                .iter()
+                .map(|stranger| {
+                    (stranger.nrows() >= last).then(|| stranger.slice(s![first..last, ..]))
+                })
+                .collect();
+            if let Some(others) = others.filter(|others| !is_sampled && others.len() == n_dancers) {
+                add(Subject::Independent, independent(frames, &others).view());
+            }
+            self.places.entry((phrase_id.to_owned(), first)).or_insert_with(|| places(frames));
+        }
+        // A dancer of each group, another one each time.
+        let dancer = self.strangers.len() % n_dancers.max(1);
+        self.strangers.push((music.song, group.index_axis(Axis(0), dancer).to_owned()));
+        if self.strangers.len() > MAX_STRANGERS {
+            self.strangers.remove(0);
+        }
+        self.others.retain(|other| other.song != music.song);
+        self.others.push(music);
+    }
+
+    /// Measures real groups and sampled ones, and returns the numbers of all.
+    pub fn finish(mut self, phrases: &PhraseIndex, truth: Option<&Truth>) -> GroupFindings {
+        for sampled in std::mem::take(&mut self.sampled) {
+            let SampledGroup { subject, phrase_id, first_frame, split, mut frames } = sampled;
+            let last = first_frame + frames.dim().1;
+            let Some(music) = music_of(phrases, &phrase_id, last) else { continue };
+            let Some(own) = music.window(first_frame, frames.dim().1) else { continue };
+            if subject == Subject::Independent {
+                let Some(to) = self.places.get(&(phrase_id, first_frame)) else { continue };
+                frames = placed(frames.view(), to);
+            }
+            let other = self.others.iter().find(|other| other.song != music.song);
+            let other = other.and_then(|other| other.window(first_frame, frames.dim().1));
+            let found = GroupWindow::new(frames.view(), RADIUS_M, own, other);
+            self.windows.entry((split.name(), subject)).or_default().push(found);
+        }
+        if let Some(truth) = truth {
+            self.add_real(phrases, truth);
+        }
+        let training = self.windows.get(&(ALL, Subject::TrainingTruth));
+        let reference: Option<Gaussian> =
+            training.and_then(|windows| feature_distribution(windows));
+        let numbers = self.windows.iter().map(|(&(split, subject), windows)| {
+            ((split, subject), group_numbers(windows, reference.as_ref()))
+        });
+        GroupFindings { numbers: numbers.collect() }
+    }
+
+    fn add_real(&mut self, phrases: &PhraseIndex, truth: &Truth) {
+        for subject in [Subject::HeldOutTruth, Subject::TrainingTruth] {
+            let is_of_subject = |group: &&[TruthPhrase]| {
+                (group[0].split == Split::Train) == (subject == Subject::TrainingTruth)
+            };
+            let groups: Vec<&[TruthPhrase]> =
+                truth.phrases.chunk_by(|a, b| a.id == b.id).filter(is_of_subject).collect();
+            let n = groups.len().min(MAX_REAL);
+            let chosen: Vec<&[TruthPhrase]> =
+                (0..n).map(|i| groups[i * groups.len() / n]).collect();
+            // The bars of real motion are those of its own phase.
+            let music: Vec<Option<WindowMusic>> =
+                chosen.iter().map(|group| music_of_real(phrases, &group[0])).collect();
+            let split = real_split(subject);
+            for (i, (group, own)) in chosen.iter().zip(&music).enumerate() {
+                let Some(own) = own else { continue };
+                let other = (1..n)
+                    .filter_map(|k| music[(i + k) % n].as_ref())
+                    .find(|other| other.song != own.song);
+                let views: Vec<_> = group.iter().map(|dancer| dancer.motion.view()).collect();
+                let Ok(frames) = ndarray::stack(Axis(0), &views) else { continue };
+                let window = self.window;
+                let firsts = (0..).step_by(window);
+                for first in firsts.take_while(|first| first + window <= frames.dim().1) {
+                    let Some(bars) = own.window(first, window) else { continue };
+                    let other = other.and_then(|other| other.window(first, window));
+                    let frames = frames.slice(s![.., first..first + window, ..]);
+                    let found = GroupWindow::new(frames, RADIUS_M, bars, other);
+                    self.windows.entry((split, subject)).or_default().push(found);
+                }
+            }
+        }
+    }
+}
+
+/// Returns the split that numbers of real groups have in tables.
+fn real_split(subject: Subject) -> &'static str {
+    match subject {
+        Subject::HeldOutTruth => MusicSplit::HeldOut.name(),
+        _ => ALL,
+    }
+}
+
+/// Returns the bars of the music of a phrase; none where its beats are not known.
+fn music_of(phrases: &PhraseIndex, phrase_id: &str, n_frames: usize) -> Option<WindowMusic> {
+    let beats = phrases.beats(phrase_id)?;
+    let times_s: Vec<f64> = (0..n_frames).map(frames_to_s).collect();
+    Some(WindowMusic {
+        song: phrases.song(phrase_id),
+        bar_frames: phrases.bar_frames(phrase_id)?,
+        phase: bar_phase(&times_s, &beats),
+    })
+}
+
+fn music_of_real(phrases: &PhraseIndex, dancer: &TruthPhrase) -> Option<WindowMusic> {
+    let phase = dancer.motion.column(Channel::Phase.range().start);
+    Some(WindowMusic {
+        song: phrases.song(&dancer.id),
+        bar_frames: phrases.bar_frames(&dancer.id)?,
+        phase: phase.iter().map(|&x| f64::from(x)).collect(),
+    })
+}
+
+/// The numbers of groups, by split and subject.
+pub(super) struct GroupFindings {
+    numbers: BTreeMap<(&'static str, Subject), Vec<Number>>,
+}
+
+/// The numbers of a split that verdicts rest on.
+pub(super) struct SplitNumbers<'a> {
+    own: &'a [Number],
+    independent: &'a [Number],
+    truth: &'a [Number],
+}
+
+impl GroupFindings {
+    fn of(&self, split: &'static str, subject: Subject) -> &[Number] {
+        self.numbers.get(&(split, subject)).map_or(&[], Vec::as_slice)
+    }
+
+    /// Returns the numbers of a split.
+    pub fn of_split(&self, split: MusicSplit) -> SplitNumbers<'_> {
+        let truth = Subject::HeldOutTruth;
+        SplitNumbers {
+            own: self.of(split.name(), Subject::Generated),
+            independent: self.of(split.name(), Subject::Independent),
+            truth: self.of(real_split(truth), truth),
+        }
+    }
+
+    /// Returns all numbers, as tables have them.
+    pub fn findings(&self) -> impl Iterator<Item = Finding> + '_ {
+        self.numbers.iter().map(|(&(split, subject), numbers)| {
+            let mut numbers = numbers.clone();
+            // Distances from itself say nothing.
+            numbers.retain(|n| n.metric != "gmr" || subject != Subject::TrainingTruth);
+            Finding { subject, split, numbers }
+        })
+    }
+}
+
+impl SplitNumbers<'_> {
+    /// Returns what the verdicts are told.
+    pub fn evidence(&self) -> GroupEvidence<'_> {
+        let Self { own, independent, truth } = self;
+        GroupEvidence { own, independent, truth }
+    }
 }

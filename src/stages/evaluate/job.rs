@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use ndarray::Array2;
 
+use super::group::GroupFindings;
 use super::measure::{MeasuredMotion, Measurer, kept_frames, stride_for};
 use super::motions::{PhraseIndex, is_held_out};
 use super::params::Params;
@@ -12,9 +13,10 @@ use super::splits::{ALL, MusicSplit, SPLITS};
 use super::subjects::{Finding, MeasureSettings, MeasuredWindow, Subject, channels};
 use super::truth::{Truth, TruthPhrase};
 use crate::evaluation::coupling::{Coupling, Harmonics, Template, consistency_p};
+use crate::evaluation::keyframe::{Keyframe, KeyframeMisses};
 use crate::evaluation::metrics::{
-    MotionWindow, Number, PhaseOrigin, control_numbers, coupling_ratio, motion_ratios,
-    song_harmonics, whole_numbers,
+    MotionWindow, Number, PhaseOrigin, control_numbers, coupling_ratio, keyframe_numbers,
+    motion_ratios, song_harmonics, whole_numbers,
 };
 use crate::evaluation::verdict::{Evidence, Verdict, verdicts};
 use crate::evaluation::window::window_starts;
@@ -47,20 +49,27 @@ impl MotionStage {
     }
 }
 
-/// A motion that is evaluated.
+/// A motion that is evaluated, of a soloist or of a dancer of a group; dancers of a group stand side by side.
 #[derive(Clone, Debug)]
 pub struct EvaluationMotion {
     pub phrase_id: String,
     pub sample: i32,
+    /// Place of the generation, or of the file, that it is of.
+    pub item: usize,
+    /// Number of the dancer, 0 of a soloist.
+    pub dancer: usize,
     pub split: MusicSplit,
     /// Largest misses of its constraints: mm and degrees.
     pub misses: [Option<f64>; 2],
+    /// What it was asked to do; empty where nothing was asked or nobody wrote it down.
+    pub keyframes: Vec<Keyframe>,
 }
 
 /// A motion, measured as it is and, where that is known, as it was decoded.
 pub struct EvaluatedMotion {
     pub is: MeasuredMotion,
     pub decoded: Option<MeasuredMotion>,
+    pub keyframes: KeyframeMisses,
 }
 
 /// Motion that was sampled as a baseline: one window each, and the place of its music.
@@ -94,6 +103,8 @@ pub struct EvaluationJob<'a> {
     pub has_network: bool,
     /// Split of the windows that were sampled.
     pub sampled_split: Option<MusicSplit>,
+    /// What was measured of groups; none of soloists.
+    pub groups: Option<&'a GroupFindings>,
 }
 
 impl EvaluationJob<'_> {
@@ -158,7 +169,7 @@ impl EvaluationJob<'_> {
             let items: Vec<&MeasuredWindow> = generated.iter().map(|(item, _)| item).collect();
             let mut numbers = meter(items.len()).numbers(ALL, &items, own);
             numbers.extend(meter(0).decoded(&items, self.raw_phase()));
-            numbers.extend(self.control(None));
+            numbers.extend(self.control(evaluated, None));
             findings.push(Finding { subject: Subject::Generated, split: ALL, numbers });
         }
         for split in splits {
@@ -173,7 +184,7 @@ impl EvaluationJob<'_> {
             numbers.extend(motion_ratios(&numbers, &truth));
             numbers.extend(coupling_ratio(&numbers, &truth));
             numbers.extend(channels(chosen.iter().map(|(_, kept)| kept), &training_kept));
-            numbers.extend(self.control(Some(split)));
+            numbers.extend(self.control(evaluated, Some(split)));
             let shuffled = meter.shuffled(&items);
             let shifted = meter.shifted(&items);
             let items_in_split = |items: &'_ [MeasuredWindow]| -> Vec<MeasuredWindow> {
@@ -189,6 +200,7 @@ impl EvaluationJob<'_> {
                 Finding { subject, split: name, numbers }
             };
             let untrained = baseline(Subject::Untrained, &sampled.untrained);
+            let group = self.groups.map(|groups| groups.of_split(split));
             let evidence = Evidence {
                 own: &numbers,
                 shuffled: &shuffled,
@@ -197,8 +209,10 @@ impl EvaluationJob<'_> {
                 truth: &truth,
                 has_raw: self.has_raw,
                 has_network: self.has_network && self.sampled_split == Some(split),
+                group: group.as_ref().map(|group| group.evidence()),
             };
-            all_verdicts.extend(verdicts(&evidence).map(|verdict| (split, verdict)));
+            let told = verdicts(&evidence);
+            all_verdicts.extend(told.into_iter().map(|verdict| (split, verdict)));
             let finding = |subject, numbers| Finding { subject, split: name, numbers };
             findings.extend([
                 finding(Subject::Generated, numbers),
@@ -206,10 +220,12 @@ impl EvaluationJob<'_> {
                 finding(Subject::Shifted, shifted),
                 untrained,
                 baseline(Subject::NoMusic, &sampled.no_music),
+                baseline(Subject::ShuffledPlan, &sampled.shuffled_plan),
                 baseline(Subject::Retrieval, &retrieved),
                 baseline(Subject::MeanMotion, &constant),
             ]);
         }
+        findings.extend(self.groups.into_iter().flat_map(GroupFindings::findings));
         findings.retain(|finding| !finding.numbers.is_empty());
         Ok(EvaluationFindings { findings, verdicts: all_verdicts })
     }
@@ -356,7 +372,7 @@ impl EvaluationJob<'_> {
     }
 
     /// Sums up how far motions are from their constraints.
-    fn control(&self, split: Option<MusicSplit>) -> Vec<Number> {
+    fn control(&self, evaluated: &[EvaluatedMotion], split: Option<MusicSplit>) -> Vec<Number> {
         let chosen = || {
             self.motions
                 .iter()
@@ -370,7 +386,17 @@ impl EvaluationJob<'_> {
                 .unzip()
         };
         let (position, orientation) = (misses(0), misses(1));
-        control_numbers([&position.0, &orientation.0], [&position.1, &orientation.1])
+        let mut numbers =
+            control_numbers([&position.0, &orientation.0], [&position.1, &orientation.1]);
+        let at_keyframes: Vec<(usize, &KeyframeMisses)> = self
+            .motions
+            .iter()
+            .zip(evaluated)
+            .filter(|(motion, _)| split.is_none_or(|split| motion.split == split))
+            .map(|(motion, found)| (self.phrases.song(&motion.phrase_id), &found.keyframes))
+            .collect();
+        numbers.extend(keyframe_numbers(&at_keyframes));
+        numbers
     }
 }
 

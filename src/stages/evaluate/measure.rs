@@ -140,20 +140,42 @@ fn over_windows(name: &str, windows: &[WindowMeasures]) -> Option<Check> {
         .iter()
         .filter_map(|window| window.checks.iter().find(|check| check.name == name))
         .collect();
-    let distance = |check: &Check| (check.value - check.threshold).abs();
-    let worst = all.iter().copied().reduce(|a, b| {
-        let is_worse = match (a.passed, b.passed) {
-            (true, false) => true,
-            (false, true) => false,
-            (false, false) => distance(b) > distance(a) || b.value.is_nan(),
-            (true, true) => distance(b) < distance(a),
-        };
-        if is_worse { b } else { a }
-    })?;
+    let worst = all.iter().copied().reduce(|a, b| if is_worse(b, a) { b } else { a })?;
     let n_passed = all.iter().filter(|check| check.passed).count();
     let message = format!("{}; {n_passed} of {} windows pass", worst.message, all.len());
     let passed = n_passed as f64 >= MIN_WINDOW_SHARE * all.len() as f64;
     Some(Check { passed, message, ..worst.clone() })
+}
+
+/// Whether an answer is worse than another: failures before passes, the former the farther and the latter the nearer to
+/// the threshold.
+fn is_worse(check: &Check, than: &Check) -> bool {
+    let distance = |check: &Check| (check.value - check.threshold).abs();
+    match (than.passed, check.passed) {
+        (true, false) => true,
+        (false, true) => false,
+        (false, false) => distance(check) > distance(than) || check.value.is_nan(),
+        (true, true) => distance(check) < distance(than),
+    }
+}
+
+/// Returns the checks of a motion, of a group those of the dancer whose answer is worst: a group passes what all its
+/// dancers pass.
+pub fn over_dancers(dancers: &[&[Check]]) -> Vec<Check> {
+    let [first, others @ ..] = dancers else { return Vec::new() };
+    let mut worst: Vec<(usize, &Check)> = first.iter().map(|check| (0, check)).collect();
+    for (dancer, checks) in others.iter().enumerate() {
+        for (worst, check) in worst.iter_mut().zip(*checks) {
+            if is_worse(check, worst.1) {
+                *worst = (dancer + 1, check);
+            }
+        }
+    }
+    let told = |(dancer, check): (usize, &Check)| match others.is_empty() {
+        true => check.clone(),
+        false => Check { message: format!("dancer {dancer}: {}", check.message), ..check.clone() },
+    };
+    worst.into_iter().map(told).collect()
 }
 
 /// Returns the kept frames of motions one behind the other, \[n, 25\].

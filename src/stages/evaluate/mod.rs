@@ -6,7 +6,9 @@ mod evaluand;
 mod foreign;
 mod group;
 mod job;
+mod making;
 mod measure;
+mod metrics_summary;
 mod motions;
 mod page;
 mod params;
@@ -15,6 +17,7 @@ mod sampled;
 mod splits;
 mod subjects;
 mod survey;
+mod tokenizer;
 mod truth;
 
 use std::collections::BTreeSet;
@@ -48,7 +51,7 @@ impl Stage for Evaluate {
     const NAME: &'static str = "evaluate";
     const ABOUT: &'static str = "tell good motion from bad, beside its baselines";
     const CONTRACT: Contract = Contract {
-        reads: "generations, generated, decoded, phrases, beats, features, motion, models/MODEL",
+        reads: "generations, generated, decoded, phrases, beats, features, motion, models/MODEL, runs/RUN",
         writes: "sanity_checks, metrics, verdicts, song_metrics, reference/, baselines/, an HTML file with \
                  --report",
     };
@@ -58,10 +61,8 @@ impl Stage for Evaluate {
         let started = Instant::now();
         params.check()?;
         let store = Location::open(&params.store, &params.client.options())?;
-        if let Some(run) = params.run.as_deref().filter(|_| params.motions.is_none())
-            && group::is_of_groups(&store, run)?
-        {
-            return group::run(&params, &store, run, progress);
+        if let Some(run) = &params.tokenizer {
+            return tokenizer::run(&params, &store, run, progress);
         }
         let against = params.against.as_deref().map(|run| page::OtherRun::read(&store, run));
         let against = against.transpose()?;
@@ -85,7 +86,7 @@ impl Stage for Evaluate {
         };
         let mut is_up_to_date = look()?;
         if params.dry_run {
-            let (n_motions, length_s) = (subject.motions.len(), subject.length_s());
+            let (n_motions, length_s) = (subject.n_items(), subject.length_s());
             let n_refused = subject.refused.len();
             return Ok(Box::new(EvaluateDryRun {
                 store: store.to_string(),
@@ -135,7 +136,7 @@ impl Stage for Evaluate {
             missed: missed(&params, &found.checks),
             not_won: not_won(&params, &report),
             store: store.to_string(),
-            n_motions: subject.motions.len(),
+            n_motions: subject.n_items(),
             length_s: subject.length_s(),
             refused: std::mem::take(&mut subject.refused),
             run,
@@ -157,8 +158,11 @@ fn not_won(params: &Params, report: &Report) -> Vec<UnwonVerdict> {
     let is_required = |name: &str| params.require.iter().any(|asked| asked.asks_for(name));
     let told = report.verdicts.iter().map(|told| (told.verdict.clone(), told.outcome));
     let is_told = |name: &str| report.verdicts.iter().any(|told| told.verdict == name);
-    let untold = Quality::ALL
+    let of_groups =
+        params.require.contains(&RequiredVerdict::Together).then_some(Quality::Together);
+    let untold = Quality::OF_SOLOISTS
         .into_iter()
+        .chain(of_groups)
         .filter(|quality| !is_told(quality.name()))
         .map(|quality| (quality.name().to_owned(), report::Outcome::Open));
     told.chain(untold)

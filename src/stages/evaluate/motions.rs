@@ -18,11 +18,12 @@ use crate::stages::generate::url_of;
 use crate::stages::plot::nearest::nearest;
 use crate::store::tables::{GenerationRow, PhraseRow};
 use crate::store::{Row as _, StoreError, StoreSnapshot, digest};
-use crate::training::Split;
+use crate::training::{Ensemble, Split};
 use crate::units::{FPS, frames_to_s};
 
-/// Returns the motions of soloists of a run that were kept, in order of name, at most `n`: those whose names have
-/// the smallest digests, which is no order that phrases have; and how many of groups are left out.
+/// Returns the motions of a run that were kept, in order of name, at most `n`: those whose names have the smallest
+/// digests, which is no order that phrases have; and how many of groups are left out. A run that has motions of
+/// soloists is measured as theirs; one of groups alone as that of groups.
 ///
 /// # Errors
 /// [`StoreError`], or one sentence where there are none.
@@ -51,14 +52,10 @@ pub fn of_run(
         bail!("store {store} has no generated motion of run \"{run}\"; nearest: {nearest}");
     }
     let n_kept = rows.len();
-    rows.retain(|row| row.count_dancers() == 1);
-    let n_groups = n_kept - rows.len();
-    if rows.is_empty() {
-        bail!(
-            "store {store}: run \"{run}\" has {n_groups} motions, all of groups of dancers; evaluate measures \
-             soloists"
-        );
+    if rows.iter().any(|row| row.count_dancers() == 1) {
+        rows.retain(|row| row.count_dancers() == 1);
     }
+    let n_groups = n_kept - rows.len();
     if let Some(n) = n.filter(|n| *n < rows.len()) {
         rows.sort_by_cached_key(|row| digest(row.generation.as_bytes()));
         rows.truncate(n);
@@ -89,6 +86,8 @@ pub struct PhraseIndex {
     beats: HashMap<String, PhraseBeats>,
     /// Activity of the frames of songs, by their file.
     activities: HashMap<String, Vec<f64>>,
+    /// Whose real motion is compared with.
+    ensemble: Ensemble,
 }
 
 impl PhraseIndex {
@@ -108,7 +107,27 @@ impl PhraseIndex {
         let rows = rows.into_iter().map(|row| (row.phrase_id.clone(), row)).collect();
         let beats = beats::of_phrases(snapshot, |id| wanted.contains(id))?;
         let songs = songs.into_iter().zip(0..).collect();
-        Ok(Self { rows, songs, beats, activities: HashMap::new() })
+        let (activities, ensemble) = (HashMap::new(), Ensemble::Soloists);
+        Ok(Self { rows, songs, beats, activities, ensemble })
+    }
+
+    /// Chooses whose real motion is compared with: soloists', unless groups are told.
+    pub fn hold_against(&mut self, ensemble: Ensemble) {
+        self.ensemble = ensemble;
+    }
+
+    /// Returns whose real motion is compared with.
+    pub fn ensemble(&self) -> Ensemble {
+        self.ensemble
+    }
+
+    /// Returns the length of a bar of a phrase's music, frames; none where its tempo is not known.
+    pub fn bar_frames(&self, phrase_id: &str) -> Option<f64> {
+        if let Some(beats) = self.beats(phrase_id) {
+            return Some(FPS * 60.0 / beats.tempo_bpm() * f64::from(beats.beats_per_bar()));
+        }
+        let row = self.row(phrase_id)?;
+        Some(FPS * 60.0 / row.tempo_bpm? * f64::from(row.beats_per_bar?))
     }
 
     /// Returns what the table says of a phrase.
@@ -224,7 +243,7 @@ impl PhraseIndex {
 
     /// Whether all phrases with real motion were constructed, so that their coupling to the bar is known.
     pub fn is_constructed(&self) -> bool {
-        let mut with_music = self.rows.values().filter(|row| has_truth(row)).peekable();
+        let mut with_music = self.rows.values().filter(|row| self.has_truth(row)).peekable();
         with_music.peek().is_some() && with_music.all(PhraseRow::is_constructed)
     }
 
@@ -233,17 +252,21 @@ impl PhraseIndex {
         let mut lines: Vec<String> = self
             .rows
             .values()
-            .filter(|row| has_truth(row))
+            .filter(|row| self.has_truth(row))
             .map(|row| format!("{}\n{}\n{}", row.phrase_id, row.split, row.content_hash))
             .collect();
         lines.sort_unstable();
         digest(lines.join("\n").as_bytes())
     }
-}
 
-fn has_truth(row: &PhraseRow) -> bool {
-    // Groups are no measure of a soloist.
-    row.count_dancers() == 1 && (row.has_features || row.has_audio)
+    /// Whether a phrase has real motion to compare with: groups are no measure of a soloist, nor soloists of groups.
+    fn has_truth(&self, row: &PhraseRow) -> bool {
+        let is_like = match self.ensemble {
+            Ensemble::Soloists => row.count_dancers() == 1,
+            Ensemble::Groups { most } => (2..=most).contains(&row.count_dancers()),
+        };
+        is_like && (row.has_features || row.has_audio)
+    }
 }
 
 /// Returns the identity of a phrase's song: the digest of its music, or its file where that is not known.

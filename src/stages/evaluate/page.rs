@@ -11,11 +11,11 @@ use crate::evaluation::interval::{holm, paired_difference};
 use crate::motion::Trajectory;
 use crate::plot::{self, Format, MOTION_WIDTH_PX, MotionPanel, MotionPlot};
 use crate::report::{
-    self, CheckLine, ComparedRun, Metric, Outcome, PairedNumber, Report, Verdict, VerdictTest,
-    WorstMotion,
+    self, CheckLine, ComparedRun, DialRun, Metric, Outcome, PairedNumber, Report, Verdict,
+    VerdictTest, WorstMotion,
 };
 use crate::store::tables::{GenerationRow, MetricRow, SanityCheckRow, SongMetricRow, VerdictRow};
-use crate::store::{Location, StoreSnapshot};
+use crate::store::{Location, Row as _, StoreSnapshot};
 use crate::training::TemporalConfig;
 use crate::units::frames_to_s;
 
@@ -68,10 +68,17 @@ impl Page<'_> {
         let Self { subject, found, .. } = self;
         let made = subject.generations.first();
         let length_s = subject.length_s();
-        let n = subject.motions.len();
+        let n = subject.n_items();
+        let n_dancers = subject.motions.len();
         let mut facts = vec![
             ("run".to_owned(), subject.run.clone()),
-            ("motions".to_owned(), format!("{n}, {length_s:.1} s in all")),
+            (
+                "motions".to_owned(),
+                match subject.is_of_groups {
+                    true => format!("{n} groups, {n_dancers} dancers, {length_s:.1} s in all"),
+                    false => format!("{n}, {length_s:.1} s in all"),
+                },
+            ),
             ("real motion".to_owned(), self.data_hash[..16.min(self.data_hash.len())].to_owned()),
         ];
         let own_settings = made.map(settings);
@@ -87,7 +94,37 @@ impl Page<'_> {
             metrics: shown(&found.metrics),
             worst: self.worst(n_worst)?,
             against: self.against.map(|other| self.compared(other)),
+            dial: self.dial()?,
         })
+    }
+
+    /// Returns the evaluated runs of groups of the same weights and number of dancers, this one among them, in order of
+    /// γ; none for soloists.
+    fn dial(&self) -> anyhow::Result<Vec<DialRun>> {
+        let own = self.subject.generations.first().filter(|_| self.subject.is_of_groups);
+        let Some(own) = own else { return Ok(Vec::new()) };
+        let mut known: BTreeMap<String, f64> = BTreeMap::new();
+        self.subject.snapshot.table(GenerationRow::schema())?.rows_where(
+            |row: &GenerationRow| {
+                if row.weights == own.weights && row.count_dancers() == own.count_dancers() {
+                    known.insert(row.run.clone(), row.consistency.unwrap_or(0.0));
+                }
+                false
+            },
+        )?;
+        let mut runs = Vec::new();
+        for (run, consistency) in known {
+            let is_this = run == self.subject.run;
+            let metrics = match is_this {
+                true => shown(&self.found.metrics),
+                false => shown(&rows::metrics_of(self.store, &run)?),
+            };
+            if !metrics.is_empty() {
+                runs.push(DialRun { run, consistency, is_this, metrics });
+            }
+        }
+        runs.sort_by(|a, b| a.consistency.total_cmp(&b.consistency).then(a.run.cmp(&b.run)));
+        Ok(runs)
     }
 
     /// Compares the run with another one.
@@ -161,10 +198,12 @@ impl Page<'_> {
             failed.get(&(motions[*i].phrase_id.as_str(), motions[*i].sample)).map_or(0, Vec::len)
         };
         let score = |i: &usize| {
-            let row = self.subject.generations.get(*i);
+            let row = self.subject.generations.get(motions[*i].item);
             row.and_then(|row| row.score).unwrap_or(f64::NEG_INFINITY)
         };
-        let mut order: Vec<usize> = (0..motions.len()).collect();
+        // A group is one motion, of which the first dancer is drawn.
+        let mut order: Vec<usize> =
+            (0..motions.len()).filter(|&i| motions[i].dancer == 0).collect();
         order.sort_by(|a, b| n_failed(b).cmp(&n_failed(a)).then(score(a).total_cmp(&score(b))));
         order.into_iter().take(n).map(|i| self.card(i, &failed)).collect()
     }
@@ -177,7 +216,8 @@ impl Page<'_> {
         let looked_at = &self.subject.motions[i];
         let phrase_id = looked_at.phrase_id.as_str();
         let motion = Trajectory::new(self.subject.frames(self.store, i)?)?;
-        let name = format!("{phrase_id}, sample {}", looked_at.sample);
+        let dancer = if self.subject.is_of_groups { ", dancer 0" } else { "" };
+        let name = format!("{phrase_id}, sample {}{dancer}", looked_at.sample);
         let plotted = MotionPlot {
             title: &name,
             motion: &motion,
@@ -189,7 +229,7 @@ impl Page<'_> {
         let messages = failed.get(&(phrase_id, looked_at.sample));
         let seconds = frames_to_s(motion.n_frames());
         let mut facts = vec![("length".to_owned(), format!("{seconds:.1} s"))];
-        if let Some(row) = self.subject.generations.get(i) {
+        if let Some(row) = self.subject.generations.get(looked_at.item) {
             facts.extend(row.score.map(|score| ("score".to_owned(), format!("{score:.3}"))));
             facts.push(("seed".to_owned(), (row.seed as u64).to_string()));
         }
@@ -283,7 +323,7 @@ fn paired(there: &[SongMetricRow], here: &[SongMetricRow]) -> Vec<PairedNumber> 
 }
 
 /// Returns the settings that determine the motions of a run.
-fn settings(row: &GenerationRow) -> [(&'static str, String); 7] {
+fn settings(row: &GenerationRow) -> [(&'static str, String); 9] {
     [
         ("model", row.model.clone()),
         ("weights", row.weights[..16.min(row.weights.len())].to_owned()),
@@ -292,6 +332,8 @@ fn settings(row: &GenerationRow) -> [(&'static str, String); 7] {
         ("steps", row.n_steps.to_string()),
         ("guidance", row.guidance.to_string()),
         ("eta", row.eta.map_or("–".to_owned(), |eta| eta.to_string())),
+        ("dancers", row.count_dancers().to_string()),
+        ("consistency", row.consistency.map_or("–".to_owned(), |gamma| gamma.to_string())),
     ]
 }
 

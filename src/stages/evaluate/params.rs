@@ -16,12 +16,14 @@ const OUTPUT_VERSION: u32 = 2;
 /// A verdict that may be required.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum RequiredVerdict {
-    /// All four.
+    /// All four, and of groups the fifth.
     All,
     Sound,
     LikeReal,
     FollowsMusic,
     Varied,
+    /// Of groups: do their dancers belong together, and keep apart?
+    Together,
 }
 
 impl RequiredVerdict {
@@ -33,6 +35,7 @@ impl RequiredVerdict {
             Self::LikeReal => verdict == Quality::LikeReal.name(),
             Self::FollowsMusic => verdict == Quality::FollowsMusic.name(),
             Self::Varied => verdict == Quality::Varied.name(),
+            Self::Together => verdict == Quality::Together.name(),
         }
     }
 }
@@ -47,16 +50,21 @@ pub struct Params {
     #[arg(
         long,
         value_name = "NAME",
-        required_unless_present = "motions",
-        conflicts_with = "motions"
+        required_unless_present_any = ["motions", "tokenizer"],
+        conflicts_with_all = ["motions", "tokenizer"]
     )]
     pub run: Option<String>,
     /// Motions of any program instead: a folder of files named after the store's phrases (ID.npy, ID.csv, ID.bvh,
     /// ID.parquet; of several motions ID.0.npy, ID.1.npy, …).
     #[arg(long, value_name = "DIR")]
     pub motions: Option<PathBuf>,
-    /// With --motions: the name under which tables keep what was found [default: the folder's]
-    #[arg(long, value_name = "NAME", requires = "motions", hide_short_help = RARE)]
+    /// A run of `train --family tokens` instead: its tokenizer writes motion that it did not learn from as tokens and
+    /// makes it again, which is held against what it was.
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["motions", "quick", "report", "against", "require"],
+          hide_short_help = RARE)]
+    pub tokenizer: Option<String>,
+    /// With --motions or --tokenizer: the name under which tables keep what was found [default: the folder's, the run's]
+    #[arg(long, value_name = "NAME", conflicts_with = "run", hide_short_help = RARE)]
     pub name: Option<String>,
     /// Sanity checks only: no real motion is read, and no numbers and verdicts are written.
     #[arg(long)]

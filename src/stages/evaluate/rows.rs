@@ -2,6 +2,7 @@
 
 use super::foreign::RefusedFile;
 use super::job::{EvaluationFindings, MotionStage};
+use super::subjects::Subject;
 use super::{CHECKS, Evaluate};
 use crate::evaluation::{Check, CheckSet};
 use crate::stages::Stage as _;
@@ -91,7 +92,7 @@ impl EvaluationRows {
                     protocol: number.protocol.clone(),
                     time,
                 });
-                if finding.subject != super::subjects::Subject::Generated {
+                if ![Subject::Generated, Subject::Reconstructed].contains(&finding.subject) {
                     continue;
                 }
                 let rows = number.by_song.iter().filter(|(_, value)| value.is_finite());

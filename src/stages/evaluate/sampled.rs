@@ -4,7 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use ndarray::{Array2, s};
 
-use super::baselines::{self, Baseline, MusicWindow, RunSettings};
+use super::baselines::tokens::{TokensBaseline, TokensBaselineRequest, settings_of_run};
+use super::baselines::{self, Baseline, BaselineMotion, MusicWindow, RunSettings};
 use super::evaluand::Evaluand;
 use super::job::SampledWindow;
 use super::params::Params;
@@ -12,13 +13,16 @@ use super::splits::MusicSplit;
 use super::subjects::Subject;
 use super::truth::Truth;
 use crate::evaluation::window::window_starts;
+use crate::generation::{FamilyCard as _, TokensCard};
+use crate::model::Family;
 use crate::motion::clock;
-use crate::stages::model_files::{OpenModel, default_model_cache};
+use crate::stages::model_files::{ModelFolder, OpenModel, default_model_cache};
 use crate::stages::{Progress, learned};
-use crate::store::{Location, StoreError, digest, tables};
+use crate::store::tables::{self, GenerationRow};
+use crate::store::{Location, StoreError, digest};
 
 /// Seed of the noise of baselines, so that two evaluations sample the same.
-const BASELINE_SEED: u64 = 2026;
+pub(super) const BASELINE_SEED: u64 = 2026;
 
 impl Evaluand {
     /// Samples the untrained network, and the trained one without music, for windows of the music of a split; none,
@@ -33,51 +37,37 @@ impl Evaluand {
     ) -> anyhow::Result<Option<Vec<SampledWindow>>> {
         let most = params.baseline_windows;
         let (Some(row), true) = (self.generations.first(), most > 0) else { return Ok(None) };
-        let is_there = learned::has_weights(store, &row.model, &row.weights)?;
-        if !is_there && learned::weights_now(store, &row.model)?.as_ref() == Some(&row.weights) {
-            self.notes.push(format!(
-                "Model \"{}\" is of a family whose untrained network is not sampled as a baseline.",
-                row.model
-            ));
-            return Ok(None);
-        }
-        if !is_there {
-            self.notes.push(format!(
-                "Store {store} has no model \"{}\" with the weights that the motions were made with, so that its \
-                 untrained network could not be sampled as a baseline.",
-                row.model
-            ));
-            return Ok(None);
-        }
-        let model = OpenModel::of_store(store, &row.model, &default_model_cache())?;
-        let settings = RunSettings::of_run(row, &model.card)?;
+        let row = row.clone();
+        let family = learned::family_with_weights(store, &row.model, &row.weights)?;
         let length = self.window_frames(truth);
-        let windows = self.music_windows(split, length, most)?;
-        let request = baselines::BaselineRequest {
-            store,
-            model: &model,
-            settings: &settings,
-            seed: BASELINE_SEED,
-            windows: &windows,
-            threads: params.threads,
-        };
-        let mut sampled = Vec::new();
-        for (baseline, subject) in
-            [(Baseline::Untrained, Subject::Untrained), (Baseline::NoMusic, Subject::NoMusic)]
-        {
-            let motions = baselines::sample(baseline, &request, progress)?;
-            sampled.extend(windows.iter().zip(motions).map(|(window, motion)| SampledWindow {
-                subject,
-                phrase_id: window.phrase_id.clone(),
-                first_frame: window.first_frame,
-                frames: motion.frames,
-            }));
+        match family {
+            Some(Family::Unet) => {
+                let windows = self.music_windows(split, length, most)?;
+                of_unet(store, params, &row, &windows, progress).map(Some)
+            }
+            Some(Family::Tokens) => {
+                let windows = self.music_windows(split, length, most)?;
+                of_tokens(store, params, &row, &windows, progress).map(Some)
+            }
+            Some(Family::Group) => {
+                self.notes.push(format!(
+                    "Model \"{}\" is of a family whose untrained network is not sampled as a baseline.",
+                    row.model
+                ));
+                Ok(None)
+            }
+            None => {
+                self.notes.push(format!(
+                    "Store {store} has no model \"{}\" with the weights that the motions were made with, so that its \
+                     untrained network could not be sampled as a baseline.",
+                    row.model
+                ));
+                Ok(None)
+            }
         }
-        Ok(Some(sampled))
     }
-
     /// Returns up to `most` windows of the music of a split, evenly among all of up to as many phrases.
-    fn music_windows(
+    pub(super) fn music_windows(
         &self,
         split: MusicSplit,
         length: usize,
@@ -119,4 +109,77 @@ impl Evaluand {
         let n = most.min(all.len());
         Ok((0..n).map(|i| all[i * all.len() / n].clone()).collect())
     }
+}
+
+/// Samples the baselines of a UNet.
+fn of_unet(
+    store: &Location,
+    params: &Params,
+    row: &GenerationRow,
+    windows: &[MusicWindow],
+    progress: &dyn Progress,
+) -> anyhow::Result<Vec<SampledWindow>> {
+    let model = OpenModel::of_store(store, &row.model, &default_model_cache())?;
+    let settings = RunSettings::of_run(row, &model.card)?;
+    let request = baselines::BaselineRequest {
+        store,
+        model: &model,
+        settings: &settings,
+        seed: BASELINE_SEED,
+        windows,
+        threads: params.threads,
+    };
+    let mut found = Vec::new();
+    for (baseline, subject) in
+        [(Baseline::Untrained, Subject::Untrained), (Baseline::NoMusic, Subject::NoMusic)]
+    {
+        let motions = baselines::sample(baseline, &request, progress)?;
+        found.extend(sampled_windows(subject, windows, motions));
+    }
+    Ok(found)
+}
+
+/// Makes the baselines of a model of tokens.
+fn of_tokens(
+    store: &Location,
+    params: &Params,
+    row: &GenerationRow,
+    windows: &[MusicWindow],
+    progress: &dyn Progress,
+) -> anyhow::Result<Vec<SampledWindow>> {
+    let files = ModelFolder::of_store(store, &row.model, &default_model_cache())?;
+    let card = TokensCard::read(files.card_bytes(), files.card_place())?;
+    let settings = settings_of_run(row, &card)?;
+    let request = TokensBaselineRequest {
+        store,
+        files: &files,
+        card: &card,
+        settings: &settings,
+        seed: BASELINE_SEED,
+        windows,
+        threads: params.threads,
+    };
+    let mut found = Vec::new();
+    for (baseline, subject) in [
+        (TokensBaseline::Untrained, Subject::Untrained),
+        (TokensBaseline::NoMusic, Subject::NoMusic),
+        (TokensBaseline::ShuffledPlan, Subject::ShuffledPlan),
+    ] {
+        let motions = baselines::tokens::sample(baseline, &request, progress)?;
+        found.extend(sampled_windows(subject, windows, motions));
+    }
+    Ok(found)
+}
+
+fn sampled_windows(
+    subject: Subject,
+    windows: &[MusicWindow],
+    motions: Vec<BaselineMotion>,
+) -> impl Iterator<Item = SampledWindow> {
+    windows.iter().zip(motions).map(move |(window, motion)| SampledWindow {
+        subject,
+        phrase_id: window.phrase_id.clone(),
+        first_frame: window.first_frame,
+        frames: motion.frames,
+    })
 }

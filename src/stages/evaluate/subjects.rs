@@ -21,7 +21,7 @@ use crate::evaluation::reference_statistics::ReferenceStatistics;
 const MAX_OTHER_SONGS: usize = 8;
 
 /// The motions or baseline that numbers were measured on.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Subject {
     Generated,
     /// The same motions with the music of other songs.
@@ -32,9 +32,18 @@ pub enum Subject {
     Untrained,
     /// Motion of the trained network, its music withheld.
     NoMusic,
+    /// Motion of a trained model of tokens, the tokens of each window in an order of chance.
+    ShuffledPlan,
+    /// Motion that a tokenizer made of the tokens of real motion.
+    Reconstructed,
     /// The library's phrase with the nearest features.
     Retrieval,
     MeanMotion,
+    /// Soloists of the same model, each sampled by itself, in the places of the dancers of a group; of motions of another
+    /// program dancers of other groups.
+    Independent,
+    /// One dancer of the group, copied to the places of all.
+    Copied,
     HeldOutTruth,
     TrainingTruth,
 }
@@ -48,8 +57,12 @@ impl Subject {
             Self::Shifted => "shifted",
             Self::Untrained => "untrained",
             Self::NoMusic => "no_music",
+            Self::ShuffledPlan => "shuffled_plan",
+            Self::Reconstructed => "reconstructed",
             Self::Retrieval => "retrieval",
             Self::MeanMotion => "mean_motion",
+            Self::Independent => "independent",
+            Self::Copied => "copied",
             Self::HeldOutTruth => "held_out_truth",
             Self::TrainingTruth => "training_truth",
         }

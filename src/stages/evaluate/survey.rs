@@ -3,9 +3,8 @@
 use std::collections::BTreeSet;
 
 use super::evaluand::Evaluand;
-use super::group::GroupEvaluand;
 use super::rows::RunIdentity;
-use super::{CHECKS, Evaluate, group, motions};
+use super::{CHECKS, Evaluate, motions};
 use crate::stages::Stage as _;
 use crate::stages::item_state::ItemState;
 use crate::store::{StoreError, StoreSnapshot};
@@ -51,18 +50,13 @@ pub fn survey(
     if !motions::has_run(snapshot, run)? {
         return Ok((ItemState::Done, refused));
     }
-    let store = snapshot.store();
-    let input_hash = if group::is_of_groups(store, run)? {
-        GroupEvaluand::read(snapshot.clone(), run)?.input_hash
-    } else {
-        match Evaluand::of_run(snapshot.clone(), run, None) {
-            Ok(subject) => subject.input_hash(&subject.phrases.truth_digest())?,
-            // Motions that are left to be made again are evaluated after that.
-            Err(_) => return Ok((ItemState::Stale, refused)),
-        }
+    let input_hash = match Evaluand::of_run(snapshot.clone(), run, None) {
+        Ok(subject) => subject.input_hash(&subject.phrases.truth_digest())?,
+        // Motions that are left to be made again are evaluated after that.
+        Err(_) => return Ok((ItemState::Stale, refused)),
     };
     let identity = RunIdentity {
-        store,
+        store: snapshot.store(),
         run,
         params_hash: &known.params_hash,
         whole_hash: &known.params_hash,

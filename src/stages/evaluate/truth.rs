@@ -2,7 +2,7 @@
 
 use std::num::NonZeroUsize;
 
-use ndarray::{Array2, ArrayView2};
+use ndarray::{Array2, ArrayView2, Axis};
 
 use crate::evaluation::baseline::mean_motion;
 use crate::evaluation::reference_statistics::ReferenceStatistics;
@@ -12,7 +12,7 @@ use crate::motion::BODY;
 use crate::stages::Progress;
 use crate::stages::retrieval::{dataset_of, index_of};
 use crate::store::{Location, StoreError, StoreSnapshot};
-use crate::training::{DatasetError, Split};
+use crate::training::{DatasetError, Ensemble, Split};
 
 /// Where the statistics of real motion are kept in a store.
 const STATISTICS: &str = "reference";
@@ -28,7 +28,7 @@ pub struct Truth {
     pub mean_motion: Array2<f32>,
 }
 
-/// A phrase with real motion.
+/// A phrase with real motion, or a dancer of one: dancers of a group stand side by side.
 pub struct TruthPhrase {
     pub id: String,
     pub split: Split,
@@ -42,14 +42,14 @@ pub struct TruthPhrase {
 /// When the store cannot be read.
 pub fn read(
     snapshot: &StoreSnapshot,
-    data_hash: &str,
+    (data_hash, ensemble): (&str, Ensemble),
     threads: NonZeroUsize,
     progress: &dyn Progress,
 ) -> anyhow::Result<Option<Truth>> {
-    let dataset = match dataset_of(snapshot, threads) {
+    let dataset = match dataset_of(snapshot, ensemble, threads) {
         Ok((dataset, left_out)) => {
             let n_groups = left_out.iter().filter(|one| one.is_for_other_models()).count();
-            if n_groups > 0 {
+            if n_groups > 0 && ensemble == Ensemble::Soloists {
                 progress.note(&format!(
                     "{n_groups} phrases of groups of dancers are left out of real motion: soloists are compared \
                      with soloists"
@@ -71,9 +71,14 @@ pub fn read(
         Err(e) => return Err(e.into()),
     };
     let mut phrases = Vec::with_capacity(dataset.phrases().len());
-    for phrase in dataset.phrases() {
-        let motion = dataset.motion(phrase, 0, phrase.n_frames)?;
-        phrases.push(TruthPhrase { id: phrase.id.to_string(), split: phrase.split, motion });
+    let is_of_groups = ensemble != Ensemble::Soloists;
+    for phrase in dataset.phrases().iter().filter(|phrase| (phrase.n_dancers > 1) == is_of_groups) {
+        let group = dataset.group(phrase, 0, phrase.n_frames)?;
+        phrases.extend(group.axis_iter(Axis(0)).map(|motion| TruthPhrase {
+            id: phrase.id.to_string(),
+            split: phrase.split,
+            motion: motion.to_owned(),
+        }));
     }
     let train = || phrases.iter().filter(|phrase| phrase.split == Split::Train);
     let too_little = "the training phrases of the store are too few or too short to compare with; two windows of 2.5 s are \
@@ -82,7 +87,8 @@ pub fn read(
         progress.note(too_little);
         return Ok(None);
     };
-    let retrieval = index_of(&dataset, length)?;
+    // Phrases of groups are no places of `phrases`, which has their dancers.
+    let retrieval = if is_of_groups { None } else { index_of(&dataset, length)? };
     let mean = mean_motion(BODY, train().map(|phrase| phrase.motion.view()), length);
     let statistics = statistics(snapshot.store(), data_hash, train(), length)?;
     let (Some(mean_motion), Some(statistics)) = (mean, statistics) else {

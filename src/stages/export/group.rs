@@ -22,6 +22,7 @@ use crate::onnx::{group_denoiser, group_score};
 use crate::stages::learned;
 use crate::stages::model_files::folder_of;
 use crate::stages::train::session::{ProgressWatch, read_phrases};
+use crate::stages::trained::{has_best, read_best};
 use crate::stages::{Progress, Stage as _, Summary};
 use crate::store::Location;
 use crate::training::{
@@ -37,8 +38,7 @@ use summary::GroupExportSummary;
 /// # Errors
 /// When the store cannot be listed.
 pub fn is_of_group(store: &Location, run: &str) -> anyhow::Result<bool> {
-    let checkpoints = Checkpoints::new(store, run, GroupLearner::STAGE);
-    Ok(!checkpoints.steps(CheckpointKind::Best)?.is_empty())
+    Ok(has_best(store, run, GroupLearner::STAGE)?)
 }
 
 /// Runs the stage.
@@ -144,15 +144,9 @@ impl TrainedGroup {
             let (run, what) = (run.to_owned(), "trained denoiser of groups");
             return Err(TrainingError::Missing { run, what, way_out });
         };
-        checkpoints.read(CheckpointKind::Best, step, |archive, place| {
-            let state: State<GroupTrainConfig> = State::of(archive, place)?;
-            let (_, list) = GroupNetworks::new(&state.config.network.group);
-            let place = place.to_owned();
-            let parameters = archive
-                .section(GROUP, list)
-                .map_err(|source| TrainingError::Weights { place, source })?;
-            Ok(Self { state, parameters, step })
-        })
+        let list = |config: &GroupTrainConfig| Ok(GroupNetworks::new(&config.network.group).1);
+        let (state, parameters) = read_best(&checkpoints, step, GROUP, list)?;
+        Ok(Self { state, parameters, step })
     }
 
     /// Returns the values of a parameter of one of the two networks.

@@ -280,14 +280,14 @@ fn record(
 mod tests {
     use super::*;
     use crate::generation::{FamilyCard as _, ModelCard};
-    use crate::stages::pretrained;
+    use crate::stages::pretrained::ShippedModel;
     use crate::store::ClientOptions;
 
     const NAMES: [&str; 2] = [file_names::UNET, file_names::DECODER];
 
     /// Files of a model that all say `version`.
     fn files(version: usize) -> ExportedFiles {
-        let card = pretrained::file(file_names::CARD).expect("the model that ships");
+        let card = ShippedModel::Soloist.file(file_names::CARD).expect("the model that ships");
         let card = ModelCard::read(&card, "card").expect("a card");
         let text = |name: &str| format!("{name} of {version}").into();
         let named = |name: &&str| {

@@ -78,23 +78,27 @@ struct PhraseBatch {
 /// When the store cannot be read or written; what was committed stays.
 pub fn run(job: &ExtractJob<'_>, target: &StoreTarget<'_>) -> anyhow::Result<ExtractTally> {
     let snapshot = StoreSnapshot::take(target.store)?;
-    let rows: Vec<PhraseRow> = snapshot.table(PhraseRow::schema())?.rows()?;
-    if rows.is_empty() {
+    // Rows of other shards are counted and dropped, so that a task's memory is that of its shard.
+    let mut table = TableCount::default();
+    let rows: Vec<PhraseRow> =
+        snapshot.table(PhraseRow::schema())?.rows_where(|row: &PhraseRow| {
+            table.add(row);
+            target.shard.takes(&row.phrase_id)
+        })?;
+    if table.n_rows == 0 {
         anyhow::bail!(
             "store {} has no phrases; run first: motiongen ingest --source … --store {}",
             target.store,
             target.store
         );
     }
-    let ledger = snapshot.ledger(Extract::NAME)?;
+    let ledger =
+        snapshot.ledger_where(Extract::NAME, |id| target.shard.takes(without_suffix(id)))?;
     let names: BTreeSet<String> = rows.iter().map(|row| row.phrase_id.clone()).collect();
-    // Constructed phrases have features of their song, without a file of their own.
-    let n_phrases = rows.iter().filter(|row| !row.is_constructed()).count() as u64;
     let listed = with_listed_beats(&snapshot, &rows)?;
-    let mut tasks = plan(rows, &listed);
-    let mut done =
-        ExtractTally { n_without: n_phrases - tasks.len() as u64, ..ExtractTally::default() };
-    tasks.retain(|task| target.shard.takes(&task.row.phrase_id));
+    let mut tasks = plan(rows, &listed, table.n_batches());
+    let n_without = (table.n_recorded - table.n_with_input) as u64;
+    let mut done = ExtractTally { n_without, ..ExtractTally::default() };
     let n_mine = tasks.len();
     let batches = BatchJob {
         store: target.store,
@@ -118,9 +122,8 @@ pub fn run(job: &ExtractJob<'_>, target: &StoreTarget<'_>) -> anyhow::Result<Ext
     let done = Mutex::new(done);
     work_off(job, target, tasks, &writer, &done)?;
     if !lock(&done).is_stopped {
-        let suffix = beside("");
         batches.forget_failures(|id| {
-            let phrase = id.strip_suffix(&suffix).unwrap_or(id);
+            let phrase = without_suffix(id);
             !names.contains(phrase) && target.shard.takes(phrase)
         })?;
     }
@@ -147,24 +150,52 @@ fn with_listed_beats(
     Ok(listed.map(|(id, _)| id).collect())
 }
 
-/// Returns the phrases that can have features, with their batches.
-fn plan(rows: Vec<PhraseRow>, listed: &BTreeSet<String>) -> Vec<PhraseTask> {
+/// What the batches depend on: the whole table, whatever the shard.
+#[derive(Default)]
+struct TableCount {
+    n_rows: usize,
+    /// Phrases that were not constructed: those have features of their song, without a file of their own.
+    n_recorded: usize,
+    /// Phrases with a file that features come from, and their length.
+    n_with_input: usize,
+    total_s: f64,
+}
+
+impl TableCount {
+    fn add(&mut self, row: &PhraseRow) {
+        self.n_rows += 1;
+        self.n_recorded += usize::from(!row.is_constructed());
+        if input_of(row).is_some() {
+            self.n_with_input += 1;
+            self.total_s += row.duration_s;
+        }
+    }
+
+    fn n_batches(&self) -> u64 {
+        let by_length = (self.total_s / MAX_BATCH_S).ceil() as u64;
+        n_batches(self.n_with_input.div_ceil(MAX_BATCH_PHRASES), by_length)
+    }
+}
+
+/// Returns the file that a phrase's features come from, and its size.
+fn input_of(row: &PhraseRow) -> Option<(Origin, &String, Option<i64>)> {
+    match (&row.audio_url, &row.features_url) {
+        (Some(url), _) => Some((Origin::Audio, url, row.audio_bytes)),
+        (None, Some(url)) => Some((Origin::FeatureFile, url, row.features_bytes)),
+        (None, None) => None,
+    }
+}
+
+/// Returns the phrases that can have features, with their batches, in the order of work.
+fn plan(rows: Vec<PhraseRow>, listed: &BTreeSet<String>, n_batches: u64) -> Vec<PhraseTask> {
     let with_input = |row: PhraseRow| {
-        let input = match (&row.audio_url, &row.features_url) {
-            (Some(url), _) => Some((Origin::Audio, url.clone(), row.audio_bytes)),
-            (None, Some(url)) => Some((Origin::FeatureFile, url.clone(), row.features_bytes)),
-            (None, None) => None,
-        };
-        let (origin, url, size_bytes) = input?;
+        let (origin, url, size_bytes) = input_of(&row)?;
+        let url = url.clone();
         let size_bytes = size_bytes.and_then(|n| u64::try_from(n).ok()).unwrap_or(0);
         let has_listed_beats = listed.contains(&row.phrase_id);
         Some(PhraseTask { batch: 0, row, origin, url, size_bytes, has_listed_beats })
     };
     let mut tasks: Vec<PhraseTask> = rows.into_iter().filter_map(with_input).collect();
-    let total_s: f64 = tasks.iter().map(|task| task.row.duration_s).sum();
-    let by_length = (total_s / MAX_BATCH_S).ceil() as u64;
-    let by_count = tasks.len().div_ceil(MAX_BATCH_PHRASES);
-    let n_batches = n_batches(by_count, by_length);
     for task in &mut tasks {
         task.batch = batch_of(&task.row.phrase_id, n_batches) as usize;
     }
@@ -203,7 +234,9 @@ pub fn survey(snapshot: &StoreSnapshot) -> Result<(Vec<(String, ItemState)>, boo
     let usual = params_hash(None);
     let params_hash = last_params_hash(&ledger, &usual, |_| true).unwrap_or_else(|| usual.clone());
     let listed = with_listed_beats(snapshot, &rows)?;
-    let tasks = plan(rows, &listed);
+    let mut table = TableCount::default();
+    rows.iter().for_each(|row| table.add(row));
+    let tasks = plan(rows, &listed, table.n_batches());
     let states = tasks.iter().map(|task| {
         let state = state(task, &ledger, &params_hash);
         (task.row.phrase_id.clone(), state)
@@ -240,6 +273,11 @@ fn as_long_as_recorded(task: &PhraseTask, extracted: ExtractedFeatures) -> Phras
 /// The name under which a phrase fails whose earlier rows stay.
 fn beside(id: &str) -> String {
     format!("{id} @ {}", Extract::NAME)
+}
+
+/// Returns the phrase of an item: the item itself, but where a phrase failed whose earlier rows stay.
+fn without_suffix(item: &str) -> &str {
+    item.strip_suffix(Extract::NAME).and_then(|id| id.strip_suffix(" @ ")).unwrap_or(item)
 }
 
 fn work_off(

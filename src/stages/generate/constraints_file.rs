@@ -1,4 +1,5 @@
-//! The file in which a user says what a motion must do.
+//! The file in which a user says what a motion must do: poses, holds and a motion to continue as TOML or JSON, or a table
+//! of way points ([`super::path_file`]).
 
 use std::fmt;
 use std::io::Read as _;
@@ -8,17 +9,15 @@ use anyhow::{Context as _, anyhow, bail, ensure};
 use ndarray::Array2;
 use serde::Deserialize;
 
+use super::path_file::{Asked, LAST_FRAME, frame_of, of_array, of_csv};
 use crate::generation::{Constraints, WantedValue, continuing, facing};
-use crate::motion::{CHANNEL_NAMES, Channel, ChannelLimits, MOTION_DIM};
-use crate::units::s_to_frames;
+use crate::motion::{CHANNEL_NAMES, Channel, ChannelLimits, MOTION_DIM, npy};
 
 /// Frames of a motion that is continued, unless the file says otherwise: half a second.
 const CONTINUED_FRAMES: usize = 15;
 
 /// Values that may be asked of a frame: of each channel four times, since what agrees may be said again.
 const MAX_ASKED: usize = 4 * MOTION_DIM;
-/// A frame behind the end of every track, after which there is another number.
-const LAST_FRAME: usize = usize::MAX / 2;
 /// Largest file that is read, in bytes.
 const MAX_FILE_BYTES: u64 = 16 << 20;
 
@@ -79,23 +78,30 @@ struct Continued {
 }
 
 /// A file that was read, with the motion that it continues.
-#[derive(Clone, PartialEq)]
+#[derive(Clone, Default, PartialEq)]
 pub struct ConstraintsRequest {
     file: ConstraintsFile,
     before: Option<(Array2<f32>, usize)>,
+    /// What a table asks for.
+    path: Asked,
 }
 
 impl fmt::Debug for ConstraintsRequest {
     /// Writes the text that the digest of a motion's settings contains. It begins with `Asked`, as in stores that were
     /// written before: another text would make their motions again.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { file, before } = self;
-        f.debug_struct("Asked").field("file", file).field("before", before).finish()
+        let Self { file, before, path } = self;
+        let mut text = f.debug_struct("Asked");
+        text.field("file", file).field("before", before);
+        if !path.is_empty() {
+            text.field("path", path);
+        }
+        text.finish()
     }
 }
 
 impl ConstraintsRequest {
-    /// Reads a file; what it says in TOML or, where its name ends in `.json`, JSON.
+    /// Reads a file: by the end of its name a table, `.csv` or `.npy`, or JSON, `.json`; TOML otherwise.
     ///
     /// # Errors
     /// One sentence that names the file and what is wrong in it.
@@ -104,17 +110,18 @@ impl ConstraintsRequest {
         motion: impl FnOnce(&Path) -> anyhow::Result<Array2<f32>>,
     ) -> anyhow::Result<Self> {
         let name = path.display();
-        let mut text = String::new();
+        let mut bytes = Vec::new();
         std::fs::File::open(path)
-            .and_then(|file| file.take(MAX_FILE_BYTES + 1).read_to_string(&mut text))
+            .and_then(|file| file.take(MAX_FILE_BYTES + 1).read_to_end(&mut bytes))
             .with_context(|| format!("while reading {name}"))?;
         ensure!(
-            text.len() as u64 <= MAX_FILE_BYTES,
+            bytes.len() as u64 <= MAX_FILE_BYTES,
             "{name}: has more than {MAX_FILE_BYTES} bytes, and is no file of constraints"
         );
-        let is_json = path.extension().is_some_and(|extension| extension == "json");
-        let asked =
-            Self::of_text(&text, is_json).with_context(|| format!("{name} has no constraints"))?;
+        let extension = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
+        let extension = extension.as_deref().unwrap_or_default();
+        let asked = Self::of_bytes(bytes, extension)
+            .with_context(|| format!("{name} has no constraints"))?;
         let before = match &asked.file.continue_from {
             Some(continued) => {
                 let frames = continued.frames.unwrap_or(CONTINUED_FRAMES);
@@ -127,12 +134,28 @@ impl ConstraintsRequest {
         Ok(Self { before, ..asked })
     }
 
+    /// Reads what a file has whose name ends in `extension`, but no motion that it continues.
+    ///
+    /// # Errors
+    /// One sentence about what is wrong in it.
+    pub fn of_bytes(bytes: Vec<u8>, extension: &str) -> anyhow::Result<Self> {
+        if extension == "npy" {
+            return Ok(Self { path: of_array(&npy::read_f64(&bytes)?)?, ..Self::default() });
+        }
+        let text = String::from_utf8(bytes)
+            .map_err(|_| anyhow!("it is not UTF-8 text; write it as text, or name it .npy"))?;
+        match extension {
+            "csv" => Ok(Self { path: of_csv(&text)?, ..Self::default() }),
+            _ => Self::of_text(&text, extension == "json"),
+        }
+    }
+
     /// Reads a text, TOML or JSON, that continues no motion.
     ///
     /// # Errors
     /// One sentence about what is wrong in it.
     pub fn of_text(text: &str, is_json: bool) -> anyhow::Result<Self> {
-        Ok(Self { file: Self::parse(text, is_json)?, before: None })
+        Ok(Self { file: Self::parse(text, is_json)?, ..Self::default() })
     }
 
     fn parse(text: &str, is_json: bool) -> anyhow::Result<ConstraintsFile> {
@@ -152,7 +175,7 @@ impl ConstraintsRequest {
     /// One sentence for what cannot be asked of a track of `n_frames`.
     pub fn of_track(&self, n_frames: usize, limits: ChannelLimits) -> anyhow::Result<Constraints> {
         let file = &self.file;
-        let mut wanted = Vec::new();
+        let mut wanted = self.path.clone();
         if let Some((before, n)) = &self.before {
             wanted.extend(continuing(before.view(), *n));
         }
@@ -196,11 +219,6 @@ fn check_asked(n_asked: usize, most: usize, n_frames: usize) -> anyhow::Result<(
          there is to say; leave out what is said again"
     );
     Ok(())
-}
-
-fn frame_of(time_s: f64) -> anyhow::Result<usize> {
-    ensure!(time_s.is_finite() && time_s >= 0.0, "{time_s} s is no time in a track; begin at 0");
-    Ok((s_to_frames(time_s).round() as usize).min(LAST_FRAME))
 }
 
 /// Adds what a pose asks of some frames.
@@ -292,7 +310,7 @@ mod tests {
         let json = r#"{"keyframe": [{"frame": 7, "position_y": 0.25}]}"#;
         let file = ConstraintsRequest::parse(json, true).expect("JSON");
         let constraints =
-            ConstraintsRequest { file, before: None }.of_track(8, ChannelLimits::Wide);
+            ConstraintsRequest { file, ..Default::default() }.of_track(8, ChannelLimits::Wide);
         assert_eq!(
             constraints.expect("constraints").errors(Array2::zeros((8, 25)).view())[0].error,
             0.25
@@ -307,6 +325,41 @@ mod tests {
         let asked = ConstraintsRequest { before: Some((before, 3)), ..asked("") };
         let constraints = asked.of_track(50, ChannelLimits::Wide).expect("constraints");
         assert_eq!(constraints.placement().z_m, 37.0);
+    }
+
+    #[test]
+    fn tables_are_constraints_like_others() {
+        let table = |text: &str| ConstraintsRequest::of_bytes(text.as_bytes().to_vec(), "csv");
+        let path = table("time_s,x,y,z\n0,0.5,0.9,-1\n1,0.25,0.9,0\n").expect("a path");
+        let constraints = path.of_track(31, ChannelLimits::Wide).expect("constraints");
+        assert_eq!((constraints.placement().x_m, constraints.placement().z_m), (0.5, -1.0));
+        assert!(format!("{path:?}").contains(", path: [(0, Value { channel: 0, value: 0.5 })"));
+        let said = |text: &str| {
+            let path = table(text).expect("a path");
+            path.of_track(31, ChannelLimits::Wide).expect_err("a mistake").to_string()
+        };
+        assert_eq!(
+            said("time_s,y\n2,0.9"),
+            "a constraint on position_y is at frame 60 (2.00 s), but the track has 31 frames (1.03 s); move it or \
+             leave it out"
+        );
+        assert_eq!(
+            said("time_s,y\n0.5,0.9\n0.51,0.8"),
+            "position_y at frame 15 must be 0.9 and 0.8 at once; keep one of the two"
+        );
+        assert!(said("time_s,y\n0.5,inf").starts_with("position_y at frame 15 is inf, allowed "));
+        assert_eq!(
+            said("frame,qw,qx,qy,qz\n3,1,1,0,0"),
+            "the orientation at frame 3 has length 1.4142; a quaternion has length 1"
+        );
+        let bytes = npy::write(&[2, 3], &[1.0, f64::NAN, 0.0, f64::NAN, 0.9, f64::NAN]);
+        let path = ConstraintsRequest::of_bytes(bytes, "npy").expect("a path");
+        let constraints = path.of_track(2, ChannelLimits::Wide).expect("constraints");
+        assert_eq!(constraints.errors(Array2::zeros((2, 25)).view()).len(), 3);
+        let broken = ConstraintsRequest::of_bytes(vec![0x93, 0x4e], "npy");
+        assert!(!broken.expect_err("no array").to_string().is_empty());
+        let broken = ConstraintsRequest::of_bytes(vec![0xff, 0xfe], "csv").expect_err("no text");
+        assert_eq!(broken.to_string(), "it is not UTF-8 text; write it as text, or name it .npy");
     }
 
     #[test]

@@ -17,16 +17,17 @@ use crate::autodiff::Parameters;
 use crate::diffusion::{SamplerConfig, Schedule};
 use crate::evaluation::{derivative_error, score};
 use crate::generation::{
-    ConsistencyForm, EngineError, FamilyCard as _, GroupCard, GroupEngine, GroupGenerator,
-    GroupTrack, ModelFileName,
+    ConsistencyForm, EngineError, FamilyCard as _, GroupCard, GroupEngine, GroupEstimator as _,
+    GroupGenerator, GroupTrack, ModelFileName,
 };
 use crate::model::{GroupNetworks, Parameter};
 use crate::motion::Channel;
-use crate::motion::group::{MAX_DANCERS, RADIUS_M, separate};
+use crate::motion::group::{MAX_DANCERS, RADIUS_M, SeparationError, separate};
 use crate::motion::postprocess::{PostProcessConfig, process};
 use crate::onnx::{Model, values_of};
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::model_folder::ModelFolder;
+use crate::stages::pretrained::ShippedModel;
 use crate::stages::train::session::check_run_name;
 use crate::stages::{Progress, Summary};
 use crate::store::tables::GenerationRow;
@@ -35,6 +36,12 @@ use crate::units::frames_to_s;
 
 /// Dancers, unless the user says otherwise.
 const DEFAULT_DANCERS: usize = 3;
+
+/// Returns the model of the program for what was asked where none is named.
+pub fn shipped_for(params: &Params) -> ShippedModel {
+    let is_of_groups = params.dancers.is_some_and(|n| n != 1) || params.consistency.is_some();
+    if is_of_groups { ShippedModel::Group } else { ShippedModel::Soloist }
+}
 
 /// Refuses what only groups know, for a model of one dancer.
 ///
@@ -55,32 +62,33 @@ pub fn refuse_for_soloists(params: &Params, model: &str) -> anyhow::Result<()> {
 /// The settings that determine a motion of a group beside its music and its sample: the column `settings` of
 /// `generations`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-struct GroupSettings {
+pub(in crate::stages) struct GroupSettings {
     /// The version of what generate writes.
-    output_version: u32,
-    n_dancers: usize,
+    pub output_version: u32,
+    pub n_dancers: usize,
     /// γ: how alike dancers move.
-    consistency: f64,
+    pub consistency: f64,
     /// What γ moves.
-    consistency_form: ConsistencyForm,
+    pub consistency_form: ConsistencyForm,
     /// s, the factor of the gradient beside γ.
-    consistency_scale: f64,
-    sampler: SamplerConfig,
+    pub consistency_scale: f64,
+    pub sampler: SamplerConfig,
     /// 1 follows the music, more exaggerates it, 0 ignores it.
-    guidance: f64,
+    pub guidance: f64,
     /// Frames that neighbouring windows share.
-    overlap_frames: usize,
-    postprocess: PostProcessConfig,
+    pub overlap_frames: usize,
+    pub postprocess: PostProcessConfig,
     /// Whether bodies are moved apart where they would touch.
-    separation: bool,
+    pub separation: bool,
     /// Whether the clock is withheld from a network that hears it.
-    no_clock: bool,
+    pub no_clock: bool,
 }
 
 impl GroupSettings {
     fn new(params: &Params, card: &GroupCard) -> anyhow::Result<Self> {
         let only_soloists = [
             ("--constraints", params.constraints.is_some()),
+            ("--control", params.control.is_some()),
             ("--prime", params.prime.is_some()),
             ("--style", !params.style.is_empty()),
             ("--stream", params.stream.is_some()),
@@ -126,6 +134,34 @@ impl GroupSettings {
         })
     }
 
+    /// Reads the settings of a row of `generations`; none of a model of another family, or of another release.
+    pub fn of_text(text: &str) -> Option<Self> {
+        serde_json::from_str(text).ok()
+    }
+
+    /// Returns γ times s.
+    pub fn gamma(&self) -> f64 {
+        self.consistency * self.consistency_scale
+    }
+
+    /// Returns what users get of a group as it was decoded, \[N, T, 25\]: each dancer post-processed, and bodies apart.
+    ///
+    /// # Errors
+    /// Motion that is not finite.
+    pub fn finished(
+        &self,
+        decoded: &Array3<f32>,
+        bars: Option<&[f64]>,
+    ) -> Result<Array3<f32>, SeparationError> {
+        let mut frames = decoded.clone();
+        for mut dancer in frames.outer_iter_mut() {
+            let mut motion: Array2<f32> = dancer.to_owned();
+            process(&self.postprocess, &mut motion, bars);
+            dancer.assign(&motion);
+        }
+        if self.separation { separate(frames.view(), RADIUS_M) } else { Ok(frames) }
+    }
+
     /// Returns the settings as JSON in the order of these fields, the same in every build.
     fn text(&self) -> String {
         serde_json::to_string(self).expect("invariant: numbers and texts become JSON")
@@ -167,7 +203,7 @@ pub fn run(
             sampler: &settings.sampler,
             schedule: &schedule,
             guidance: settings.guidance,
-            consistency: settings.consistency * settings.consistency_scale,
+            consistency: settings.gamma(),
             form: settings.consistency_form,
             normalizer: &card.normalizer,
             window_frames: card.window_frames,
@@ -194,8 +230,14 @@ pub fn run(
     Ok(Box::new(GenerateSummary { place, done, model: name, made_with, dry_run, took_s }))
 }
 
-/// Reads the weights of both networks.
-fn parameters(files: &ModelFolder, card: &GroupCard) -> anyhow::Result<Parameters<f32>> {
+/// Reads the weights of both networks of a model of groups.
+///
+/// # Errors
+/// When a file is not what the card says.
+pub(in crate::stages) fn parameters(
+    files: &ModelFolder,
+    card: &GroupCard,
+) -> anyhow::Result<Parameters<f32>> {
     let model = |name| -> anyhow::Result<(Model, String)> {
         let place = files.place_of(name);
         Ok((Model::read(files.read(name)?, None, &place)?, place))
@@ -283,16 +325,10 @@ impl GroupMaker<'_> {
             .map_err(|e| Failure::new(FailureKind::Engine, music.source, e))?;
         let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
         let decoded = concatenate(Axis(1), &views).expect("invariant: parts of one group");
-        let mut frames = decoded.clone();
-        for mut dancer in frames.outer_iter_mut() {
-            let mut motion: Array2<f32> = dancer.to_owned();
-            process(&self.settings.postprocess, &mut motion, bars);
-            dancer.assign(&motion);
-        }
-        if self.settings.separation {
-            frames = separate(frames.view(), RADIUS_M)
-                .map_err(|e| Failure::new(FailureKind::NonFinite, music.source, e))?;
-        }
+        let frames = self
+            .settings
+            .finished(&decoded, bars)
+            .map_err(|e| Failure::new(FailureKind::NonFinite, music.source, e))?;
         let seconds = started.elapsed().as_secs_f64();
         let row = self.row(music, sample, seed, (&frames, &decoded), bars, seconds);
         Ok(GeneratedMotion { frames, decoded, rows: vec![row], displacement: None, seconds })
@@ -346,6 +382,7 @@ impl GroupMaker<'_> {
             velocity_error,
             control_error_mm: None,
             control_error_deg: None,
+            constraints: None,
             generate_s,
             real_time_factor: generate_s / frames_to_s(n_frames).max(f64::MIN_POSITIVE),
             settings: Some(settings.text()),

@@ -4,6 +4,7 @@ use std::time::Instant;
 
 use ndarray::{Array2, Array3, ArrayView2, Axis, concatenate};
 
+use super::constraints_text::text_of;
 use super::music::{HeardMusic, PhraseMusic};
 use super::params::Settings;
 use crate::evaluation::{Score, derivative_error, score};
@@ -145,7 +146,9 @@ impl SoloistMaker<'_> {
         let heard = music.heard_by(&self.card.unet, self.settings.no_clock);
         let bars = heard.bars();
         let priming = self.priming(music)?;
-        let kept = constraints.as_ref().filter(|_| !self.settings.soft);
+        let settings = self.settings;
+        let is_kept = !settings.soft && !settings.uncontrolled;
+        let kept = constraints.as_ref().filter(|_| is_kept);
         let held = kept.map(|constraints| constraints.held(n_frames)).unwrap_or_default();
         let mut best: Option<Candidate> = None;
         let mut rows = Vec::with_capacity(self.settings.best_of);
@@ -186,6 +189,7 @@ impl SoloistMaker<'_> {
                 score: &score,
                 velocity_error,
                 control: worst_misses(&misses),
+                constraints: constraints.as_ref(),
                 generate_s,
             };
             rows.push(self.row(music, n_frames, &found));
@@ -240,6 +244,7 @@ impl SoloistMaker<'_> {
             seed,
             style: self.settings.style,
             constraints: constraints
+                .filter(|_| !self.settings.uncontrolled)
                 .map(|constraints| WeightedConstraints { constraints, strength }),
             primed: priming.zip(self.settings.prime.as_ref()).map(|(priming, prime)| {
                 PrimingMotion { motion: priming.motion.view(), n_left: prime.n_left }
@@ -256,7 +261,8 @@ impl SoloistMaker<'_> {
         let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
         let mut frames =
             concatenate(Axis(0), &views).unwrap_or_else(|_| Array2::zeros((0, MOTION_DIM)));
-        if let Some(constraints) = constraints.filter(|_| !self.settings.soft) {
+        let is_kept = !self.settings.soft && !self.settings.uncontrolled;
+        if let Some(constraints) = constraints.filter(|_| is_kept) {
             constraints.bend(&mut frames, 0, 1.0);
         }
         Ok(frames)
@@ -295,6 +301,7 @@ impl SoloistMaker<'_> {
             velocity_error: found.velocity_error,
             control_error_mm: found.control[0],
             control_error_deg: found.control[1],
+            constraints: found.constraints.map(text_of),
             generate_s: found.generate_s,
             real_time_factor: found.generate_s / frames_to_s(n_frames).max(f64::MIN_POSITIVE),
             settings: Some(settings.to_row().to_json()),
@@ -335,6 +342,7 @@ struct CandidateFindings<'a> {
     velocity_error: f64,
     /// Largest misses: mm, degrees.
     control: [Option<f64>; 2],
+    constraints: Option<&'a Constraints>,
     generate_s: f64,
 }
 

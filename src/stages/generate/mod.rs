@@ -1,12 +1,14 @@
 //! `generate`: music becomes motion, in the tables `generated`, `decoded` and `generations`, or in files.
 
 mod constraints_file;
+mod constraints_text;
 mod files;
 mod group;
 mod maker;
 mod music;
 mod outputs;
 mod params;
+mod path_file;
 mod receipt;
 mod report;
 mod settings;
@@ -38,11 +40,14 @@ use params::Settings;
 pub use params::{Params, SamplerName, Tracks};
 use report::{GeneratePlace, GenerateSummary};
 
+pub(in crate::stages) use constraints_text::keyframes_of;
 pub(in crate::stages) use files::listen;
+pub(in crate::stages) use group::{GroupSettings, parameters as group_parameters};
 pub(in crate::stages) use maker::{generation_id, seed_of};
 pub(in crate::stages) use params::PostProcessParams;
 pub(in crate::stages) use settings::MotionSettings;
 pub(in crate::stages) use survey::{SurveyedRun, runs, survey};
+pub(in crate::stages) use tokens::TokensSettings;
 pub(in crate::stages) use tracks::url_of;
 
 /// The stage.
@@ -210,7 +215,7 @@ fn make_all(
 /// Opens the model of a store, or in a folder.
 fn open_model(params: &Params, store: Option<&Location>) -> anyhow::Result<ModelFolder> {
     match &params.model {
-        None => ModelFolder::pretrained(),
+        None => ModelFolder::shipped(group::shipped_for(params)),
         Some(model) => ModelFolder::named(model, store, &params.engine.cache()),
     }
 }

@@ -12,7 +12,7 @@ use super::constraints_file::ConstraintsRequest;
 use super::outputs::{MotionFormat, StreamFormat};
 use super::settings::{MotionSettings, OUTPUT_VERSION};
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing, TokenSampling};
-use crate::generation::{ConsistencyForm, FamilyCard, ModelCard, OVERLAP_FRAMES};
+use crate::generation::{ConsistencyForm, Control, FamilyCard, ModelCard, OVERLAP_FRAMES};
 use crate::motion::postprocess::PostProcessConfig;
 use crate::motion::style::STYLE_DIM;
 use crate::motion::{Channel, Normalizer};
@@ -73,7 +73,8 @@ pub struct Params {
     /// Folder or bucket of the tables; its model and, without --audio, its phrases.
     #[arg(long, value_name = "URL")]
     pub store: Option<String>,
-    /// Name of a model of the store, or the folder of one [default: the model that ships with the program]
+    /// Name of a model of the store, or the folder of one [default: the model that ships with the program, `pretrained`, or
+    /// `group` where --dancers or --consistency are given]
     #[arg(long, value_name = "NAME|DIR")]
     pub model: Option<String>,
     /// Audio files to dance to, instead of the store's phrases.
@@ -194,9 +195,15 @@ pub struct Params {
     #[arg(long, value_name = "SHARE", default_value_t = TokenSampling::default().top_share,
           help_heading = "Tokens", hide_short_help = RARE)]
     pub plan_top: f64,
-    /// TOML or JSON file of poses and values that the motion must have (docs/generate.md).
+    /// Poses and values that the motion must have: a TOML or JSON file (docs/generate.md); a path or way points as CSV
+    /// (time_s or frame, x, y, z, heading_deg or a quaternion); or as .npy, [T, 3] or [T, 25], NaN where free.
     #[arg(long, value_name = "FILE", help_heading = "Control", hide_short_help = RARE)]
     pub constraints: Option<PathBuf>,
+    /// Where constraints act: on the plan of a model of the family tokens, in decoding (of the family unet, by
+    /// in-painting), on both, or nowhere, where it is only told how far motion is from them [default: both of a planner that
+    /// knows constraints, decode of other models]
+    #[arg(long, value_enum, value_name = "PATHS", help_heading = "Control", hide_short_help = RARE)]
+    pub control: Option<Control>,
     /// Share of the way to a constraint that every step of the sampling goes, 0 to 1.
     #[arg(long, value_name = "X", default_value_t = 1.0, help_heading = "Control",
           hide_short_help = RARE)]
@@ -308,6 +315,8 @@ pub struct Settings {
     pub no_clock: bool,
     pub decoder_derives: bool,
     pub phase_given: bool,
+    /// Whether constraints are only measured.
+    pub uncontrolled: bool,
 }
 
 impl Settings {
@@ -319,6 +328,13 @@ impl Settings {
         let SamplingSettings { sampler, guidance, overlap_frames } = params.sampling(card)?;
         let strength = params.checked_constraint_strength()?;
         let constraints = params.constraints_asked()?;
+        let control = params.control.unwrap_or(Control::Decode);
+        ensure!(
+            !control.plans(),
+            "--control {}: model {} is of the family unet, which plans nothing; give decode or none",
+            control.name(),
+            card.name
+        );
         Ok(Self {
             sampler,
             guidance,
@@ -334,6 +350,7 @@ impl Settings {
             no_clock: params.no_clock,
             decoder_derives: card.decoder.fusion.is_some(),
             phase_given: card.unet.clock && !params.no_clock,
+            uncontrolled: !control.decodes(),
         })
     }
 
@@ -385,6 +402,7 @@ impl Settings {
             no_clock: self.no_clock,
             decoder_derives: self.decoder_derives,
             phase_given: self.phase_given,
+            uncontrolled: self.uncontrolled && self.constraints.is_some(),
         }
     }
 

@@ -54,6 +54,9 @@ pub struct MotionSettings {
     /// Whether motion is sampled with the phase of its music, where that is known.
     #[serde(default, skip_serializing_if = "is_false")]
     pub phase_given: bool,
+    /// Whether constraints are measured, and nothing is done about them.
+    #[serde(default, skip_serializing_if = "is_false")]
+    pub uncontrolled: bool,
 }
 
 /// As release 0.1 wrote settings, what it did not know is left out where it says nothing new.
@@ -101,6 +104,7 @@ mod tests {
             no_clock: false,
             decoder_derives: false,
             phase_given: false,
+            uncontrolled: false,
         }
     }
 

@@ -8,6 +8,7 @@ use ndarray::{Array2, ArrayView2, Axis, concatenate};
 use serde::{Deserialize, Serialize};
 
 use super::constraints_file::ConstraintsRequest;
+use super::constraints_text::text_of;
 use super::maker::{
     GeneratedMotion, MotionMaker, StopReason, generation_id, seed_of, worst_misses,
 };
@@ -19,14 +20,15 @@ use super::{make_all, name_of_model, weights_digest_of_tokens};
 use crate::diffusion::{SamplerConfig, Schedule, TokenSampling};
 use crate::evaluation::{derivative_error, score};
 use crate::generation::{
-    FamilyCard as _, TokenGenerator, TokenTrack, TokensCard, WeightedConstraints,
+    Control, FamilyCard as _, Steering, TokenGenerator, TokenTrack, TokensCard,
+    WeightedConstraints, steer,
 };
-use crate::motion::postprocess::{PostProcessConfig, process, process_holding};
+use crate::motion::postprocess::{HeldPoses, PostProcessConfig, process, process_holding};
 use crate::motion::style::STYLE_DIM;
 use crate::motion::{Channel, MOTION_DIM};
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::model_files::{EngineChoice, EngineParams, ModelFolder};
-use crate::stages::token_model::{OpenTokens, TokenEngines};
+use crate::stages::tokens_model::{OpenTokens, TokenEngines};
 use crate::stages::train::session::check_run_name;
 use crate::stages::{Progress, Summary};
 use crate::store::tables::GenerationRow;
@@ -35,31 +37,34 @@ use crate::units::frames_to_s;
 
 /// The settings that determine a motion beside its music and its sample: the column `settings` of `generations`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-struct TokensSettings {
+pub struct TokensSettings {
     /// The version of what generate writes.
-    output_version: u32,
+    pub output_version: u32,
     /// How tokens are drawn.
-    plan: TokenSampling,
+    pub plan: TokenSampling,
     /// How motion is made of them.
-    sampler: SamplerConfig,
+    pub sampler: SamplerConfig,
     /// Of the plan: 1 follows the music, more exaggerates it, 0 ignores it.
-    guidance: f64,
+    pub guidance: f64,
     /// Style in the model's units.
-    style: Option<[f32; STYLE_DIM]>,
+    pub style: Option<[f32; STYLE_DIM]>,
     /// Frames of a window, where it is shorter than the model's.
     #[serde(skip_serializing_if = "Option::is_none")]
-    window_frames: Option<usize>,
+    pub window_frames: Option<usize>,
     /// Tokens that neighbouring windows share.
-    overlap_tokens: usize,
-    postprocess: PostProcessConfig,
+    pub overlap_tokens: usize,
+    pub postprocess: PostProcessConfig,
     /// Digest of the constraints.
-    constraints: Option<String>,
+    pub constraints: Option<String>,
     /// Length of the steps by which the decoder is steered to constraints.
-    constraint_strength: f64,
+    pub constraint_strength: f64,
     /// Whether the rest of the way to constraints is left.
-    soft: bool,
+    pub soft: bool,
     /// Whether the clock is withheld from a network that hears it.
-    no_clock: bool,
+    pub no_clock: bool,
+    /// Where constraints act; none where there are none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub control: Option<Control>,
 }
 
 impl TokensSettings {
@@ -103,6 +108,16 @@ impl TokensSettings {
             ..TokenSampling::default()
         };
         plan.check()?;
+        let knows_constraints = card.planner.constraint_dim > 0;
+        let usual = if knows_constraints { Control::Both } else { Control::Decode };
+        let control = params.control.unwrap_or(usual);
+        ensure!(
+            knows_constraints || !control.plans(),
+            "--control {}: the planner of model {} knows nothing of constraints; give decode or none, or train a planner \
+             without --no-constraints",
+            control.name(),
+            card.name
+        );
         Ok(Self {
             output_version: OUTPUT_VERSION,
             plan,
@@ -121,6 +136,7 @@ impl TokensSettings {
             constraint_strength: params.checked_constraint_strength()?,
             soft: params.soft,
             no_clock: params.no_clock,
+            control: constraints.is_some().then_some(control),
         })
     }
 
@@ -262,8 +278,9 @@ impl TokensMaker<'_> {
             Some(Ok(constraints)) => Some(constraints),
             None => None,
         };
-        let kept = constraints.as_ref().filter(|_| !self.settings.soft);
-        let held = kept.map(|constraints| constraints.held(n_frames)).unwrap_or_default();
+        let control = self.settings.control.unwrap_or(Control::None);
+        let is_kept = control.decodes() && !self.settings.soft;
+        let kept = constraints.as_ref().filter(|_| is_kept);
         let seed = seed_of(self.seed, music.phrase_id, sample, 0);
         let track = TokenTrack {
             condition: heard.condition.view(),
@@ -272,6 +289,7 @@ impl TokensMaker<'_> {
             constraints: constraints
                 .as_ref()
                 .map(|constraints| WeightedConstraints { constraints, strength }),
+            control,
             seed,
         };
         let mut parts: Vec<Array2<f32>> = Vec::new();
@@ -282,18 +300,14 @@ impl TokensMaker<'_> {
         };
         self.generator.run(&track, emit).map_err(|stop| stop.of(music.source))?;
         let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
-        let mut decoded =
+        let decoded =
             concatenate(Axis(0), &views).unwrap_or_else(|_| Array2::zeros((0, MOTION_DIM)));
-        if let Some(constraints) = kept {
-            // What blending of windows has moved.
-            constraints.bend(&mut decoded, 0, 1.0);
-        }
         let mut frames = decoded.clone();
         let postprocess = &self.settings.postprocess;
-        let displacement = process_holding(postprocess, &mut frames, bars, &held);
+        let displacement = process_holding(postprocess, &mut frames, bars, &HeldPoses::default());
         if let Some(constraints) = kept {
-            // Smoothing and limits have moved it, by millimetres; what follows from poses follows again.
-            constraints.bend(&mut frames, 0, 1.0);
+            // Only now is it smooth, and what is missing yet too; what follows from poses follows again.
+            steer(constraints, &mut frames, 0, Steering::Finish);
             process(&postprocess.without_smoothing(), &mut frames, bars);
         }
         let seconds = started.elapsed().as_secs_f64();
@@ -301,6 +315,7 @@ impl TokensMaker<'_> {
             self.row(music, (sample, seed), (&frames, &decoded), heard.phase.as_deref(), seconds);
         let misses = constraints.as_ref().map(|c| c.errors(frames.view())).unwrap_or_default();
         [row.control_error_mm, row.control_error_deg] = worst_misses(&misses);
+        row.constraints = constraints.as_ref().map(text_of);
         let [frames, decoded] = [frames, decoded].map(|motion| motion.insert_axis(Axis(0)));
         Ok(GeneratedMotion { frames, decoded, rows: vec![row], displacement, seconds })
     }
@@ -346,6 +361,7 @@ impl TokensMaker<'_> {
             velocity_error,
             control_error_mm: None,
             control_error_deg: None,
+            constraints: None,
             generate_s,
             real_time_factor: generate_s / frames_to_s(n_frames).max(f64::MIN_POSITIVE),
             settings: Some(settings.text()),

@@ -8,7 +8,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::num::NonZeroUsize;
 use std::sync::Mutex;
 
-use anyhow::{bail, ensure};
+use anyhow::bail;
 use ndarray::Array2;
 
 use super::maker::{GeneratedMotion, MotionMaker, generation_id};
@@ -251,19 +251,11 @@ impl MusicAhead {
 /// Returns the phrases that are to have motions, in the order in which they are made.
 pub fn plan(target: &TrackTarget, snapshot: &StoreSnapshot) -> anyhow::Result<Vec<TrackTask>> {
     let store = target.store;
-    let rows: Vec<PhraseRow> = snapshot.table(PhraseRow::schema())?.rows()?;
-    if rows.is_empty() {
-        bail!(
-            "store {store} has no phrases; run first: motiongen ingest --source … --store {store}"
-        );
-    }
-    for id in target.phrases {
-        ensure!(rows.iter().any(|row| row.phrase_id == *id), "store {store} has no phrase {id}");
-    }
-    let extractions: Vec<ExtractionRow> = snapshot.table(ExtractionRow::schema())?.rows()?;
-    let extracted: HashMap<&str, i64> =
-        extractions.iter().map(|row| (row.phrase_id.as_str(), row.n_frames)).collect();
-    let outdated = outdated_features(snapshot, &rows)?;
+    let mut extracted: HashMap<String, i64> = HashMap::new();
+    snapshot.table(ExtractionRow::schema())?.rows_where(|row: &ExtractionRow| {
+        extracted.insert(row.phrase_id.clone(), row.n_frames);
+        false
+    })?;
     let is_wanted = |row: &PhraseRow| {
         let is_of_kind = match target.tracks {
             Tracks::All => true,
@@ -279,21 +271,41 @@ pub fn plan(target: &TrackTarget, snapshot: &StoreSnapshot) -> anyhow::Result<Ve
         let n = extracted.get(row.phrase_id.as_str()).copied().or(own).unwrap_or(0);
         usize::try_from(n).unwrap_or(0)
     };
+    // Batches depend on the whole table. Rows of other shards are counted and dropped, so that a task's memory is
+    // that of its shard.
+    let (mut n_rows, mut n_wanted, mut total_s) = (0_usize, 0_usize, 0.0);
+    let mut unknown: BTreeSet<&str> = target.phrases.iter().map(String::as_str).collect();
+    let rows: Vec<PhraseRow> =
+        snapshot.table(PhraseRow::schema())?.rows_where(|row: &PhraseRow| {
+            n_rows += 1;
+            unknown.remove(row.phrase_id.as_str());
+            if !is_wanted(row) {
+                return false;
+            }
+            n_wanted += 1;
+            total_s += frames_to_s(n_frames(row)) * target.n_samples as f64;
+            target.shard.takes(&row.phrase_id)
+        })?;
+    if n_rows == 0 {
+        bail!(
+            "store {store} has no phrases; run first: motiongen ingest --source … --store {store}"
+        );
+    }
+    if let Some(id) = target.phrases.iter().find(|id| unknown.contains(id.as_str())) {
+        bail!("store {store} has no phrase {id}");
+    }
+    let by_length = (total_s / MAX_BATCH_S).ceil() as u64;
+    let by_count = n_wanted.div_ceil(MAX_BATCH_PHRASES);
+    let n_batches = n_batches(by_count, by_length);
+    let outdated = outdated_features(snapshot, &rows)?;
     let mut tasks: Vec<TrackTask> = rows
         .into_iter()
-        .filter(|row| is_wanted(row))
         .map(|row| {
             let (n_frames, beats) = (n_frames(&row), PhraseBeats::default());
             let has_old_features = outdated.contains(&row.phrase_id);
             TrackTask { batch: 0, n_frames, row, beats, has_old_features, samples: Vec::new() }
         })
         .collect();
-    let total_s: f64 =
-        tasks.iter().map(|task| frames_to_s(task.n_frames) * target.n_samples as f64).sum();
-    let by_length = (total_s / MAX_BATCH_S).ceil() as u64;
-    let by_count = tasks.len().div_ceil(MAX_BATCH_PHRASES);
-    let n_batches = n_batches(by_count, by_length);
-    tasks.retain(|task| target.shard.takes(&task.row.phrase_id));
     let ids: BTreeSet<&str> = tasks.iter().map(|task| task.row.phrase_id.as_str()).collect();
     let mut beats = beats::of_phrases(snapshot, |id| ids.contains(id))?;
     for task in &mut tasks {

@@ -13,7 +13,7 @@ use crate::generation::{FamilyCard as _, PlanRequest};
 use crate::model::PlannerKind;
 use crate::motion::MOTION_DIM;
 use crate::stages::model_files::{EngineParams, ModelFolder};
-use crate::stages::token_model::{OpenTokens, TokenEngines};
+use crate::stages::tokens_model::{OpenTokens, TokenEngines};
 use crate::stages::{Progress, Summary};
 
 /// Opens a model, looks through its files, plans one motion for silence, and makes it of noise.
@@ -42,6 +42,7 @@ pub fn look(
     let request = PlanRequest {
         condition: silence.view(),
         style: None,
+        constraints: None,
         given: &[],
         guidance: card.guidance(),
         seed: 0,

@@ -59,10 +59,11 @@ fn panel_help() -> String {
     let usual = |stage: TrainingStage| names(stage.usual_panels().iter().map(|p| p.name()));
     format!(
         "Panels to draw: {ALL}, or names with commas between them, of {} [default: {}; of \
-         finetune {}]",
+         finetune {}; of tokens {}]",
         TrainingPanel::known(),
         usual(TrainingStage::Diffusion),
-        usual(TrainingStage::Finetune)
+        usual(TrainingStage::Finetune),
+        usual(TrainingStage::Tokens)
     )
 }
 
@@ -139,8 +140,8 @@ fn stages(
     let known: Vec<TrainingStage> = TrainingStage::ALL.into_iter().filter(has).collect();
     ensure!(
         !known.is_empty(),
-        "{place} has no stage that can be drawn (diffusion, decoder or finetune); install a newer \
-         motiongen"
+        "{place} has no stage that can be drawn ({}); install a newer motiongen",
+        names(TrainingStage::ALL.into_iter().map(TrainingStage::name))
     );
     if let Some(missing) = wanted.iter().find(|stage| !known.contains(stage)) {
         bail!(
@@ -274,6 +275,10 @@ fn value(row: &TrainingLogRow, panel: TrainingPanel) -> Option<f64> {
         TrainingPanel::QuaternionDelta => row.quaternion_delta,
         TrainingPanel::PhaseMonotonic => row.phase_monotonic,
         TrainingPanel::PositionSmoothness => row.position_smoothness,
+        TrainingPanel::Markers => row.markers,
+        TrainingPanel::Contrast => row.contrast,
+        TrainingPanel::Commitment => row.commitment,
+        TrainingPanel::Perplexity => row.perplexity,
         TrainingPanel::GradientNorm => row.gradient_norm,
         TrainingPanel::LearningRate => row.learning_rate,
     }

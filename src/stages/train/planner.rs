@@ -103,6 +103,7 @@ fn check_numbers(config: &PlannerTrainConfig) -> anyhow::Result<()> {
         ("--condition-dropout", training.condition_dropout),
         ("--clock-dropout", training.clock_dropout),
         ("--style-dropout", training.style_dropout),
+        ("--constraint-dropout", training.constraint_dropout),
         ("--time-stretch", training.augmentation.stretch),
     ] {
         ensure!((0.0..1.0).contains(&x), "{flag} {x} is no share; give a number from 0 to below 1");

@@ -37,6 +37,20 @@ pub fn runs(store: &Location) -> Result<BTreeSet<String>, StoreError> {
     Ok(listed.iter().filter_map(|file| run(&file.path)).collect())
 }
 
+/// Returns what train trains first of a run, as checkpoints call it, and of other families than the UNet's alone; none
+/// where no such run was begun.
+///
+/// # Errors
+/// [`StoreError`] when the store cannot be read.
+pub fn first_stage(store: &Location, run: &str) -> Result<Option<&'static str>, StoreError> {
+    let Some(claim) = store.read_if_there(&claim_path(run, Train::NAME))? else { return Ok(None) };
+    let config: serde_json::Value = serde_json::from_slice(&claim).unwrap_or_default();
+    // Configurations of other families name what is trained as checkpoints do.
+    let families = [GroupLearner::STAGE, TokensLearner::STAGE, PlannerLearner::STAGE];
+    let found = families.into_iter().find(|stage| config.get(stage).is_some());
+    Ok(Some(found.unwrap_or(DiffusionLearner::STAGE)))
+}
+
 /// Returns how far the networks of a run are trained, in the order in which they are.
 ///
 /// A network that is not trained to the end is missing, whether or not it was begun; one that another learns from came
@@ -46,12 +60,9 @@ pub fn runs(store: &Location) -> Result<BTreeSet<String>, StoreError> {
 /// When a checkpoint cannot be read.
 pub fn survey(store: &Location, run: &str) -> Result<Vec<TrainedNetwork>, TrainingError> {
     let mut networks = Vec::new();
-    if let Some(claim) = store.read_if_there(&claim_path(run, Train::NAME))? {
-        let config: serde_json::Value = serde_json::from_slice(&claim).unwrap_or_default();
-        // Configurations of other families name what is trained as checkpoints do.
-        let families = [GroupLearner::STAGE, TokensLearner::STAGE, PlannerLearner::STAGE];
-        if let Some(stage) = families.into_iter().find(|stage| config.get(stage).is_some()) {
-            networks.push(network(store, run, stage)?);
+    if let Some(first) = first_stage(store, run)? {
+        if first != DiffusionLearner::STAGE {
+            networks.push(network(store, run, first)?);
         } else {
             let decoder = network(store, run, DecoderLearner::STAGE)?;
             let mut diffusion = network(store, run, DiffusionLearner::STAGE)?;

@@ -1,5 +1,6 @@
 //! What training left of a run of the family `tokens`: a tokenizer, or a planner of its tokens.
 
+use super::{has_best, read_best};
 use crate::autodiff::Parameters;
 use crate::model::{Planner, Tokenizer};
 use crate::store::Location;
@@ -29,16 +30,12 @@ impl TrainedTokenizer {
             let (run, what) = (run.to_owned(), "trained tokenizer");
             return Err(TrainingError::Missing { run, what, way_out });
         };
-        checkpoints.read(CheckpointKind::Best, step, |archive, place| {
-            let state: State<TokensTrainConfig> = State::of(archive, place)?;
-            state.config.network.check()?;
-            let (_, list) = Tokenizer::new(&state.config.network.tokens);
-            let place = place.to_owned();
-            let parameters = archive
-                .section(TOKENS, list)
-                .map_err(|source| TrainingError::Weights { place, source })?;
-            Ok(Self { state, parameters })
-        })
+        let list = |config: &TokensTrainConfig| -> Result<_, TrainingError> {
+            config.network.check()?;
+            Ok(Tokenizer::new(&config.network.tokens).1)
+        };
+        let (state, parameters) = read_best(&checkpoints, step, TOKENS, list)?;
+        Ok(Self { state, parameters })
     }
 
     /// Returns whether a run has a tokenizer.
@@ -46,8 +43,7 @@ impl TrainedTokenizer {
     /// # Errors
     /// When the store cannot be listed.
     pub fn is_of(store: &Location, run: &str) -> Result<bool, TrainingError> {
-        let checkpoints = Checkpoints::new(store, run, TokensLearner::STAGE);
-        Ok(!checkpoints.steps(CheckpointKind::Best)?.is_empty())
+        has_best(store, run, TokensLearner::STAGE)
     }
 }
 
@@ -79,16 +75,12 @@ impl TrainedPlanner {
             let (run, what) = (run.to_owned(), "trained planner");
             return Err(TrainingError::Missing { run, what, way_out });
         };
-        checkpoints.read(CheckpointKind::Best, step, |archive, place| {
-            let state: State<PlannerTrainConfig> = State::of(archive, place)?;
-            state.config.network.planner.check()?;
-            let (_, list) = Planner::new(&state.config.network.planner);
-            let place = place.to_owned();
-            let parameters = archive
-                .section(PLANNER, list)
-                .map_err(|source| TrainingError::Weights { place, source })?;
-            Ok(Self { state, parameters, step })
-        })
+        let list = |config: &PlannerTrainConfig| -> Result<_, TrainingError> {
+            config.network.planner.check()?;
+            Ok(Planner::new(&config.network.planner).1)
+        };
+        let (state, parameters) = read_best(&checkpoints, step, PLANNER, list)?;
+        Ok(Self { state, parameters, step })
     }
 
     /// Returns whether a run has a planner.
@@ -96,7 +88,6 @@ impl TrainedPlanner {
     /// # Errors
     /// When the store cannot be listed.
     pub fn is_of(store: &Location, run: &str) -> Result<bool, TrainingError> {
-        let checkpoints = Checkpoints::new(store, run, PlannerLearner::STAGE);
-        Ok(!checkpoints.steps(CheckpointKind::Best)?.is_empty())
+        has_best(store, run, PlannerLearner::STAGE)
     }
 }

@@ -153,8 +153,11 @@ class PlannerCase(Case):
         return self.network(*self.inputs.values())
 
 
-def planner_case(*, is_causal: bool) -> PlannerCase:
+def planner_case(*, is_causal: bool, constraint_dim: int = 0) -> PlannerCase:
     config = planner.PlannerConfig(is_causal=is_causal)
+    if constraint_dim:
+        # Fewer features, which keeps the file small.
+        config = replace(config, constraint_dim=constraint_dim, condition_dim=20)
     made = planner.Planner(config).double().eval()
     weights.fill(made)
     batch, frames, n_tokens = 3, 22, 6
@@ -171,6 +174,9 @@ def planner_case(*, is_causal: bool) -> PlannerCase:
         "labels": labels,
         "weights": mask if is_causal else hidden,
     }
+    if constraint_dim:
+        inputs["constraints"] = drawn("input.constraints", batch, frames, constraint_dim)
+        inputs["drop_constraints"] = torch.tensor([0.0, 0.0, 1.0]).double()
     # A step may pass the kink of a ReLU, which costs up to its length.
     return PlannerCase(made, inputs, torch.zeros(()), tolerance=1e-6)
 
@@ -219,7 +225,7 @@ def check(name: str, case: Case, gradients: dict[str, Tensor]) -> None:
 def differentiated(name: str, case: Case) -> dict[str, np.ndarray]:
     """Returns output, loss and gradients of a case, and the inputs that have no rule."""
     for key, tensor in case.inputs.items():
-        if key in ("x", "motion", "audio", "style", "z") and tensor is not None:
+        if key in ("x", "motion", "audio", "style", "constraints", "z") and tensor is not None:
             tensor.requires_grad_()
     output, loss = case.loss()
     # Before the check moves parameters.
@@ -320,6 +326,8 @@ def main() -> None:
         "tokens_halves": lambda: tokens_case(2, 7),
         "planner_masked": lambda: planner_case(is_causal=False),
         "planner_autoregressive": lambda: planner_case(is_causal=True),
+        "constrained_masked": lambda: planner_case(is_causal=False, constraint_dim=12),
+        "constrained_autoregressive": lambda: planner_case(is_causal=True, constraint_dim=12),
     }
     asked = sys.argv[1:]
     for name, make in cases.items():

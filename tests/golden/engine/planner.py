@@ -28,6 +28,7 @@ class PlannerConfig:
     depth: int = 1
     condition_dim: int = 173
     style_dim: int = 8
+    constraint_dim: int = 0
 
 
 def turned(x: Tensor) -> Tensor:
@@ -86,18 +87,26 @@ class Planner(nn.Module):
         super().__init__()
         d = config.width
         self.table = nn.Parameter(torch.empty(config.codes + (not config.is_causal), d))
-        of_music = TokensConfig(
-            width=d,
-            conv_width=config.conv_width,
-            depth=config.depth,
-            frames_per_token=config.frames_per_token,
-            motion_dim=config.condition_dim,
-        )
-        self.music = Encoder(of_music)
+
+        def encoder(inputs: int) -> Encoder:
+            return Encoder(
+                TokensConfig(
+                    width=d,
+                    conv_width=config.conv_width,
+                    depth=config.depth,
+                    frames_per_token=config.frames_per_token,
+                    motion_dim=inputs,
+                )
+            )
+
+        self.music = encoder(config.condition_dim)
         self.null_music = nn.Parameter(torch.empty(d))
         # "global" is a word of the language.
         self.add_module("global", nn.Linear(d, d))
         self.style = nn.Linear(config.style_dim, d)
+        if config.constraint_dim:
+            self.constraints = encoder(config.constraint_dim)
+            self.null_constraints = nn.Parameter(torch.empty(d))
         self.layers = nn.ModuleList(Layer(config) for _ in range(config.layers))
         self.norm = nn.LayerNorm(d)
         self.out = nn.Linear(d, config.codes)
@@ -112,17 +121,27 @@ class Planner(nn.Module):
         mask: Tensor,
         labels: Tensor,
         weights: Tensor,
+        constraints: Tensor | None = None,
+        drop_constraints: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """tokens, mask, labels, weights [B, N], audio [B, T, C], drop [B], style [B, S]: logits and their loss."""
+        """tokens, mask, labels, weights [B, N], audio [B, T, C], drop [B], style [B, S]: logits and their loss.
+
+        Of a network that takes constraints: [B, T, 12], and the windows that go without, [B].
+        """
         music = torch.where(drop[:, None, None] > 0, self.null_music, self.music(audio))
         mean = (music * mask[:, :, None]).sum(1) / mask.sum(1)[:, None]
         top = self.get_submodule("global")(mean) + self.style(style)
         rows = self.table[tokens]
+        local = music
+        if constraints is not None and drop_constraints is not None:
+            asked = self.constraints(constraints)
+            gone = drop_constraints[:, None, None] > 0
+            local = music + torch.where(gone, self.null_constraints, asked)
         if self.is_causal:
-            h = torch.cat([top[:, None], rows[:, :-1]], 1) + music
+            h = torch.cat([top[:, None], rows[:, :-1]], 1) + local
             counts = mask
         else:
-            h = torch.cat([top[:, None], rows + music], 1)
+            h = torch.cat([top[:, None], rows + local], 1)
             counts = torch.cat([torch.ones_like(mask[:, :1]), mask], 1)
         n = h.shape[1]
         allowed = (counts[:, None] > 0).expand(-1, n, -1)

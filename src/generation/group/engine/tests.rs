@@ -2,7 +2,7 @@ use ndarray::Array;
 
 use super::*;
 use crate::autodiff::Stream;
-use crate::diffusion::{BetaSchedule, DiffusionConfig};
+use crate::diffusion::{BetaSchedule, DiffusionConfig, Prediction};
 use crate::model::Preset;
 use crate::motion::MOTION_DIM;
 
@@ -28,6 +28,7 @@ fn engine() -> GroupEngine {
 }
 
 struct Case {
+    n_dancers: usize,
     x: Array3<f32>,
     audio: Array3<f32>,
     z: Vec<f32>,
@@ -35,6 +36,10 @@ struct Case {
 
 impl Case {
     fn new() -> Self {
+        Self::of(N_DANCERS)
+    }
+
+    fn of(n_dancers: usize) -> Self {
         let config = config();
         let mut drawn = 0;
         let mut normal = |shape: (usize, usize, usize)| {
@@ -44,10 +49,10 @@ impl Case {
             Stream::new(11, drawn).normal(0, values_mut);
             values
         };
-        let x = normal((N_GROUPS * N_DANCERS, N_FRAMES, MOTION_DIM));
+        let x = normal((N_GROUPS * n_dancers, N_FRAMES, MOTION_DIM));
         let audio = normal((N_GROUPS, N_FRAMES, config.condition().dim()));
         let z = normal((1, 1, config.width)).into_raw_vec_and_offset().0;
-        Self { x, audio, z }
+        Self { n_dancers, x, audio, z }
     }
 
     fn inputs<'a>(
@@ -56,7 +61,7 @@ impl Case {
         consistency: (ConsistencyForm, f64),
     ) -> GroupEngineInputs<'a> {
         let (audio, z) = (self.audio.view(), &self.z[..]);
-        let (t, n_dancers, guidance) = (400, N_DANCERS, 1.0);
+        let (t, n_dancers, guidance) = (400, self.n_dancers, 1.0);
         GroupEngineInputs { x: x.view(), t, audio, n_dancers, z, guidance, consistency }
     }
 }
@@ -183,6 +188,7 @@ fn groups_of_a_call_do_not_move_each_other() {
     let form = (ConsistencyForm::Estimate, 1.0);
     let both = engine.predict(&case.inputs(&case.x, form)).expect("shapes fit");
     let second = Case {
+        n_dancers: N_DANCERS,
         x: case.x.slice(ndarray::s![N_DANCERS.., .., ..]).to_owned(),
         audio: case.audio.slice(ndarray::s![1.., .., ..]).to_owned(),
         z: case.z.clone(),
@@ -192,4 +198,79 @@ fn groups_of_a_call_do_not_move_each_other() {
         .iter()
         .fold(0.0_f32, |worst, d| worst.max(d.abs()));
     assert!(worst < 1e-5, "{worst}");
+}
+
+/// Of one dancer there is no agreement with others: γ moves along the whole of log f, which tells the phrase.
+#[test]
+fn a_soloist_moves_along_log_f() {
+    let (engine, case) = (engine(), Case::of(1));
+    let form = ConsistencyForm::Estimate;
+    let x0 = engine.predict(&case.inputs(&case.x, (form, 0.0))).expect("shapes fit");
+    let moved = engine.predict(&case.inputs(&case.x, (form, 1.0))).expect("shapes fit");
+    assert_is_gradient(&(moved - &x0), 1.0, &x0, |x0| {
+        let scores = engine.score(&case.inputs(x0, (form, 0.0))).expect("shapes fit");
+        scores.iter().map(|score| f64::from(score.log_ratio)).sum()
+    });
+}
+
+/// A whole sampling with γ ends where what γ moves along is greater, and with -γ where it is less: of a soloist log f,
+/// how well the dance fits its phrase; of a group the agreement of its dancers.
+#[test]
+fn sampling_ends_farther_along_the_score_the_greater_gamma_is() {
+    use crate::diffusion::{SamplerConfig, Schedule};
+    use crate::generation::{GroupGenerator, GroupTrack};
+    use crate::motion::Normalizer;
+
+    let (engine, normalizer) = (engine(), Normalizer::identity());
+    let diffusion = DiffusionConfig {
+        n_steps: config().n_steps,
+        prediction: Prediction::Sample,
+        clip_range: None,
+        ..Default::default()
+    };
+    let schedule = Schedule::new(&diffusion).expect("a schedule");
+    let case = Case::of(1);
+    let sampler = SamplerConfig { n_steps: 6, clip: false, ..SamplerConfig::default() };
+    for n_dancers in [1, 3] {
+        for seed in 0..4 {
+            let along = |gamma: f64| {
+                let generator = GroupGenerator {
+                    engine: &engine,
+                    sampler: &sampler,
+                    schedule: &schedule,
+                    guidance: 1.0,
+                    consistency: gamma,
+                    form: ConsistencyForm::Direction,
+                    normalizer: &normalizer,
+                    window_frames: N_FRAMES,
+                    overlap_frames: 2,
+                };
+                let condition = case.audio.index_axis(ndarray::Axis(0), 0);
+                let track = GroupTrack { condition, phase: None, seed, n_dancers };
+                let mut found = None;
+                let emit = |part| -> Result<(), EngineError> {
+                    found = Some(part);
+                    Ok(())
+                };
+                generator.run(&track, emit).expect("a dance");
+                let found: Array3<f32> = found.expect("one window");
+                // The embedding that it was sampled with.
+                let mut z = vec![0.0; engine.embedding_dim()];
+                Stream::new(seed, u64::MAX).normal(0, &mut z);
+                let inputs = GroupEngineInputs {
+                    x: found.view(),
+                    t: 0,
+                    audio: case.audio.slice(ndarray::s![..1, .., ..]),
+                    n_dancers,
+                    z: &z,
+                    guidance: 1.0,
+                    consistency: (ConsistencyForm::Direction, 0.0),
+                };
+                let score = engine.score(&inputs).expect("shapes fit")[0].clone();
+                if n_dancers == 1 { score.log_ratio } else { score.agreement }
+            };
+            let [low, middle, high] = [-1.0, 0.0, 1.0].map(along);
+            assert!(low < middle && middle < high, "{n_dancers}, {seed}: {low} {middle} {high}");
+        }
+    }
 }

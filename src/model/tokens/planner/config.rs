@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::constraint::CONSTRAINT_DIM;
 use crate::audio::FEATURE_DIM;
 use crate::model::condition::ConditionConfig;
 use crate::model::tokens::TokensConfig;
@@ -55,7 +56,16 @@ pub struct PlannerConfig {
     pub clock: bool,
     /// Numbers of a style that is given as a condition; 0 for a network without.
     pub style_dim: usize,
+    /// Channels of what is asked of a frame, [`CONSTRAINT_DIM`]; 0 for a network that knows nothing of constraints, as
+    /// those of release 0.2.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub constraint_dim: usize,
     pub dropout: f64,
+}
+
+/// Sizes of release 0.2 are written as they were.
+fn is_zero(n: &usize) -> bool {
+    *n == 0
 }
 
 impl PlannerConfig {
@@ -83,6 +93,7 @@ impl PlannerConfig {
             audio_cond_dim: FEATURE_DIM,
             clock: true,
             style_dim: 0,
+            constraint_dim: CONSTRAINT_DIM,
             dropout: 0.1,
         })
     }
@@ -117,8 +128,17 @@ impl PlannerConfig {
 
     /// Returns the convolutions that bring the music to the positions of tokens.
     pub(super) fn music(&self) -> EncoderConfig {
+        self.encoder(self.condition().dim())
+    }
+
+    /// Returns the convolutions that bring constraints there, of a network that takes them.
+    pub(super) fn constraints(&self) -> Option<EncoderConfig> {
+        (self.constraint_dim > 0).then(|| self.encoder(self.constraint_dim))
+    }
+
+    fn encoder(&self, inputs: usize) -> EncoderConfig {
         EncoderConfig {
-            inputs: self.condition().dim(),
+            inputs,
             outputs: self.width,
             conv_width: self.conv_width,
             depth: self.depth,
@@ -142,6 +162,7 @@ impl PlannerConfig {
             ("depth", self.depth, 1, MAX_DEPTH),
             ("audio_cond_dim", self.audio_cond_dim, 1, MAX_WIDTH),
             ("style_dim", self.style_dim, 0, MAX_WIDTH),
+            ("constraint_dim", self.constraint_dim, 0, MAX_WIDTH),
         ] {
             if value < least {
                 return refuse(format!("{name} is {value}; it must be at least {least}"));
@@ -251,6 +272,16 @@ mod tests {
              of the two"
         );
         assert_eq!(refusal(|c| c.dropout = 1.0), "dropout is 1; it must lie in [0, 1)");
+    }
+
+    #[test]
+    fn sizes_of_release_0_2_are_read_and_written_as_they_were() {
+        let text = r#"{"kind":"masked","codes":32,"frames_per_token":4,"width":48,"heads":4,"expansion":4,"layers":2,"conv_width":32,"depth":1,"audio_cond_dim":163,"clock":true,"style_dim":0,"dropout":0.1}"#;
+        let read: PlannerConfig = serde_json::from_str(text).expect("sizes of 0.2");
+        assert_eq!(read, PlannerConfig { constraint_dim: 0, ..tiny() });
+        assert_eq!(serde_json::to_string(&read).expect("JSON"), text);
+        let own = serde_json::to_string(&tiny()).expect("JSON");
+        assert_eq!(serde_json::from_str::<PlannerConfig>(&own).expect("JSON"), tiny());
     }
 
     #[test]

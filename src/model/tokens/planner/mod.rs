@@ -5,14 +5,18 @@
 //! every position sees all others, and says what stands behind \[MASK\] (Guo et al., "MoMask", CVPR 2024); of the
 //! autoregressive kind it sees those before it, and says which token comes next (Zhang et al., "T2M-GPT", CVPR 2023).
 //!
+//! What is asked of the motion comes to the same positions through an encoder of its own, and is added to the music.
+//!
 //! The paper adds a learned vector to each position. Here queries and keys are turned by it (RoFormer), so that no
 //! number of positions is the last.
 
 mod config;
+mod constraint;
 mod layer;
 mod step;
 
 pub use self::config::{PlannerConfig, PlannerKind};
+pub use self::constraint::{AskedPose, CONSTRAINT_DIM};
 pub use self::layer::KeysAndValues;
 use self::layer::PlannerLayer;
 pub use self::step::{PlanConditions, PlannerStep, PlannerStepInputs};
@@ -33,9 +37,17 @@ pub struct Planner {
     null_music: ParameterId,
     global: Linear,
     style: Option<Linear>,
+    constraints: Option<ConstraintEncoder>,
     layers: Vec<PlannerLayer>,
     norm: LayerNorm,
     out: Linear,
+}
+
+/// E_c: what is asked of frames to the positions of tokens, and what stands there where nothing is asked.
+#[derive(Clone, Debug)]
+struct ConstraintEncoder {
+    encoder: Encoder,
+    null: ParameterId,
 }
 
 /// The inputs of a planner: B windows of N tokens, T frames.
@@ -49,7 +61,22 @@ pub struct PlannerInputs<'a, T> {
     pub drop_audio: Option<&'a T>,
     /// Style of each window, \[B, style_dim\], of a network that takes one.
     pub style: Option<&'a T>,
+    /// What is asked of the motion, \[B, T, 12\] ([`AskedPose::channels`]), of a network that takes it; nothing where
+    /// absent.
+    pub constraints: Option<&'a T>,
+    /// Windows that go without constraints, \[B\], 1 where the learned null takes their place.
+    pub drop_constraints: Option<&'a T>,
     /// Tokens that count, \[B, N\], 1 or 0; all where absent.
+    pub mask: Option<&'a T>,
+}
+
+/// What a planner is told of B windows beside their tokens; see [`PlannerInputs`].
+pub struct ConditionInputs<'a, T> {
+    pub audio: &'a T,
+    pub drop_audio: Option<&'a T>,
+    pub style: Option<&'a T>,
+    pub constraints: Option<&'a T>,
+    pub drop_constraints: Option<&'a T>,
     pub mask: Option<&'a T>,
 }
 
@@ -72,6 +99,10 @@ impl Planner {
             global: Linear::new(&mut root.at("global"), d, d),
             style: (config.style_dim > 0)
                 .then(|| Linear::new(&mut root.at("style"), config.style_dim, d)),
+            constraints: config.constraints().map(|sizes| ConstraintEncoder {
+                encoder: Encoder::within(&mut root.at("constraints"), &sizes),
+                null: root.parameter("null_constraints", &[d], Init::Zeros, Role::Vector),
+            }),
             layers: (0..config.layers)
                 .map(|i| PlannerLayer::new(&mut root.at(format!("layers.{i}")), config))
                 .collect(),
@@ -83,8 +114,9 @@ impl Planner {
 
     /// ln p(z_n | what position n sees) up to a constant, for each token of each position.
     ///
-    /// m = E(music), g = W ⟨m⟩ + b + W_s style, e the table of tokens. Of the masked kind the positions are
-    /// \[g; e_1 + m_1; …; e_N + m_N\], of the other \[g + m_1; e_1 + m_2; …; e_{N−1} + m_N\] (paper, section 3.2).
+    /// m = E(music), g = W ⟨m⟩ + b + W_s style, l = m + E_c(constraints), e the table of tokens. Of the masked kind the
+    /// positions are \[g; e_1 + l_1; …; e_N + l_N\], of the other \[g + l_1; e_1 + l_2; …; e_{N−1} + l_N\] (paper,
+    /// section 3.3).
     ///
     /// # Shapes
     /// See [`PlannerInputs`]; returns \[B, N, K\].
@@ -93,9 +125,12 @@ impl Planner {
         g: &mut G,
         inputs: &PlannerInputs<G::Tensor>,
     ) -> Result<G::Tensor> {
-        let PlannerInputs { audio, drop_audio, style, mask, .. } = *inputs;
-        let conditions = self.conditions(g, audio, drop_audio, style, mask)?;
-        self.forward_under(g, inputs.tokens, &conditions, mask)
+        let PlannerInputs { tokens, audio, drop_audio, style, constraints, drop_constraints, mask } =
+            *inputs;
+        let heard =
+            ConditionInputs { audio, drop_audio, style, constraints, drop_constraints, mask };
+        let conditions = self.conditions(g, &heard)?;
+        self.forward_under(g, tokens, &conditions, mask)
     }
 
     /// [`Planner::forward`] of windows whose conditions are known, [`Planner::conditions`].
@@ -106,11 +141,11 @@ impl Planner {
         conditions: &PlanConditions<G::Tensor>,
         mask: Option<&G::Tensor>,
     ) -> Result<G::Tensor> {
-        let PlanConditions { local: music, global } = conditions;
+        let PlanConditions { local, global } = conditions;
         let tokens = g.embedding(self.table, tokens)?;
         let h = match self.kind {
             PlannerKind::Masked => {
-                let tokens = g.add(&tokens, music)?;
+                let tokens = g.add(&tokens, local)?;
                 let h = g.concat_frames(&[global, &tokens])?;
                 let mask = mask.map(|mask| g.token_mask(mask, 1)).transpose()?;
                 let h = self.transformed(g, h, mask.as_ref())?;
@@ -118,8 +153,8 @@ impl Planner {
             }
             PlannerKind::Autoregressive => {
                 let before = g.concat_frames(&[global, &tokens])?;
-                let before = g.crop_frames(&before, music)?;
-                let h = g.add(&before, music)?;
+                let before = g.crop_frames(&before, local)?;
+                let h = g.add(&before, local)?;
                 self.transformed(g, h, mask)?
             }
         };
@@ -127,30 +162,45 @@ impl Planner {
         self.out.forward(g, &h)
     }
 
-    /// Returns what the positions of windows hear, m and g of [`Planner::forward`].
+    /// Returns what the positions of windows are told, l and g of [`Planner::forward`].
     ///
     /// # Shapes
     /// See [`PlannerInputs`].
     pub fn conditions<G: Graph>(
         &self,
         g: &mut G,
-        audio: &G::Tensor,
-        drop_audio: Option<&G::Tensor>,
-        style: Option<&G::Tensor>,
-        mask: Option<&G::Tensor>,
+        inputs: &ConditionInputs<G::Tensor>,
     ) -> Result<PlanConditions<G::Tensor>> {
-        let mut music = self.music.forward(g, audio)?;
-        if let Some(drop_audio) = drop_audio {
+        let mut music = self.music.forward(g, inputs.audio)?;
+        if let Some(drop_audio) = inputs.drop_audio {
             let null = g.parameter(self.null_music)?;
             music = g.select(drop_audio, &null, &music)?;
         }
-        let mean = g.mean_frames(&music, mask)?;
+        let mean = g.mean_frames(&music, inputs.mask)?;
         let mut global = self.global.forward(g, &mean)?;
-        if let (Some(layer), Some(style)) = (&self.style, style) {
+        if let (Some(layer), Some(style)) = (&self.style, inputs.style) {
             let style = layer.forward(g, style)?;
             global = g.add(&global, &style)?;
         }
-        Ok(PlanConditions { local: music, global })
+        let local = self.with_constraints(g, music, inputs)?;
+        Ok(PlanConditions { local, global })
+    }
+
+    /// m + E_c(constraints), of a network that takes them. → \[B, N, d\]
+    fn with_constraints<G: Graph>(
+        &self,
+        g: &mut G,
+        music: G::Tensor,
+        inputs: &ConditionInputs<G::Tensor>,
+    ) -> Result<G::Tensor> {
+        let Some(ConstraintEncoder { encoder, null }) = &self.constraints else { return Ok(music) };
+        let null = g.parameter(*null)?;
+        let Some(constraints) = inputs.constraints else { return g.add(&music, &null) };
+        let mut asked = encoder.forward(g, constraints)?;
+        if let Some(drop) = inputs.drop_constraints {
+            asked = g.select(drop, &null, &asked)?;
+        }
+        g.add(&music, &asked)
     }
 
     fn transformed<G: Graph>(

@@ -8,7 +8,7 @@ use crate::model::graph::{Graph, Result};
 /// What the positions of a window hear beside its tokens.
 #[derive(Clone, Debug)]
 pub struct PlanConditions<T> {
-    /// The music at each token, \[B, N, d\].
+    /// The music and what is asked at each token, \[B, N, d\].
     pub local: T,
     /// That of the window as a whole, \[B, d\].
     pub global: T,

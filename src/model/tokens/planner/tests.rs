@@ -21,11 +21,14 @@ fn shapes_are_followed_at_every_rate_and_every_parameter_is_met() {
             let tokens = g.input(&[batch, n_tokens]);
             let audio = g.input(&[batch, frames, config.condition().dim()]);
             let (drop_audio, style) = (g.input(&[batch]), g.input(&[batch, 8]));
+            let constraints = g.input(&[batch, frames, CONSTRAINT_DIM]);
             let inputs = PlannerInputs {
                 tokens: &tokens,
                 audio: &audio,
                 drop_audio: Some(&drop_audio),
                 style: Some(&style),
+                constraints: Some(&constraints),
+                drop_constraints: Some(&drop_audio),
                 mask: Some(&tokens),
             };
             let logits = planner.forward(&mut g, &inputs).expect("shapes fit");
@@ -33,6 +36,22 @@ fn shapes_are_followed_at_every_rate_and_every_parameter_is_met() {
             let met: usize = g.layers().iter().map(|layer| layer.n_parameters).sum();
             assert_eq!(met, list.n_elements(), "ρ = {frames_per_token}");
         }
+    }
+}
+
+#[test]
+fn a_network_without_constraints_is_that_of_release_0_2() {
+    for kind in [PlannerKind::Masked, PlannerKind::Autoregressive] {
+        let own = config(kind, 4, 8);
+        let names = |config: &PlannerConfig| -> Vec<String> {
+            let (_, list) = Planner::new(config);
+            list.iter().map(|(_, parameter)| parameter.name.clone()).collect()
+        };
+        let without = names(&PlannerConfig { constraint_dim: 0, ..own.clone() });
+        let rest: Vec<_> =
+            names(&own).into_iter().filter(|name| !name.contains("constraints")).collect();
+        assert_eq!(without, rest);
+        assert_ne!(names(&own), rest);
     }
 }
 
@@ -57,11 +76,26 @@ fn flops_of_a_plan(n_tokens: usize) -> [u64; 2] {
     let mut whole = Outline::new(&list);
     let tokens = whole.input(&[batch, n_tokens]);
     let audio = whole.input(&[batch, frames, config.condition().dim()]);
-    let inputs =
-        PlannerInputs { tokens: &tokens, audio: &audio, drop_audio: None, style: None, mask: None };
+    let inputs = PlannerInputs {
+        tokens: &tokens,
+        audio: &audio,
+        drop_audio: None,
+        style: None,
+        constraints: None,
+        drop_constraints: None,
+        mask: None,
+    };
     planner.forward(&mut whole, &inputs).expect("shapes fit");
     let mut steps = Outline::new(&list);
-    let conditions = planner.conditions(&mut steps, &audio, None, None, None).expect("shapes fit");
+    let heard = ConditionInputs {
+        audio: &audio,
+        drop_audio: None,
+        style: None,
+        constraints: None,
+        drop_constraints: None,
+        mask: None,
+    };
+    let conditions = planner.conditions(&mut steps, &heard).expect("shapes fit");
     let mut past: Option<Vec<KeysAndValues<Vec<usize>>>> = None;
     for n in 1..=n_tokens {
         let tokens = steps.input(&[batch, n]);

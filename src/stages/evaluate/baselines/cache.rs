@@ -42,7 +42,27 @@ struct BaselineKey<'a> {
 
 /// Phrase, first frame, and digests of features, phase and clock.
 #[derive(Serialize)]
-struct BaselineKeyWindow<'a>(&'a str, usize, String, Option<String>, Option<String>);
+pub struct BaselineKeyWindow<'a>(&'a str, usize, String, Option<String>, Option<String>);
+
+/// Returns what determines the music of windows, for a network that hears the clock or does not.
+pub fn key_windows(windows: &[MusicWindow], hears_clock: bool) -> Vec<BaselineKeyWindow<'_>> {
+    fn digest_of_values<const N: usize>(bytes: impl Iterator<Item = [u8; N]>) -> String {
+        digest(&bytes.flatten().collect::<Vec<u8>>())
+    }
+    let key = |window: &'_ MusicWindow| {
+        let features = digest_of_values(window.features.iter().map(|x| x.to_le_bytes()));
+        let phase = window.phase.as_ref();
+        let phase = phase.map(|phase| digest_of_values(phase.iter().map(|x| x.to_le_bytes())));
+        let clock = window.clock.as_ref().filter(|_| hears_clock);
+        let clock = clock.map(|clock| digest_of_values(clock.iter().map(|x| x.to_le_bytes())));
+        (window.first_frame, features, phase, clock)
+    };
+    let keys = windows.iter().map(|window| {
+        let (first, features, phase, clock) = key(window);
+        BaselineKeyWindow(&window.phrase_id, first, features, phase, clock)
+    });
+    keys.collect()
+}
 
 /// Returns the digest of a baseline.
 pub fn digest_of(
@@ -51,17 +71,6 @@ pub fn digest_of(
     settings: &MotionSettings,
 ) -> String {
     let card = &request.model.card;
-    let window = |window: &'_ MusicWindow| {
-        let features: Vec<u8> = window.features.iter().flat_map(|x| x.to_le_bytes()).collect();
-        let phase = window
-            .phase
-            .as_ref()
-            .map(|phase| digest(&phase.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>()));
-        let clock = window.clock.as_ref().filter(|_| card.unet.clock);
-        let clock = clock
-            .map(|clock| digest(&clock.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>()));
-        (window.first_frame, digest(&features), phase, clock)
-    };
     let digested = BaselineKey {
         version: VERSION,
         baseline: baseline.name(),
@@ -74,14 +83,7 @@ pub fn digest_of(
         feature_scale: &card.feature_scale,
         settings,
         seed: request.seed,
-        windows: request
-            .windows
-            .iter()
-            .map(|w| {
-                let (first, features, phase, clock) = window(w);
-                BaselineKeyWindow(&w.phrase_id, first, features, phase, clock)
-            })
-            .collect(),
+        windows: key_windows(request.windows, card.unet.clock),
     };
     let text = serde_json::to_vec(&digested).expect("invariant: numbers and texts become JSON");
     digest(&text)

@@ -150,6 +150,7 @@ fn row(settings: Option<String>) -> GenerationRow {
         velocity_error: 0.0,
         control_error_mm: None,
         control_error_deg: None,
+        constraints: None,
         generate_s: 0.0,
         real_time_factor: 0.0,
         settings,

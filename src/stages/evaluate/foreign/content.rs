@@ -2,9 +2,10 @@
 
 use std::path::Path;
 
-use ndarray::{Array2, ArrayView2, s};
+use ndarray::{Array2, Array3, ArrayView2, s};
 
 use super::FileContent;
+use crate::motion::group::MAX_DANCERS;
 use crate::motion::kinematics::frames_of;
 use crate::motion::npy::{self, NpyError};
 use crate::motion::quaternion::{Quaternion, make_sign_continuous, normalize};
@@ -42,15 +43,15 @@ impl ForeignFormat {
     }
 }
 
-/// Reads a motion, `[T, 25]`, T ≥ 1, and what it came from.
+/// Reads a motion, `[T, 25]` of each dancer, T ≥ 1, one dancer or more, and what it came from.
 ///
 /// # Errors
 /// One sentence that names the file.
-pub fn read(path: &Path) -> Result<(Array2<f32>, FileContent), Failure> {
+pub fn read(path: &Path) -> Result<(Vec<Array2<f32>>, FileContent), Failure> {
     let place = path.display().to_string();
     let bytes = bytes_of(path, &place)?;
     let (frames, content) = match ForeignFormat::of(path) {
-        Some(ForeignFormat::Npy) => of_npy(&place, &bytes)?,
+        Some(ForeignFormat::Npy) => return of_npy(&place, &bytes),
         Some(ForeignFormat::Csv) => (of_csv(&place, bytes)?, FileContent::Channels),
         Some(ForeignFormat::Bvh) => {
             (read_bvh(&place, &bytes, None, None)?.trajectory.into_array(), FileContent::Capture)
@@ -66,7 +67,7 @@ pub fn read(path: &Path) -> Result<(Array2<f32>, FileContent), Failure> {
         let message = format!("{place}: has no frames; write it again");
         return Err(Failure::new(FailureKind::Shape, &place, message));
     }
-    Ok((frames, content))
+    Ok((vec![frames], content))
 }
 
 fn bytes_of(path: &Path, place: &str) -> Result<Vec<u8>, Failure> {
@@ -95,18 +96,27 @@ fn bytes_of(path: &Path, place: &str) -> Result<Vec<u8>, Failure> {
     Ok(bytes)
 }
 
-fn of_npy(place: &str, bytes: &[u8]) -> Result<(Array2<f32>, FileContent), Failure> {
+fn of_npy(place: &str, bytes: &[u8]) -> Result<(Vec<Array2<f32>>, FileContent), Failure> {
     let array = npy::read_f32(bytes).map_err(|e: NpyError| Failure::of(place, e.kind(), &e))?;
     let refused = || {
         let is_turned = matches!(array.shape[..], [MOTION_DIM | POSE_DIM, n] if n > 0);
         let hint = if is_turned { "; transpose it" } else { "" };
         let message = format!(
             "{place}: has shape {:?}, expected [frames, {MOTION_DIM}], or [frames, {POSE_DIM}] of position \
-             and quaternion (w, x, y, z){hint}",
+             and quaternion (w, x, y, z), or [dancers, frames, {MOTION_DIM}] of a group of 2 to \
+             {MAX_DANCERS}{hint}",
             array.shape
         );
         Failure::new(FailureKind::Shape, place, message)
     };
+    if let [n_dancers @ 2..=MAX_DANCERS, n_frames, MOTION_DIM] = array.shape[..]
+        && n_frames > 0
+    {
+        let group = Array3::from_shape_vec((n_dancers, n_frames, MOTION_DIM), array.values)
+            .map_err(|e| Failure::new(FailureKind::Shape, place, format!("{place}: {e}")))?;
+        let dancers = group.outer_iter().map(|dancer| dancer.to_owned()).collect();
+        return Ok((dancers, FileContent::Channels));
+    }
     let &[n_frames, n_channels] = array.shape.as_slice() else { return Err(refused()) };
     if n_frames == 0 || ![MOTION_DIM, POSE_DIM].contains(&n_channels) {
         return Err(refused());
@@ -114,8 +124,8 @@ fn of_npy(place: &str, bytes: &[u8]) -> Result<(Array2<f32>, FileContent), Failu
     let values = Array2::from_shape_vec((n_frames, n_channels), array.values)
         .map_err(|e| Failure::new(FailureKind::Shape, place, format!("{place}: {e}")))?;
     Ok(match n_channels {
-        MOTION_DIM => (values, FileContent::Channels),
-        _ => (of_poses(values.view()), FileContent::Poses),
+        MOTION_DIM => (vec![values], FileContent::Channels),
+        _ => (vec![of_poses(values.view())], FileContent::Poses),
     })
 }
 

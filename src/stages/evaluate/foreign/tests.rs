@@ -366,7 +366,7 @@ fn bad_files_are_refused_with_what_is_wrong() {
     let shape = |shape: &str, hint: &str| {
         let message = format!(
             ": has shape {shape}, expected [frames, 25], or [frames, 7] of position and quaternion (w, x, y, \
-             z){hint}"
+             z), or [dancers, frames, 25] of a group of 2 to 16{hint}"
         );
         (FailureKind::Shape, message)
     };

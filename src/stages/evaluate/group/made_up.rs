@@ -1,17 +1,24 @@
-//! Groups made up from generated ones, which generated groups are held against.
+//! Groups made up of other motion, which generated groups are held against.
 
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis};
 
 use crate::motion::Channel;
 
 /// Mean place of a dancer on the floor, m.
-fn mean_place(dancer: ArrayView2<f32>) -> [f32; 2] {
+pub(super) type Place = [f32; 2];
+
+fn mean_place(dancer: ArrayView2<f32>) -> Place {
     let first = Channel::Position.range().start;
     [first, first + 2].map(|i| dancer.column(i).mean().unwrap_or_default())
 }
 
+/// Returns the mean places of the dancers of a group.
+pub(super) fn places(group: ArrayView3<f32>) -> Vec<Place> {
+    group.outer_iter().map(mean_place).collect()
+}
+
 /// Moves a dancer so that its mean place is `to`.
-fn moved(dancer: ArrayView2<f32>, to: [f32; 2]) -> Array2<f32> {
+fn moved(dancer: ArrayView2<f32>, to: Place) -> Array2<f32> {
     let from = mean_place(dancer);
     let mut dancer = dancer.to_owned();
     let first = Channel::Position.range().start;
@@ -22,7 +29,7 @@ fn moved(dancer: ArrayView2<f32>, to: [f32; 2]) -> Array2<f32> {
 }
 
 /// The first dancer in the place of every dancer.
-pub fn copied(group: ArrayView3<f32>) -> Array3<f32> {
+pub(super) fn copied(group: ArrayView3<f32>) -> Array3<f32> {
     let mut copies = group.to_owned();
     let first = group.index_axis(Axis(0), 0);
     for (mut copy, dancer) in copies.outer_iter_mut().zip(group.outer_iter()) {
@@ -31,13 +38,21 @@ pub fn copied(group: ArrayView3<f32>) -> Array3<f32> {
     copies
 }
 
-/// Dancer k of group k in the place of dancer k.
-pub fn independent(group: ArrayView3<f32>, others: &[Array3<f32>]) -> Array3<f32> {
+/// Strangers in the places of the dancers.
+pub(super) fn independent(group: ArrayView3<f32>, strangers: &[ArrayView2<f32>]) -> Array3<f32> {
     let mut mixed = group.to_owned();
-    for (k, (mut dancer, other)) in mixed.outer_iter_mut().zip(others).enumerate() {
-        let place = mean_place(group.index_axis(Axis(0), k));
-        let from = other.index_axis(Axis(0), k.min(other.dim().0 - 1));
-        dancer.assign(&moved(from, place));
+    for (k, (mut dancer, stranger)) in mixed.outer_iter_mut().zip(strangers).enumerate() {
+        dancer.assign(&moved(*stranger, mean_place(group.index_axis(Axis(0), k))));
     }
     mixed
+}
+
+/// The dancers of a group in given places; who has none stays.
+pub(super) fn placed(group: ArrayView3<f32>, to: &[Place]) -> Array3<f32> {
+    let mut group = group.to_owned();
+    for (mut dancer, &to) in group.outer_iter_mut().zip(to) {
+        let there = moved(dancer.view(), to);
+        dancer.assign(&there);
+    }
+    group
 }

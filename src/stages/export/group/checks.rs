@@ -9,7 +9,8 @@ use crate::audio::FEATURE_DIM;
 use crate::autodiff::{Arena, Eager, Interpreter as _, Parameters, Stream};
 use crate::generation::ModelFileName;
 use crate::model::{
-    GroupConfig, GroupInputs, GroupNetworks, GroupScoreInputs, Parameter, ParameterList,
+    GroupConfig, GroupInputs, GroupNetworks, GroupScoreInputs, GroupScores, Parameter,
+    ParameterList,
 };
 use crate::motion::{CLOCK_DIM, MOTION_DIM};
 use crate::onnx::{
@@ -72,11 +73,15 @@ pub fn checks(
         let (wanted, eager_s) = timed(|| given.estimate(&networks, &parameters, &arena, trained))?;
         let apart = difference(&found.1, &wanted);
         rows.push((case, "forward", apart, onnx_s, eager_s));
-        let (found, onnx_s) =
-            timed(|| score.run(&given.of_score(&wanted, &w.1), GroupScoreNames::LOG_RATIO))?;
-        let (logits, eager_s) =
+        let (scores, eager_s) =
             timed(|| given.score(&networks, &parameters, &arena, &wanted, &w.1))?;
-        rows.push((case, "score", difference(&found.1, &logits), onnx_s, eager_s));
+        for (check, output, wanted_scores) in [
+            ("score", GroupScoreNames::LOG_RATIO, &scores.log_ratio),
+            ("agreement", GroupScoreNames::AGREEMENT, &scores.agreement),
+        ] {
+            let (found, onnx_s) = timed(|| score.run(&given.of_score(&wanted, &w.1), output))?;
+            rows.push((case, check, difference(&found.1, wanted_scores), onnx_s, eager_s));
+        }
     }
     let build = runtime.build();
     let row =
@@ -228,7 +233,7 @@ impl CheckInputs {
         arena: &Arena<f32>,
         x0: &[f32],
         w: &[f32],
-    ) -> anyhow::Result<Vec<f32>> {
+    ) -> anyhow::Result<GroupScores<Vec<f32>>> {
         let Case { n_groups, n_dancers, n_frames } = self.case;
         let mut g = Eager::new(parameters, arena);
         let x0 = g.constant(&[n_groups * n_dancers, n_frames, MOTION_DIM], x0);
@@ -238,7 +243,11 @@ impl CheckInputs {
         let number = g.constant(&[n_groups], &vec![self.number as f32; n_groups]);
         let inputs =
             GroupScoreInputs { x0: &x0, t: &t, w: &w, number: &number, mask: None, there: None };
-        Ok(networks.score.forward(&mut g, &inputs)?.log_ratio.data().to_vec())
+        let GroupScores { log_ratio, agreement } = networks.score.forward(&mut g, &inputs)?;
+        Ok(GroupScores {
+            log_ratio: log_ratio.data().to_vec(),
+            agreement: agreement.data().to_vec(),
+        })
     }
 }
 

@@ -152,12 +152,17 @@ struct CheckInputs {
     case: Case,
     n_tokens: usize,
     is_clock_heard: bool,
+    /// Of a frame; 0 for a network without.
+    constraint_dim: usize,
     motion: Vec<f32>,
     x: Vec<f32>,
     t: Vec<usize>,
     tokens: Vec<usize>,
     features: Vec<f32>,
     clock: Vec<f32>,
+    constraints: Vec<f32>,
+    /// Of every other window.
+    drop_constraints: Vec<f32>,
 }
 
 impl CheckInputs {
@@ -174,12 +179,15 @@ impl CheckInputs {
             case,
             n_tokens,
             is_clock_heard: card.planner.clock,
+            constraint_dim: card.planner.constraint_dim,
             motion: normal(n_windows * n_frames * MOTION_DIM, 11),
             x: normal(n_windows * n_frames * MOTION_DIM, 12),
             t: (0..n_windows).map(|i| (i + 1) * (card.diffusion.n_steps - 1) / n_windows).collect(),
             tokens: (0..n_windows * n_tokens).map(|i| i * 7919 % codes).collect(),
             features: normal(n_windows * n_frames * FEATURE_DIM, 13),
             clock: normal(n_windows * n_frames * CLOCK_DIM, 14),
+            constraints: normal(n_windows * n_frames * card.planner.constraint_dim, 15),
+            drop_constraints: (0..n_windows).map(|i| (i % 2) as f32).collect(),
         }
     }
 
@@ -234,6 +242,12 @@ impl CheckInputs {
         ];
         if self.is_clock_heard {
             inputs.push(floats(PlannerNames::CLOCK, &self.frames(CLOCK_DIM), &self.clock));
+        }
+        if self.constraint_dim > 0 {
+            let shape = self.frames(self.constraint_dim);
+            inputs.push(floats(PlannerNames::CONSTRAINTS, &shape, &self.constraints));
+            let (name, dropped) = (PlannerNames::DROP_CONSTRAINTS, &self.drop_constraints);
+            inputs.push(floats(name, &[dropped.len()], dropped));
         }
         inputs
     }
@@ -299,11 +313,18 @@ impl CheckInputs {
             let shape = [self.case.n_windows, card.planner.style_dim];
             g.constant(&shape, &vec![0.0; shape[0] * shape[1]])
         });
+        let constraints = (self.constraint_dim > 0).then(|| {
+            let shape = self.frames(self.constraint_dim);
+            let dropped = &self.drop_constraints;
+            (g.constant(&shape, &self.constraints), g.constant(&[dropped.len()], dropped))
+        });
         let inputs = PlannerInputs {
             tokens: &tokens,
             audio: &audio,
             drop_audio: None,
             style: style.as_ref(),
+            constraints: constraints.as_ref().map(|(asked, _)| asked),
+            drop_constraints: constraints.as_ref().map(|(_, dropped)| dropped),
             mask: None,
         };
         Ok(networks.planner.forward(&mut g, &inputs)?)

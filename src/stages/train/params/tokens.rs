@@ -21,6 +21,13 @@ pub struct TokensParams {
     /// Probability that a token which a planner sees is replaced by any other [default: 0.1 masked, 0.2 autoregressive]
     #[arg(long, value_name = "P", help_heading = "Tokens", hide_short_help = RARE)]
     pub token_replacement: Option<f64>,
+    /// Let a planner know nothing of constraints, as those of release 0.2.
+    #[arg(long, help_heading = "Tokens", hide_short_help = RARE)]
+    pub no_constraints: bool,
+    /// Probability that a window of a planner goes without constraints, parts of its own motion that are asked for.
+    #[arg(long, value_name = "P", default_value_t = PlannerTraining::CONSTRAINT_DROPOUT,
+          help_heading = "Tokens", hide_short_help = RARE)]
+    pub constraint_dropout: f64,
     /// Frames that a token stands for: 1, 2, 4, 8 or 16.
     #[arg(long, value_name = "N", default_value_t = 4, help_heading = "Tokens", hide_short_help = RARE)]
     pub frames_per_token: usize,
@@ -94,6 +101,7 @@ impl ConfigParams {
         let sizes = PlannerConfig::of(self.network.preset, kind, &network.tokens)?;
         let TrainConfig { diffusion, .. } = self.config(seed);
         let usual = PlannerTraining::usual_replacement(kind);
+        let is_constrained = !self.tokens.no_constraints;
         Some(PlannerTrainConfig {
             seed,
             tokenizer,
@@ -101,6 +109,7 @@ impl ConfigParams {
                 planner: PlannerConfig {
                     clock: !self.network.no_clock,
                     style_dim: if self.network.style { STYLE_DIM } else { 0 },
+                    constraint_dim: if is_constrained { sizes.constraint_dim } else { 0 },
                     dropout: self.network.dropout.unwrap_or(sizes.dropout),
                     ..sizes
                 },
@@ -111,6 +120,11 @@ impl ConfigParams {
                 condition_dropout: diffusion.condition_dropout,
                 clock_dropout: diffusion.clock_dropout,
                 style_dropout: diffusion.style_dropout,
+                constraint_dropout: if is_constrained {
+                    self.tokens.constraint_dropout
+                } else {
+                    0.0
+                },
                 augmentation: diffusion.augmentation,
                 batch_size: diffusion.batch_size,
                 accumulate: diffusion.accumulate,

@@ -49,6 +49,9 @@ pub struct PlannerTraining {
     pub clock_dropout: f64,
     /// Probability that the style is withheld.
     pub style_dropout: f64,
+    /// Probability that constraints are withheld, of a network that takes them.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub constraint_dropout: f64,
     pub augmentation: Augmentation,
     pub batch_size: usize,
     /// Parts of a batch that are done one after the other, to save memory.
@@ -60,7 +63,16 @@ pub struct PlannerTraining {
     pub ema: EmaConfig,
 }
 
+/// Settings of release 0.2 are written as they were.
+fn is_zero(x: &f64) -> bool {
+    *x == 0.0
+}
+
 impl PlannerTraining {
+    /// Half of the windows are those of the paper's other task, which has no constraints (section 3.4); of a network
+    /// that is always given a trajectory the paper withholds it from a tenth.
+    pub const CONSTRAINT_DROPOUT: f64 = 0.5;
+
     /// Returns the probability that a token is replaced, where nothing is said (paper, section 4.2).
     pub fn usual_replacement(kind: PlannerKind) -> f64 {
         match kind {

@@ -11,6 +11,8 @@ use crate::training::batch::Batch;
 use crate::training::diffusion::without_clock;
 
 use super::PlannerTraining;
+use super::constraints::DrawnConstraints;
+use crate::motion::Normalizer;
 
 /// Share of the masked tokens that are not replaced which the network sees as \[MASK\]; it sees the others as they are
 /// (MoMask, as BERT).
@@ -18,8 +20,11 @@ const HIDDEN: f64 = 0.88;
 /// Numbers drawn for each token: its place in the order of masking, its fate, and the token in its place.
 const N_DRAWN: usize = 3;
 
-/// Probabilities of what chance does to the inputs; all 0 for a validation.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+/// Share of the validation windows that go without constraints, as many as with: a planner is there for both.
+const UNCONSTRAINED_VALIDATION: f64 = 0.5;
+
+/// Probabilities of what chance does to the inputs.
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PlannerChances {
     pub replacement: f64,
     /// Of the tokens that are asked for, those that are seen as they are.
@@ -27,6 +32,20 @@ pub struct PlannerChances {
     pub audio: f64,
     pub clock: f64,
     pub style: f64,
+    /// Of constraints, for a network that takes them.
+    pub constraints: f64,
+}
+
+impl PlannerChances {
+    /// Those of a validation: all that is asked for is hidden, and nothing withheld but constraints.
+    pub const VALIDATION: Self = Self {
+        replacement: 0.0,
+        shown: 0.0,
+        audio: 0.0,
+        clock: 0.0,
+        style: 0.0,
+        constraints: UNCONSTRAINED_VALIDATION,
+    };
 }
 
 impl From<&PlannerTraining> for PlannerChances {
@@ -37,6 +56,7 @@ impl From<&PlannerTraining> for PlannerChances {
             audio: config.condition_dropout,
             clock: config.clock_dropout,
             style: config.style_dropout,
+            constraints: config.constraint_dropout,
         }
     }
 }
@@ -47,6 +67,7 @@ pub struct PlannerBatch<'a> {
     audio: Cow<'a, [f32]>,
     drop_audio: Vec<f32>,
     style: Option<Vec<f32>>,
+    constraints: Option<DrawnConstraints>,
     /// What the network sees, \[B, N\].
     seen: Vec<f32>,
     /// What it is asked for, \[B, N\].
@@ -67,7 +88,7 @@ impl<'a> PlannerBatch<'a> {
     pub fn of(
         batch: &'a Batch,
         tokens: &[u32],
-        sizes: &PlannerConfig,
+        (sizes, normalizer): (&PlannerConfig, &Normalizer),
         chances: PlannerChances,
         seed: u64,
     ) -> Self {
@@ -131,6 +152,8 @@ impl<'a> PlannerBatch<'a> {
             audio: without_clock(batch, chances.clock),
             drop_audio: drop_audio.collect(),
             style,
+            constraints: (sizes.constraint_dim > 0)
+                .then(|| DrawnConstraints::new(batch, normalizer, chances.constraints, seed)),
             seen,
             labels,
             mask,
@@ -170,11 +193,18 @@ impl<'a> PlannerBatch<'a> {
             let style = part(style);
             g.constant(&[n, style.len() / n.max(1)], &style)
         });
+        let constraints = self.constraints.as_ref().map(|drawn| {
+            let channels = part(&drawn.channels);
+            let width = channels.len() / (n * frames).max(1);
+            (g.constant(&[n, frames, width], &channels), g.constant(&[n], &part(&drawn.dropped)))
+        });
         let inputs = PlannerInputs {
             tokens: &seen,
             audio: &audio,
             drop_audio: Some(&drop_audio),
             style: style.as_ref(),
+            constraints: constraints.as_ref().map(|(channels, _)| channels),
+            drop_constraints: constraints.as_ref().map(|(_, dropped)| dropped),
             mask: Some(&mask),
         };
         let logits = planner.forward(g, &inputs)?;

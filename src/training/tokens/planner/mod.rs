@@ -1,9 +1,10 @@
 //! Training of a planner: the tokens of a tokenizer that does not change any more, from the music.
 //!
 //! Windows are cut, changed and placed as for the tokenizer, and become tokens when they are learned from, so that
-//! motion that is mirrored or stretched has tokens of its own.
+//! motion that is mirrored or stretched has tokens of its own. Parts of the same motion are asked for.
 
 mod config;
+mod constraints;
 mod inputs;
 
 use std::sync::Arc;
@@ -117,9 +118,10 @@ impl PlannerLearner {
         let side_by_side = self.gradients.len();
         let n_parts = (self.config.accumulate * side_by_side).clamp(1, batch.n_windows);
         let at = |part: usize| part * batch.n_windows / n_parts;
-        let seed = self.seed;
+        let (seed, windows) = (self.seed, Arc::clone(&self.windows));
         let Self { gradients, arenas, network, planner, tokenizer, sizes, config, threads, .. } =
             &mut *self;
+        let sizes = (&*sizes, windows.normalizer());
         let parameters = network.live();
         gradients.iter_mut().for_each(Gradients::clear);
         let tokens = threads.run(|| tokenizer.tokens(batch, &arenas[0]))?;
@@ -162,10 +164,11 @@ impl PlannerLearner {
         for first in (0..n_wanted).step_by(VALIDATION_BATCH) {
             let range = first..(first + VALIDATION_BATCH).min(n_wanted);
             let batch = self.windows.validation(range)?;
-            let chances = PlannerChances::default();
+            let (sizes, chances) =
+                ((&self.sizes, self.windows.normalizer()), PlannerChances::VALIDATION);
             let of_batch = self.threads.run(|| {
                 let tokens = self.tokenizer.tokens(&batch, &self.arenas[0])?;
-                let given = PlannerBatch::of(&batch, &tokens, &self.sizes, chances, first as u64);
+                let given = PlannerBatch::of(&batch, &tokens, sizes, chances, first as u64);
                 let mut g = Eager::new(parameters, &self.arenas[0]);
                 let windows = 0..batch.n_windows;
                 let loss = given.loss(&mut g, &self.planner, windows.clone())?;

@@ -12,7 +12,17 @@ const WINDOWS: usize = 400;
 fn sizes(kind: PlannerKind) -> PlannerConfig {
     let tokens = TokensConfig::of(Preset::Tiny).expect("a preset of the family");
     let tiny = PlannerConfig::of(Preset::Tiny, kind, &tokens).expect("a preset of the family");
-    PlannerConfig { style_dim: 8, clock: false, ..tiny }
+    PlannerConfig { style_dim: 8, clock: false, constraint_dim: 0, ..tiny }
+}
+
+fn given<'a>(
+    batch: &'a Batch,
+    tokens: &[u32],
+    sizes: &PlannerConfig,
+    chances: PlannerChances,
+    seed: u64,
+) -> PlannerBatch<'a> {
+    PlannerBatch::of(batch, tokens, (sizes, &Normalizer::identity()), chances, seed)
 }
 
 /// Windows of which every other has 21 frames, six tokens.
@@ -36,14 +46,20 @@ fn tokens() -> Vec<u32> {
     (0..WINDOWS * N).map(|i| (i * 7 % 32) as u32).collect()
 }
 
-const TRAINED: PlannerChances =
-    PlannerChances { replacement: 0.1, shown: 0.12, audio: 0.25, clock: 0.0, style: 0.5 };
+const TRAINED: PlannerChances = PlannerChances {
+    replacement: 0.1,
+    shown: 0.12,
+    audio: 0.25,
+    clock: 0.0,
+    style: 0.5,
+    constraints: 0.5,
+};
 
 #[test]
 fn masked_tokens_are_as_many_as_the_cosine_says_and_never_beyond_a_phrase() {
     let (batch, tokens) = (batch(), tokens());
     let sizes = sizes(PlannerKind::Masked);
-    let given = PlannerBatch::of(&batch, &tokens, &sizes, TRAINED, 5);
+    let given = given(&batch, &tokens, &sizes, TRAINED, 5);
     for (b, weights) in given.weights.chunks(N).enumerate() {
         let n_counting = if b % 2 == 0 { N } else { 6 };
         let n_asked = weights.iter().filter(|&&w| w == 1.0).count();
@@ -72,7 +88,7 @@ fn every_place_is_masked_as_often_as_any_other() {
     let mut counts = [0_u32; N];
     for seed in 0..20 {
         let sizes = sizes(PlannerKind::Masked);
-        let given = PlannerBatch::of(&batch, &tokens, &sizes, TRAINED, seed);
+        let given = given(&batch, &tokens, &sizes, TRAINED, seed);
         for weights in given.weights.chunks(N).step_by(2) {
             counts.iter_mut().zip(weights).for_each(|(n, &w)| *n += w as u32);
         }
@@ -86,7 +102,7 @@ fn every_place_is_masked_as_often_as_any_other() {
 fn a_validation_hides_all_that_it_asks_for_and_withholds_nothing() {
     let (batch, tokens) = (batch(), tokens());
     let sizes = sizes(PlannerKind::Masked);
-    let given = PlannerBatch::of(&batch, &tokens, &sizes, PlannerChances::default(), 5);
+    let given = given(&batch, &tokens, &sizes, PlannerChances::VALIDATION, 5);
     let all = given.weights.iter().zip(given.seen.iter().zip(&given.labels));
     for (w, (seen, label)) in all {
         assert_eq!(*seen, if *w == 1.0 { 32.0 } else { *label });
@@ -100,7 +116,7 @@ fn of_the_autoregressive_kind_all_are_asked_for_and_a_share_is_replaced() {
     let (batch, tokens) = (batch(), tokens());
     let sizes = sizes(PlannerKind::Autoregressive);
     let chances = PlannerChances { replacement: 0.2, ..TRAINED };
-    let given = PlannerBatch::of(&batch, &tokens, &sizes, chances, 5);
+    let given = given(&batch, &tokens, &sizes, chances, 5);
     assert_eq!(given.weights, given.mask);
     assert_eq!(given.weight(0..WINDOWS), (WINDOWS / 2 * (N + 6)) as f64);
     let counting = given.mask.iter().zip(given.seen.iter().zip(&given.labels));
@@ -119,8 +135,25 @@ fn what_chance_does_follows_from_the_seed() {
     let (batch, tokens) = (batch(), tokens());
     for kind in [PlannerKind::Masked, PlannerKind::Autoregressive] {
         let sizes = sizes(kind);
-        let seen = |seed| PlannerBatch::of(&batch, &tokens, &sizes, TRAINED, seed).seen;
+        let seen = |seed| given(&batch, &tokens, &sizes, TRAINED, seed).seen;
         assert_eq!(seen(5), seen(5));
         assert_ne!(seen(5), seen(6));
     }
+}
+
+#[test]
+fn constraints_are_drawn_for_networks_that_take_them_and_change_nothing_else() {
+    let (mut batch, tokens) = (batch(), tokens());
+    batch.motion = vec![0.5; WINDOWS * FRAMES * 25];
+    let without = sizes(PlannerKind::Masked);
+    let with = PlannerConfig { constraint_dim: crate::model::CONSTRAINT_DIM, ..without.clone() };
+    let (plain, asked) =
+        (given(&batch, &tokens, &without, TRAINED, 5), given(&batch, &tokens, &with, TRAINED, 5));
+    assert_eq!(plain.constraints, None);
+    assert_eq!((plain.seen, plain.weights), (asked.seen, asked.weights));
+    let drawn = asked.constraints.expect("constraints");
+    assert_eq!(drawn.channels.len(), WINDOWS * FRAMES * 12);
+    let dropped: f32 = drawn.dropped.iter().sum();
+    // Five deviations of a binomial of 400 and 1/2.
+    assert!((dropped - 200.0).abs() < 50.0, "{dropped}");
 }

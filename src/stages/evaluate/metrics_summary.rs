@@ -1,4 +1,4 @@
-//! The account of an evaluation of groups.
+//! The account of an evaluation that ends in numbers and no verdicts: of groups, and of tokenizers.
 
 use std::collections::BTreeSet;
 use std::io::{self, Write};
@@ -6,35 +6,45 @@ use std::io::{self, Write};
 use crate::stages::Summary;
 use crate::store::tables::MetricRow;
 
-/// The summary of an evaluation of groups.
-pub struct GroupEvaluationSummary {
+/// The summary of an evaluation without verdicts.
+pub struct MetricsSummary {
     pub store: String,
     pub run: String,
+    /// What was measured: groups, phrases.
+    pub items: &'static str,
     pub n_motions: usize,
     pub length_s: f64,
     pub is_up_to_date: bool,
     pub dry_run: bool,
     pub metrics: Vec<MetricRow>,
+    /// Metrics that people are shown; all where empty.
+    pub shown: &'static [&'static str],
     pub took_s: f64,
 }
 
-impl Summary for GroupEvaluationSummary {
+impl Summary for MetricsSummary {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        let Self { store, run, n_motions, length_s, took_s, .. } = self;
+        let Self { store, run, items, n_motions, length_s, took_s, .. } = self;
         writeln!(out, "evaluate {run} → {store}")?;
         if self.dry_run {
             let what = if self.is_up_to_date { "nothing to do for" } else { "would evaluate" };
-            return writeln!(out, "  {what} {n_motions} groups ({length_s:.1} s)");
+            return writeln!(out, "  {what} {n_motions} {items} ({length_s:.1} s)");
         }
         let done = match self.is_up_to_date {
             true => ", evaluated before".to_owned(),
             false => format!(" evaluated; {took_s:.1} s"),
         };
-        writeln!(out, "  {n_motions} groups ({length_s:.1} s){done}")?;
+        writeln!(out, "  {n_motions} {items} ({length_s:.1} s){done}")?;
         let columns: BTreeSet<(&str, &str)> =
             self.metrics.iter().map(|row| (row.split.as_str(), row.subject.as_str())).collect();
-        let names: BTreeSet<(&str, &str)> =
-            self.metrics.iter().map(|row| (row.metric.as_str(), row.variant.as_str())).collect();
+        let is_shown =
+            |row: &&MetricRow| self.shown.is_empty() || self.shown.contains(&&*row.metric);
+        let names: BTreeSet<(&str, &str)> = self
+            .metrics
+            .iter()
+            .filter(is_shown)
+            .map(|row| (row.metric.as_str(), row.variant.as_str()))
+            .collect();
         write!(out, "\n  {:<38}", "")?;
         for (split, subject) in &columns {
             write!(out, " {:>16}", format!("{split}/").chars().take(16).collect::<String>())?;

@@ -6,10 +6,12 @@ use anyhow::Context as _;
 
 use super::model_files::{EngineChoice, EngineParams};
 use super::model_folder::ModelFolder;
+use crate::autodiff::Parameters;
 use crate::generation::{
     FamilyCard as _, ModelFileName, OnnxPlanner, OnnxTokenizer, PlannerEngine, SessionPlan,
     TokenEngine, TokensCard, tokens_parameters,
 };
+use crate::model::{ParameterList, Planner, Tokenizer};
 use crate::onnx::{Device, Model, Runtime, check};
 
 /// A model of tokens whose files are at hand on this machine.
@@ -72,19 +74,7 @@ impl OpenTokens {
     }
 
     fn eager(&self, workers: (NonZeroUsize, NonZeroUsize)) -> anyhow::Result<TokenEngines> {
-        let Self { card, files } = self;
-        let read = |name| -> anyhow::Result<_> {
-            let place = files.place_of(name);
-            Ok((Model::read(files.read(name)?, None, &place)?, place))
-        };
-        let (of_tokenizer, of_planner) = tokens_parameters(card, read)?;
-        let (window, starting) = (card.window_frames, "while starting threads");
-        let tokens =
-            TokenEngine::new(&card.tokens, of_tokenizer, &card.normalizer, window, workers)
-                .context(starting)?;
-        let planner = PlannerEngine::new(&card.planner, of_planner, &card.feature_scale, workers)
-            .context(starting)?;
-        Ok(TokenEngines { tokens, planner, note: None })
+        TokensWeights::read(&self.files, &self.card)?.engines(&self.card, workers)
     }
 
     fn onnx(
@@ -109,5 +99,53 @@ impl OpenTokens {
             planner: PlannerEngine::with(&card.planner, Box::new(planner)),
             note: None,
         })
+    }
+}
+
+/// The weights of the networks of a model of tokens.
+pub struct TokensWeights {
+    tokenizer: Parameters<f32>,
+    planner: Parameters<f32>,
+}
+
+impl TokensWeights {
+    /// Reads the weights of a model that was exported.
+    ///
+    /// # Errors
+    /// A file that is not what the card says.
+    pub fn read(files: &ModelFolder, card: &TokensCard) -> anyhow::Result<Self> {
+        let (tokenizer, planner) = tokens_parameters(card, |name| -> anyhow::Result<_> {
+            let place = files.place_of(name);
+            Ok((Model::read(files.read(name)?, None, &place)?, place))
+        })?;
+        Ok(Self { tokenizer, planner })
+    }
+
+    /// Makes networks of a model's sizes with the weights that training begins with.
+    ///
+    /// Layers that begin at zero are drawn as others are: with zeros the denoiser says the same whatever the tokens.
+    pub fn untrained(card: &TokensCard) -> Self {
+        let first = |list: ParameterList| Parameters::new(list.without_zero_layers(), 0);
+        let tokenizer = first(Tokenizer::new(&card.tokens).1);
+        let planner = first(Planner::new(&card.planner).1);
+        Self { tokenizer, planner }
+    }
+
+    /// Starts the engines of both networks by the interpreter that trains, of so many workers of so many threads each.
+    ///
+    /// # Errors
+    /// When the system gives no threads.
+    pub fn engines(
+        self,
+        card: &TokensCard,
+        workers: (NonZeroUsize, NonZeroUsize),
+    ) -> anyhow::Result<TokenEngines> {
+        let Self { tokenizer, planner } = self;
+        let (window, starting) = (card.window_frames, "while starting threads");
+        let tokens = TokenEngine::new(&card.tokens, tokenizer, &card.normalizer, window, workers)
+            .context(starting)?;
+        let planner = PlannerEngine::new(&card.planner, planner, &card.feature_scale, workers)
+            .context(starting)?;
+        Ok(TokenEngines { tokens, planner, note: None })
     }
 }
