@@ -22,7 +22,8 @@ use motiongen::motion::{MOTION_DIM, Normalizer};
 use motiongen::training::{
     Augmentation, Batch, Chances, Dataset, EmaConfig, FinetuneConfig, FinetuneLearner,
     GroupLearner, GroupLosses, GroupNetworkConfig, GroupTraining, Learner, LearningRate,
-    NetworkConfig, Objective, OptimizerConfig, TemporalConfig, Windows, WithholdProbabilities,
+    LearningRateSchedule, NetworkConfig, Objective, OptimizerConfig, TemporalConfig, Windows,
+    WithholdProbabilities,
 };
 use ndarray::Array2;
 use serde_json::{Value, json};

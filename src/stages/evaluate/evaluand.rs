@@ -3,7 +3,7 @@
 mod folder;
 mod measured;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 use anyhow::{Context as _, bail};
 use ndarray::{Array2, Axis};
@@ -16,16 +16,14 @@ use super::measure::over_dancers;
 use super::motions::{self, PhraseIndex, is_held_out};
 use super::params::Params;
 use super::rows::{self, EvaluationRows, RunName};
-use super::splits::{MusicSplit, telling};
+use super::splits::{splits_of, telling};
 use super::truth::{self, Truth};
 use crate::evaluation::metrics::PhaseOrigin;
 use crate::evaluation::window::own_window_frames;
 use crate::evaluation::{Check, holds_by_construction, holds_by_derivation};
-use crate::generation::LearnedFrom;
 use crate::motion::group::MAX_DANCERS;
 use crate::motion::postprocess::PostProcessConfig;
 use crate::stages::Progress;
-use crate::stages::learned;
 use crate::stages::motion_source::generated_group;
 use crate::store::tables::{self, GenerationRow};
 use crate::store::{
@@ -355,41 +353,3 @@ fn refuse_outdated(
 
 /// Notes on single files that are told; the table of failures has all that were refused.
 const MAX_NOTES: usize = 5;
-
-/// Returns what the model that made each motion had to do with its music, as the card says, and a note where that is
-/// not known.
-pub(super) fn splits_of(
-    store: &Location,
-    phrases: &PhraseIndex,
-    generations: &[GenerationRow],
-) -> anyhow::Result<(Vec<MusicSplit>, Vec<String>)> {
-    let mut models: BTreeMap<(&str, &str), Option<LearnedFrom>> = BTreeMap::new();
-    let mut notes = Vec::new();
-    for row in generations {
-        let key = (row.model.as_str(), row.weights.as_str());
-        if models.contains_key(&key) {
-            continue;
-        }
-        let learned_from = match learned::of_model(store, key.0, key.1)? {
-            Ok(learned_from) => Some(learned_from),
-            Err(why) => {
-                notes.push(format!(
-                    "Nobody knows which of these songs model {} learned from: {why}.",
-                    row.model
-                ));
-                None
-            }
-        };
-        models.insert(key, learned_from);
-    }
-    let split = |row: &GenerationRow| -> MusicSplit {
-        let learned_from = models.get(&(row.model.as_str(), row.weights.as_str()));
-        match (learned_from, phrases.row(&row.phrase_id)) {
-            (Some(Some(learned_from)), Some(phrase)) => {
-                learned_from.split_of(phrase.song_hash.as_deref(), &phrase.content_hash)
-            }
-            _ => MusicSplit::Unknown,
-        }
-    };
-    Ok((generations.iter().map(split).collect(), notes))
-}
