@@ -134,6 +134,7 @@ impl Served {
                 let request = PlanRequest {
                     condition: music.view(),
                     style: None,
+                    constraints: None,
                     given: &[],
                     guidance: if request["answers"] == 1 { 1.0 } else { 2.0 },
                     seed: 3,
