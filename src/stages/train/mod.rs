@@ -5,6 +5,7 @@ mod group;
 mod judge;
 mod params;
 mod planner;
+pub(in crate::stages) mod ranks;
 pub mod session;
 mod summary;
 pub(in crate::stages) mod survey;
@@ -24,12 +25,13 @@ use crate::model::{Family, UNet1D};
 use crate::motion::Normalizer;
 use crate::store::{Lease, Location};
 use crate::training::{
-    Augmentation, CheckpointKind, Checkpoints, DecoderLearner, Denoiser, DiffusionLearner, Drive,
-    GroupLearner, Journal, Learner, Loader, PlannerLearner, State, TokensLearner, TrainConfig,
-    TrainingEnd, TrainingError, Windows,
+    Augmentation, ByOne, CheckpointKind, Checkpoints, DecoderLearner, Denoiser, DiffusionLearner,
+    Drive, GroupLearner, Journal, Learner, Loader, PlannerLearner, Ranks, State, TokensLearner,
+    TrainConfig, TrainingEnd, TrainingError, Windows,
 };
 use budget::{BudgetParams, KeptCheckpoint, StageBudget};
 use judge::ValidationJudge;
+use ranks::{agreed, check_same};
 use session::{
     MachineParams, ProgressWatch, TrainingPhrases, check_run_name, claim, claim_path, lease_of,
     read_phrases, scales,
@@ -90,37 +92,52 @@ impl Stage for Train {
 
     fn run(params: Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
         check_run_name(&params.run)?;
-        match params.config.network.family {
-            Family::Unet => {}
-            Family::Group => return group::run(&params, progress),
+        ranks::on_all(progress, |ranks, progress| match params.config.network.family {
+            Family::Unet => train(&params, ranks, progress),
+            Family::Group => group::run(&params, ranks, progress),
             Family::Tokens if params.config.tokens.tokenizer.is_some() => {
-                return planner::run(&params, progress);
+                planner::run(&params, ranks, progress)
             }
-            Family::Tokens => return tokens::run(&params, progress),
-        }
+            Family::Tokens => tokens::run(&params, ranks, progress),
+        })
+    }
+}
+
+/// Trains a UNet and a decoder.
+fn train(
+    params: &Params,
+    ranks: &Arc<Ranks>,
+    progress: &dyn Progress,
+) -> anyhow::Result<Box<dyn Summary>> {
+    let checked = || {
         let config = params.config.config(params.seed);
         config.network.check()?;
-        check_numbers(&params, &config)?;
-        let store = Location::open(&params.store, &params.client.options())?;
-        let watch = ProgressWatch(progress);
-        let lease = match params.dry_run {
-            true => None,
-            false => Some(lease_of(&store, &params.run, &watch)?),
-        };
-        let lease = lease.as_ref();
-        let mut run = Run { params: &params, store: &store, watch: &watch, lease };
-        let first = run.checkpoints(DiffusionLearner::STAGE);
-        ensure!(
-            !params.resume || !first.steps(CheckpointKind::Step)?.is_empty(),
-            "run {} has no checkpoint to resume from in {store}; leave --resume out to start it",
-            params.run
-        );
-        if params.dry_run {
-            return run.dry_run(&config, progress);
-        }
-        store.sweep();
-        run.train(&config, progress)
+        check_numbers(params, &config)?;
+        Ok((config, Location::open(&params.store, &params.client.options())?))
+    };
+    let (config, store) = agreed(ranks, checked())?;
+    let watch = ProgressWatch(progress);
+    let lease = agreed(ranks, lease(params, &store, ranks, &watch))?;
+    let mut run = Run { params, store: &store, watch: &watch, lease: lease.as_ref(), ranks };
+    agreed(ranks, run.check_resume(DiffusionLearner::STAGE))?;
+    if params.dry_run {
+        return run.dry_run(&config, progress);
     }
+    run.sweep();
+    run.train(&config, progress)
+}
+
+/// Takes the lease to write the run: the first process has it, and none in a dry run.
+fn lease(
+    params: &Params,
+    store: &Location,
+    ranks: &Ranks,
+    watch: &ProgressWatch,
+) -> anyhow::Result<Option<Lease>> {
+    if params.dry_run || !ranks.is_first() {
+        return Ok(None);
+    }
+    Ok(Some(lease_of(store, &params.run, watch)?))
 }
 
 fn check_numbers(params: &Params, config: &TrainConfig) -> anyhow::Result<()> {
@@ -181,9 +198,47 @@ struct Run<'a> {
     store: &'a Location,
     watch: &'a ProgressWatch<'a>,
     lease: Option<&'a Lease>,
+    ranks: &'a Arc<Ranks>,
 }
 
 impl<'a> Run<'a> {
+    /// Refuses to resume a run that has no checkpoint.
+    fn check_resume(&self, stage: &str) -> anyhow::Result<()> {
+        let Self { params, store, .. } = self;
+        ensure!(
+            !params.resume || !self.checkpoints(stage).steps(CheckpointKind::Step)?.is_empty(),
+            "run {} has no checkpoint to resume from in {store}; leave --resume out to start it",
+            params.run
+        );
+        Ok(())
+    }
+
+    /// Removes what writers of the store left behind.
+    fn sweep(&self) {
+        if self.ranks.is_first() {
+            self.store.sweep();
+        }
+    }
+
+    /// Makes the run this configuration's, anew where that is asked for. Only to be called when it is certain that there
+    /// is something to train and to train on.
+    fn begin<C>(&self, config: &C) -> anyhow::Result<()>
+    where
+        C: serde::Serialize + serde::de::DeserializeOwned,
+    {
+        let begun = || {
+            if !self.ranks.is_first() {
+                return Ok(());
+            }
+            if self.params.force {
+                self.clear()?;
+            }
+            let patience = self.params.machine.patience();
+            claim(self.store, &self.params.run, Train::NAME, config, patience, self.watch)
+        };
+        agreed(self.ranks, begun())
+    }
+
     fn checkpoints(&self, stage: &str) -> Checkpoints<'a> {
         Checkpoints::new(self.store, &self.params.run, stage)
     }
@@ -200,11 +255,16 @@ impl<'a> Run<'a> {
     fn phrases(&self, family: Family, progress: &dyn Progress) -> anyhow::Result<TrainingPhrases> {
         let Params { machine, dry_run, .. } = self.params;
         let (store, watch) = (self.store, self.watch);
-        read_phrases(store, Train::NAME, (machine, family), None, progress, watch, *dry_run)
+        let is_dry_run = *dry_run || !self.ranks.is_first();
+        let machine = (machine, family);
+        let read = read_phrases(store, Train::NAME, machine, None, progress, watch, is_dry_run);
+        let phrases = agreed(self.ranks, read)?;
+        check_same(self.ranks, &self.params.store, phrases.dataset.fingerprint())?;
+        Ok(phrases)
     }
 
     /// Removes what the run has left, so that it can begin anew.
-    fn clear(&mut self) -> anyhow::Result<()> {
+    fn clear(&self) -> anyhow::Result<()> {
         for stage in STAGES {
             self.checkpoints(stage).clear()?;
             self.journal(stage)?.clear()?;
@@ -261,21 +321,18 @@ impl<'a> Run<'a> {
         let mut account = TrainSummary::new(&params.run, self.store, phrases.left_out.clone());
 
         let augmented = windows(config.diffusion.augmentation.clone());
-        let mut learner =
+        let learner =
             DiffusionLearner::new(&config.network, &config.diffusion, &augmented, params.seed)?
                 .on(&threads);
+        let mut learner = agreed(self.ranks, learner.among(self.ranks).map_err(Into::into))?;
         if params.budget.keep == KeptCheckpoint::Motion
+            && self.ranks.is_first()
             && let Some(judge) =
                 ValidationJudge::new(&config.network, &phrases.dataset, &scales.features)?
         {
             learner = learner.judged_by(judge);
         }
-        // Only now is it certain that there is something to train and to train on.
-        if params.force {
-            self.clear()?;
-        }
-        let patience = params.machine.patience();
-        claim(self.store, &params.run, Train::NAME, config, patience, self.watch)?;
+        self.begin(config)?;
         let end = self.stage(
             config,
             params.budget.of_denoiser(config.diffusion.batch_size),
@@ -286,26 +343,29 @@ impl<'a> Run<'a> {
         if end == TrainingEnd::Interrupted {
             return Ok(Box::new(account.interrupted(&resume_command(params))));
         }
-        account.beside(learner.baselines()?);
+        if self.ranks.is_first() {
+            account.beside(learner.baselines()?);
+        }
         drop(learner);
 
         let (unet, list) = UNet1D::new(&config.network.unet);
-        let weights = best_unet(&self.checkpoints(DiffusionLearner::STAGE), &params.run, list)?;
         let arena = Arena::default();
         let takes_style = config.network.unet.style_dim > 0;
-        let denoiser = Denoiser { unet: &unet, parameters: &weights, arena: &arena, takes_style };
-        let schedule = Schedule::new(&config.network.diffusion)?;
         let augmented =
             windows(Augmentation { condition_noise: 0.0, ..config.diffusion.augmentation.clone() });
-        let mut learner = DecoderLearner::new(
-            &config.network.decoder,
-            &config.decoder,
-            denoiser,
-            schedule,
-            &augmented,
-            params.seed,
-        )
-        .on(&threads);
+        let checkpoints = self.checkpoints(DiffusionLearner::STAGE);
+        let best = || best_unet(&checkpoints, &params.run, list);
+        let weights = self.ranks.is_first().then(best).transpose()?;
+        // A decoder's step takes milliseconds: one process is faster than several that wait for each other.
+        let mut learner = ByOne::new(self.ranks, weights.as_ref(), |weights| {
+            let schedule = Schedule::new(&config.network.diffusion)?;
+            let denoiser =
+                Denoiser { unet: &unet, parameters: weights, arena: &arena, takes_style };
+            let (decoder, training) = (&config.network.decoder, &config.decoder);
+            let learner =
+                DecoderLearner::new(decoder, training, denoiser, schedule, &augmented, params.seed);
+            Ok::<_, anyhow::Error>(learner.on(&threads))
+        })?;
         let end = self.stage(
             config,
             params.budget.of_decoder(config.decoder.batch_size),
@@ -341,24 +401,58 @@ impl<'a> Run<'a> {
             windows.dataset().fingerprint(),
             windows.scales().clone(),
         );
-        let state = restore(learner, &checkpoints, state, &self.params.run, self.watch)?;
+        let state = self.restore(learner, &checkpoints, state)?;
         let (run, dataset) = (&self.params.run, windows.dataset());
-        remember(self.store, run, Train::NAME, dataset, patience, self.watch)?;
+        if self.ranks.is_first() {
+            remember(self.store, run, Train::NAME, dataset, patience, self.watch)?;
+        }
         let started_at = state.progress.step;
         let mut drive = Drive {
             plan,
             state,
             checkpoints,
-            journal: self.journal(L::STAGE)?,
+            journal: self.ranks.is_first().then(|| self.journal(L::STAGE)).transpose()?,
+            ranks: Arc::clone(self.ranks),
             watch: self.watch,
             anchor: claim_path(&self.params.run, Train::NAME),
         };
         let machine = &self.params.machine;
-        let end = drive.run(learner, |first| {
-            Loader::start(windows, plan.batch_size as usize, first, machine.loader_threads)
+        let end = drive.run(learner, |first, ownership| {
+            let (size, n_threads) = (plan.batch_size as usize, machine.loader_threads);
+            Loader::start_some(windows, size, first, n_threads, ownership)
         })?;
         account.add(StageSummary::of(L::STAGE, &drive.state.progress, started_at, end));
         Ok(end)
+    }
+
+    /// Takes up the newest checkpoint that the first process can read, on all of them.
+    fn restore<L, C>(
+        &self,
+        learner: &mut L,
+        checkpoints: &Checkpoints,
+        fresh: State<C>,
+    ) -> anyhow::Result<State<C>>
+    where
+        L: Learner,
+        C: serde::Serialize + serde::de::DeserializeOwned,
+    {
+        let (run, ranks) = (&self.params.run, self.ranks);
+        if ranks.is_first() {
+            let state = agreed(ranks, restore(learner, checkpoints, fresh, run, self.watch))?;
+            ranks.of_first(&[state.progress.step as f64])?;
+            return agreed(ranks, Ok(state));
+        }
+        agreed(ranks, Ok(()))?;
+        let step = ranks.of_first(&[])?.first().copied().unwrap_or_default() as u64;
+        if step == 0 {
+            return agreed(ranks, Ok(fresh));
+        }
+        let read = checkpoints.read(CheckpointKind::Step, step, |archive, place| {
+            let state = State::<C>::of(archive, place)?;
+            learner.restore(archive, place, &state.progress)?;
+            Ok(state)
+        });
+        agreed(ranks, read.map_err(Into::into))
     }
 }
 
