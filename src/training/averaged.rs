@@ -2,9 +2,7 @@
 
 use std::sync::Arc;
 
-use crate::autodiff::{
-    AdamW, Gradients, Parameters, SHARD_CHUNK, Shard, norm_of, part_of, squares,
-};
+use crate::autodiff::{AdamW, Gradients, Parameters, SHARD_CHUNK, norm_of, part_of, squares};
 use crate::weights::{Archive, Section};
 
 use super::checkpoint::Progress;
@@ -50,9 +48,7 @@ impl NetworkState {
     /// Keeps a share of the average and of the moments alone, before the first step.
     pub fn among(&mut self, ranks: &Arc<Ranks>) {
         self.ranks = Arc::clone(ranks);
-        let average = self.ema.average().part(Shard::WHOLE);
-        self.ema =
-            Ema::resume(self.ema_config, average, self.ema.n_updates()).shared(ranks.shard());
+        self.ema = Ema::new(self.ema_config, &self.parameters).shared(ranks.shard());
     }
 
     /// Returns the weights themselves.

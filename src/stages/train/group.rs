@@ -26,15 +26,18 @@ pub fn run(
     ranks: &Arc<Ranks>,
     progress: &dyn Progress,
 ) -> anyhow::Result<Box<dyn Summary>> {
-    let config = params.config.group_config(params.seed).with_context(|| {
-        format!(
-            "--preset {} is none of the family group; give tiny, small or base",
-            params.config.network.preset.name()
-        )
-    })?;
-    config.network.check()?;
-    check_numbers(&config)?;
-    let store = Location::open(&params.store, &params.client.options())?;
+    let checked = || -> anyhow::Result<_> {
+        let config = params.config.group_config(params.seed).with_context(|| {
+            format!(
+                "--preset {} is none of the family group; give tiny, small or base",
+                params.config.network.preset.name()
+            )
+        })?;
+        config.network.check()?;
+        check_numbers(&config)?;
+        Ok((config, Location::open(&params.store, &params.client.options())?))
+    };
+    let (config, store) = agreed(ranks, checked())?;
     let watch = ProgressWatch(progress);
     let lease = agreed(ranks, lease(params, &store, ranks, &watch))?;
     let mut run = Run { params, store: &store, watch: &watch, lease: lease.as_ref(), ranks };

@@ -91,14 +91,16 @@ impl Stage for Train {
     type Params = Params;
 
     fn run(params: Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
-        check_run_name(&params.run)?;
-        ranks::on_all(progress, |ranks, progress| match params.config.network.family {
-            Family::Unet => train(&params, ranks, progress),
-            Family::Group => group::run(&params, ranks, progress),
-            Family::Tokens if params.config.tokens.tokenizer.is_some() => {
-                planner::run(&params, ranks, progress)
+        ranks::on_all(progress, |ranks, progress| {
+            agreed(ranks, check_run_name(&params.run))?;
+            match params.config.network.family {
+                Family::Unet => train(&params, ranks, progress),
+                Family::Group => group::run(&params, ranks, progress),
+                Family::Tokens if params.config.tokens.tokenizer.is_some() => {
+                    planner::run(&params, ranks, progress)
+                }
+                Family::Tokens => tokens::run(&params, ranks, progress),
             }
-            Family::Tokens => tokens::run(&params, ranks, progress),
         })
     }
 }
@@ -109,7 +111,7 @@ fn train(
     ranks: &Arc<Ranks>,
     progress: &dyn Progress,
 ) -> anyhow::Result<Box<dyn Summary>> {
-    let checked = || {
+    let checked = || -> anyhow::Result<_> {
         let config = params.config.config(params.seed);
         config.network.check()?;
         check_numbers(params, &config)?;
@@ -226,7 +228,7 @@ impl<'a> Run<'a> {
     where
         C: serde::Serialize + serde::de::DeserializeOwned,
     {
-        let begun = || {
+        let begun = || -> anyhow::Result<()> {
             if !self.ranks.is_first() {
                 return Ok(());
             }
@@ -439,14 +441,16 @@ impl<'a> Run<'a> {
         let (run, ranks) = (&self.params.run, self.ranks);
         if ranks.is_first() {
             let state = agreed(ranks, restore(learner, checkpoints, fresh, run, self.watch))?;
-            ranks.of_first(&[state.progress.step as f64])?;
+            let (step, n_steps) = (state.progress.step, state.progress.n_steps);
+            // Steps in all are chosen before the first is saved.
+            ranks.of_first(&[f64::from(u8::from(n_steps > 0)), step as f64])?;
             return agreed(ranks, Ok(state));
         }
         agreed(ranks, Ok(()))?;
-        let step = ranks.of_first(&[])?.first().copied().unwrap_or_default() as u64;
-        if step == 0 {
-            return agreed(ranks, Ok(fresh));
-        }
+        let step = match ranks.of_first(&[])?[..] {
+            [has_checkpoint, step] if has_checkpoint > 0.0 => step as u64,
+            _ => return agreed(ranks, Ok(fresh)),
+        };
         let read = checkpoints.read(CheckpointKind::Step, step, |archive, place| {
             let state = State::<C>::of(archive, place)?;
             learner.restore(archive, place, &state.progress)?;

@@ -27,24 +27,28 @@ pub fn run(
     ranks: &Arc<Ranks>,
     progress: &dyn Progress,
 ) -> anyhow::Result<Box<dyn Summary>> {
-    let tokenizer = params.config.tokens.tokenizer.as_deref().unwrap_or_default();
-    check_run_name(tokenizer).with_context(|| format!("--tokenizer {tokenizer:?}"))?;
-    ensure!(
-        tokenizer != params.run,
-        "--run and --tokenizer are both {tokenizer}; give the planner a name of its own with --run"
-    );
-    let store = Location::open(&params.store, &params.client.options())?;
-    ensure!(
-        !TrainedPlanner::is_of(&store, tokenizer)?,
-        "--tokenizer {tokenizer} is a planner; name the run of the tokenizer that it was trained with"
-    );
-    ensure!(
-        !TrainedTokenizer::is_of(&store, &params.run)?,
-        "run {} is a tokenizer; give the planner a name of its own with --run",
-        params.run
-    );
-    let trained = TrainedTokenizer::read(&store, tokenizer)?;
-    let config = config(params, tokenizer, &trained)?;
+    let checked = || -> anyhow::Result<_> {
+        let tokenizer = params.config.tokens.tokenizer.as_deref().unwrap_or_default();
+        check_run_name(tokenizer).with_context(|| format!("--tokenizer {tokenizer:?}"))?;
+        ensure!(
+            tokenizer != params.run,
+            "--run and --tokenizer are both {tokenizer}; give the planner a name of its own with --run"
+        );
+        let store = Location::open(&params.store, &params.client.options())?;
+        ensure!(
+            !TrainedPlanner::is_of(&store, tokenizer)?,
+            "--tokenizer {tokenizer} is a planner; name the run of the tokenizer that it was trained with"
+        );
+        ensure!(
+            !TrainedTokenizer::is_of(&store, &params.run)?,
+            "run {} is a tokenizer; give the planner a name of its own with --run",
+            params.run
+        );
+        let trained = TrainedTokenizer::read(&store, tokenizer)?;
+        let config = config(params, tokenizer, &trained)?;
+        Ok((config, trained, store))
+    };
+    let (config, trained, store) = agreed(ranks, checked())?;
     let watch = ProgressWatch(progress);
     let lease = agreed(ranks, lease(params, &store, ranks, &watch))?;
     let mut run = Run { params, store: &store, watch: &watch, lease: lease.as_ref(), ranks };

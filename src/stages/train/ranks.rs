@@ -155,7 +155,7 @@ pub fn on_all(
         Err(error) if error.is::<SaidByFirst>() => return Ok(Box::new(Nothing)),
         joined => joined?,
     };
-    let progress = if ranks.is_first() { progress } else { &silent };
+    let progress: &dyn Progress = if ranks.is_first() { progress } else { &silent };
     let done = run(&ranks, progress);
     let is_said = |error: &anyhow::Error| {
         let is_of_all = matches!(error.downcast_ref(), Some(TrainingError::NotFinite { .. }));
@@ -165,7 +165,8 @@ pub fn on_all(
         Ok(summary) => {
             // A launcher ends the others as soon as one has ended with an error, so none ends before all are done.
             ranks.finish()?;
-            Ok(if ranks.is_first() { summary } else { Box::new(Nothing) })
+            let nothing: Box<dyn Summary> = Box::new(Nothing);
+            Ok(if ranks.is_first() { summary } else { nothing })
         }
         Err(error) if !ranks.is_first() && is_said(&error) => Ok(Box::new(Nothing)),
         Err(error) => Err(error),
@@ -200,8 +201,8 @@ impl Summary for Nothing {
         0
     }
 
-    fn is_data(&self) -> bool {
-        true
+    fn is_told(&self) -> bool {
+        false
     }
 
     fn figures(&mut self) -> serde_json::Value {

@@ -20,10 +20,10 @@ use serde::de::DeserializeOwned;
 
 use crate::autodiff::{SHARD_CHUNK, Shard};
 
+#[cfg(feature = "mpi")]
+pub use self::mpi::MpiLink;
 #[cfg(test)]
 pub use memory::{MemoryLink, together};
-#[cfg(feature = "mpi")]
-pub use mpi::MpiLink;
 pub use one::ByOne;
 
 /// Chunks of numbers that go in one exchange: 8 MB, enough that its fixed cost does not count.
@@ -134,7 +134,7 @@ impl Ranks {
     ///
     /// # Errors
     /// What making it says.
-    pub fn start<L: Link>(
+    pub fn start<L: Link + 'static>(
         make: impl FnOnce() -> Result<L, RanksError> + Send + 'static,
     ) -> Result<Arc<Self>, RanksError> {
         let (orders, given) = channel();

@@ -16,7 +16,8 @@ use ::mpi::{Rank, Threading, initialize_with_threading};
 
 use super::{Link, Message, RanksError};
 
-/// How long answers that are expected at once are asked for often.
+/// How long answers that are expected at once are asked for often: from the beginning, and without a pause once another
+/// process is seen to be there. Large messages move a little with each question.
 const BRISK: Duration = Duration::from_millis(20);
 /// Pauses between two questions: then, and later.
 const PAUSES: [Duration; 2] = [Duration::from_micros(40), Duration::from_micros(500)];
@@ -68,6 +69,7 @@ where
             .map(|(rank, one)| world.process_at_rank(rank as Rank).immediate_send(scope, &one[..]))
             .collect();
         let started = Instant::now();
+        let mut arrived = None;
         loop {
             let mut is_idle = true;
             let missing = found.iter_mut().enumerate().filter(|(_, one)| one.is_none());
@@ -79,13 +81,19 @@ where
                     message.matched_receive_into(&mut numbers[..]);
                     *one = Some(Arc::new(numbers));
                     is_idle = false;
+                    arrived = Some(Instant::now());
                 }
             }
             under_way = under_way.into_iter().filter_map(|one| one.test().err()).collect();
             if under_way.is_empty() && found.iter().all(Option::is_some) {
                 return;
             }
-            if is_idle {
+            if !is_idle {
+                continue;
+            }
+            if arrived.is_some_and(|arrived: Instant| arrived.elapsed() < BRISK) {
+                std::thread::yield_now();
+            } else {
                 let is_brisk = started.elapsed() < BRISK;
                 std::thread::sleep(PAUSES[usize::from(!is_brisk)]);
             }
