@@ -185,7 +185,7 @@ impl NetworkState {
     }
 }
 
-/// Writes the methods of [`Learner`](super::drive::Learner) that say what a checkpoint keeps, for a learner that keeps
+/// Writes the methods of [`Learner`](super::learner::Learner) that say what a checkpoint keeps, for a learner that keeps
 /// a [`NetworkState`] and nothing else.
 macro_rules! keeps_network {
     ($field:ident) => {
