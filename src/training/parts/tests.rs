@@ -14,22 +14,27 @@ use crate::training::ranks::{EXCHANGED_CHUNKS, together};
 /// Windows of a batch and numbers of each.
 const N: usize = 13;
 const WIDTH: usize = 24;
-/// Wide enough that a gradient takes three exchanges, the last of them short.
-const HIDDEN: usize = 1500;
+/// Wide enough that a gradient takes two exchanges, the second of them short.
+const HIDDEN: usize = 1200;
 
-/// Three layers, of which the second is run again for its gradient and serves twice, and one that plays no part.
-fn network() -> (ParameterList, [ParameterId; 7]) {
+/// Four layers, of which the second is run again for its gradient and serves twice, and a vector that plays no part.
+///
+/// It lies first, so that the numbers before the middle of the second layer leave at the end alone, and those behind it as
+/// soon as that layer has been passed for the second time.
+fn network() -> (ParameterList, [ParameterId; 8]) {
     let mut list = ParameterList::default();
     let mut root = Scope::root(&mut list);
     let mut weight = |name: &str, shape: &[usize], role| {
         root.parameter(name, shape, Init::Uniform { bound: 0.05 }, role)
     };
+    weight("idle", &[40], Role::Vector);
     let ids = [
         weight("first.weight", &[HIDDEN, WIDTH], Role::Weight),
         weight("first.bias", &[HIDDEN], Role::Vector),
+        weight("third.weight", &[HIDDEN, HIDDEN], Role::Weight),
+        weight("third.bias", &[HIDDEN], Role::Vector),
         weight("second.weight", &[HIDDEN, HIDDEN], Role::Weight),
         weight("second.bias", &[HIDDEN], Role::Vector),
-        weight("idle.weight", &[HIDDEN, HIDDEN], Role::Weight),
         weight("last.weight", &[1, HIDDEN], Role::Weight),
         weight("last.bias", &[1], Role::Vector),
     ];
@@ -44,7 +49,7 @@ fn windows() -> Vec<f32> {
 fn differentiate(
     parts: &mut Parts,
     parameters: &Parameters<f32>,
-    ids: [ParameterId; 7],
+    ids: [ParameterId; 8],
 ) -> Vec<f64> {
     let x = windows();
     let n_parts = parts.number(N);
@@ -56,7 +61,7 @@ fn differentiate(
             let number = part.number;
             let (first, end) = (at(number), at(number + 1));
             let mut tape = Tape::new(parameters, part.arena, Some(number as u64));
-            let [w1, b1, w2, b2, _, w3, b3] = ids;
+            let [w1, b1, w3, b3, w2, b2, w4, b4] = ids;
             let x = tape.constant(&[end - first, WIDTH], &x[first * WIDTH..end * WIDTH]);
             let h = tape.linear(&x, w1, Some(b1))?;
             let mut h = tape.activation(&h, Activation::Silu)?;
@@ -66,7 +71,9 @@ fn differentiate(
                     g.activation(&h, Activation::Silu)
                 })?;
             }
-            let y = tape.linear(&h, w3, Some(b3))?;
+            let h = tape.linear(&h, w3, Some(b3))?;
+            let h = tape.activation(&h, Activation::Silu)?;
+            let y = tape.linear(&h, w4, Some(b4))?;
             let y = tape.mul(&y, &y)?;
             let loss = tape.apply(Reduce::mean(Over::All), &[&y])?;
             let value = f64::from(loss.scalar());
@@ -107,9 +114,8 @@ fn train(ranks: &Arc<Ranks>, (accumulate, side_by_side): (usize, usize)) -> Foun
 #[test]
 fn any_number_of_processes_ends_with_the_same_bits() {
     let n = Parameters::<f32>::new(network().0, 7).plan().len();
-    assert!(n > 2 * EXCHANGED_CHUNKS * SHARD_CHUNK && !n.is_multiple_of(SHARD_CHUNK), "{n}");
-    for (plan, sizes) in [((1, 2), &[2][..]), ((2, 6), &[2, 3, 6]), ((1, 4), &[4]), ((9, 2), &[2])]
-    {
+    assert!(n > EXCHANGED_CHUNKS * SHARD_CHUNK && !n.is_multiple_of(SHARD_CHUNK), "{n}");
+    for (plan, sizes) in [((1, 2), &[2][..]), ((2, 6), &[3, 6]), ((9, 2), &[2])] {
         let alone = train(&Ranks::alone(), plan);
         assert!(alone.1.iter().all(|norm| *norm > 0.0));
         for &size in sizes {
@@ -151,7 +157,7 @@ fn a_process_keeps_its_share_of_the_moments_alone() {
         (strange.clone().count(), strange.filter(|&chunk| zero(chunk)).count())
     });
     for (n_strange, n_zero) in found {
-        assert!(n_strange > 20 && n_strange == n_zero, "{n_zero} of {n_strange} chunks are zero");
+        assert!(n_strange > 15 && n_strange == n_zero, "{n_zero} of {n_strange} chunks are zero");
     }
 }
 
