@@ -93,7 +93,15 @@ fn host() -> String {
 
 /// Ends all processes with a sentence that the first one says.
 fn refuse<T>(ranks: &Ranks, sentence: String) -> anyhow::Result<T> {
+    take_leave(ranks);
     if ranks.is_first() { bail!(sentence) } else { bail!(SaidByFirst) }
+}
+
+/// Takes leave of the others where all end with an error at the same place: a launcher kills those that are left when one
+/// ends without, before the first has said why.
+fn take_leave(ranks: &Ranks) {
+    // Whoever is gone already has said why.
+    ranks.finish().ok();
 }
 
 /// An error that the first process reports.
@@ -116,7 +124,10 @@ pub fn agreed<T>(ranks: &Ranks, outcome: anyhow::Result<T>) -> anyhow::Result<T>
     });
     match (failed, outcome) {
         (None, outcome) => outcome,
-        (Some((0, ..)), Err(own)) if ranks.is_first() => Err(own),
+        (Some((0, ..)), Err(own)) if ranks.is_first() => {
+            take_leave(ranks);
+            Err(own)
+        }
         (Some((rank, sentence, host)), _) => {
             refuse(ranks, format!("rank {rank} on {host}: {sentence}"))
         }
@@ -157,10 +168,13 @@ pub fn on_all(
     };
     let progress: &dyn Progress = if ranks.is_first() { progress } else { &silent };
     let done = run(&ranks, progress);
-    let is_said = |error: &anyhow::Error| {
-        let is_of_all = matches!(error.downcast_ref(), Some(TrainingError::NotFinite { .. }));
-        error.is::<SaidByFirst>() || is_of_all
+    let is_of_all = |error: &anyhow::Error| {
+        matches!(error.downcast_ref(), Some(TrainingError::NotFinite { .. }))
     };
+    if done.as_ref().err().is_some_and(is_of_all) {
+        take_leave(&ranks);
+    }
+    let is_said = |error: &anyhow::Error| error.is::<SaidByFirst>() || is_of_all(error);
     match done {
         Ok(summary) => {
             // A launcher ends the others as soon as one has ended with an error, so none ends before all are done.
