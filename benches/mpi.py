@@ -20,7 +20,7 @@ import time
 HERE = pathlib.Path(__file__).resolve().parent.parent
 
 
-def ranks_of(store):
+def ranks_of(motiongen, store):
     """Processes of motiongen that train in a store: process number → (VmRSS, VmHWM) in bytes."""
     found = {}
     for entry in pathlib.Path("/proc").iterdir():
@@ -28,7 +28,7 @@ def ranks_of(store):
             continue
         try:
             words = (entry / "cmdline").read_bytes().split(b"\0")
-            if not words[0].endswith(b"/motiongen") or str(store).encode() not in words:
+            if words[0] != str(motiongen).encode() or str(store).encode() not in words:
                 continue
             lines = (entry / "status").read_text().splitlines()
         except OSError:
@@ -39,13 +39,13 @@ def ranks_of(store):
     return found
 
 
-def run(command, store):
+def run(motiongen, command, store):
     """Runs a training; returns its wall time and the memory of its ranks: [(median VmRSS, VmHWM)]."""
     started = time.monotonic()
     process = subprocess.Popen(command)
     seen = {}
     while process.poll() is None:
-        for pid, sizes in ranks_of(store).items():
+        for pid, sizes in ranks_of(motiongen, store).items():
             seen.setdefault(pid, []).append(sizes)
         time.sleep(0.25)
     if process.returncode != 0:
@@ -57,12 +57,12 @@ def run(command, store):
     return time.monotonic() - started, [memory(seen[pid]) for pid in sorted(seen)]
 
 
-def steps(motiongen, store, name):
+def steps(motiongen, store, name, batch_size):
     """Seconds of each step but the first three."""
     sql = f"SELECT samples_per_s FROM training_log WHERE run = '{name}' AND stage = 'diffusion' AND kind = 'step' ORDER BY step"
     told = subprocess.run([motiongen, "query", "--store", store, sql, "--format", "csv"], check=True,
                           capture_output=True, text=True).stdout.split()
-    return [1 / float(rate) for rate in told[1:]][3:]
+    return [batch_size / float(rate) for rate in told[1:]][3:]
 
 
 def main():
@@ -89,8 +89,8 @@ def main():
             for what, start, threads in [("1 rank of 2 threads", [], 2), ("2 ranks of 1 thread", [*launcher, "-n", "2"], 1)]:
                 name = f"{what[0]}-{turn}"
                 command = [*start, motiongen, *usual, "--run", name, "--threads", threads]
-                wall_s, memory = run(list(map(str, command)), store)
-                times = steps(motiongen, store, name)
+                wall_s, memory = run(motiongen, list(map(str, command)), store)
+                times = steps(motiongen, store, name, arguments.batch_size)
                 told = ", ".join(f"{rss / 1e6:.0f} MB (at most {peak / 1e6:.0f})" for rss, peak in memory)
                 print(f"{what}: step {statistics.median(times):.3f} s (of {len(times)}, {min(times):.3f} to {max(times):.3f}), "
                       f"memory {told}, whole run {wall_s:.0f} s", flush=True)
