@@ -70,6 +70,11 @@ cluster: ## submit all stages to Slurm as a chain: make cluster SOURCE=… STORE
 cluster-demo: build build-diff-tables ## start a Slurm of two nodes here, kill one under ingest, extract and generate, and compare the tables
 	@$(PYTHON) pipelines/slurm/demo.py --bin $(BIN)
 
+.PHONY: mpi-demo
+mpi-demo: ## train by two processes of mpirun, of which one is killed, and compare the bits with those of one process
+	$(CARGO) build --locked --features mpi --bin motiongen
+	@$(PYTHON) pipelines/mpi/demo.py --bin $(BIN)
+
 .PHONY: check-kubernetes
 check-kubernetes: build/kubernetes-venv/ready ## hold the manifests of pipelines/kubernetes against the API's schema
 	@build/kubernetes-venv/bin/python pipelines/kubernetes/check.py

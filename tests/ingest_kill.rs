@@ -85,6 +85,12 @@ impl Running {
         self.0.try_wait().expect("a child's status").is_none()
     }
 
+    /// Waits for the program's end, and returns its exit code.
+    #[cfg(feature = "mpi")]
+    pub fn wait(mut self) -> Option<i32> {
+        self.0.wait().expect("a child's status").code()
+    }
+
     /// Ends the program at once, and returns whether that cut it short.
     pub fn kill(mut self) -> bool {
         self.0.kill().expect("a child that can be killed");

@@ -29,6 +29,7 @@ mod library;
 mod linear;
 mod motion_capture;
 mod motion_formats;
+mod mpi;
 mod notebooks;
 mod npy_files;
 mod object_store_conformance;

@@ -53,7 +53,7 @@ const MAY_USE: [(&str, &[&str]); 22] = [
 ];
 
 /// Crates that only one place may name: crate, where.
-const KEPT_TO: [(&str, &str); 19] = [
+const KEPT_TO: [(&str, &str); 20] = [
     ("polars", "store/query"),
     ("sqlparser", "store/sql.rs"),
     ("object_store", "store/"),
@@ -73,6 +73,7 @@ const KEPT_TO: [(&str, &str); 19] = [
     ("rustysynth", "music/"),
     ("pathfinding", "motion/group/"),
     ("prost", "onnx/"),
+    ("mpi", "training/ranks/"),
 ];
 
 fn walk(folder: &Path, found: &mut BTreeMap<PathBuf, String>) {

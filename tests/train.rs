@@ -108,7 +108,7 @@ fn log(store: &Path, run: &str, stage: &str) -> Vec<TrainingLogRow> {
 }
 
 /// Returns steps and the bits of their losses.
-fn losses(store: &Path, run: &str, stage: &str) -> Vec<(i64, Option<u64>)> {
+pub fn losses(store: &Path, run: &str, stage: &str) -> Vec<(i64, Option<u64>)> {
     log(store, run, stage)
         .into_iter()
         .filter(|row| row.kind == "step")
@@ -117,7 +117,7 @@ fn losses(store: &Path, run: &str, stage: &str) -> Vec<(i64, Option<u64>)> {
 }
 
 /// Returns the files of a run's stage that begin with `kind`, oldest step first.
-fn checkpoints(store: &Path, run: &str, stage: &str, kind: &str) -> Vec<PathBuf> {
+pub fn checkpoints(store: &Path, run: &str, stage: &str, kind: &str) -> Vec<PathBuf> {
     let Ok(entries) = std::fs::read_dir(store.join("runs").join(run).join(stage)) else {
         return Vec::new();
     };
@@ -135,7 +135,7 @@ fn numbers(path: &Path) -> Vec<u8> {
 }
 
 /// Returns the numbers of the newest checkpoint, and what it is called.
-fn newest(store: &Path, run: &str, stage: &str, kind: &str) -> (String, Vec<u8>) {
+pub fn newest(store: &Path, run: &str, stage: &str, kind: &str) -> (String, Vec<u8>) {
     let path = checkpoints(store, run, stage, kind).pop().expect("a checkpoint");
     (path.file_name().expect("a name").to_string_lossy().into_owned(), numbers(&path))
 }

@@ -9,9 +9,10 @@ use super::arena::Arena;
 use super::element::Element;
 use super::kernel::vectorized;
 use super::parameters::{Gradients, Parameters};
+use super::shard::{SHARD_CHUNK, Shard, chunk_range};
 
 /// Elements of a chunk: four streams of it (1 MB of `f32`) stay in the second cache.
-const CHUNK: usize = 1 << 16;
+const CHUNK: usize = SHARD_CHUNK;
 /// The number that PyTorch adds to the norm before it divides by it.
 const CLIP_EPSILON: f64 = 1e-6;
 
@@ -80,8 +81,10 @@ vectorized! {
     }
 }
 
-/// Returns √Σ x² of numbers whose count is a multiple of 16; chunks are summed in their order, in f64.
-fn norm<E: Element>(x: &[E]) -> f64 {
+/// Returns Σ x² of each chunk of a process's share, in order, in f64.
+///
+/// The norm of all is √Σ of the sums of all chunks in their order, see [`norm_of`], whoever computed them.
+pub fn squares<E: Element>(x: &[E], shard: Shard) -> Vec<f64> {
     let part = |x: &[E]| {
         // Lanes join the f64 sum every 1,024 numbers, so that their rounding stays small.
         let run = |x: &[E]| {
@@ -91,8 +94,13 @@ fn norm<E: Element>(x: &[E]) -> f64 {
         };
         x.chunks(1024).map(run).sum::<f64>()
     };
-    let parts: Vec<f64> = x.par_chunks(CHUNK).map(part).collect();
-    parts.iter().sum::<f64>().sqrt()
+    let ranges: Vec<_> = shard.ranges(x.len()).collect();
+    ranges.into_par_iter().map(|range| part(&x[range])).collect()
+}
+
+/// Returns √Σ of the squares of chunks in their order.
+pub fn norm_of(squares: &[f64]) -> f64 {
+    squares.iter().sum::<f64>().sqrt()
 }
 
 impl<E: Element> AdamW<E> {
@@ -110,8 +118,16 @@ impl<E: Element> AdamW<E> {
 
     /// Takes up a state, which must lie as the parameters do.
     pub fn restore(&mut self, moments: [&[E]; 2], n_steps: u64) {
+        self.restore_shard(moments, n_steps, Shard::WHOLE);
+    }
+
+    /// Takes up a process's share of a state.
+    pub fn restore_shard(&mut self, moments: [&[E]; 2], n_steps: u64, shard: Shard) {
         for (own, given) in self.moments.iter_mut().zip(moments) {
-            own.as_slice_mut().expect("one run of memory").copy_from_slice(given);
+            let own = own.as_slice_mut().expect("one run of memory");
+            for range in shard.ranges(given.len()) {
+                own[range.clone()].copy_from_slice(&given[range]);
+            }
         }
         self.n_steps = n_steps;
     }
@@ -135,11 +151,26 @@ impl<E: Element> AdamW<E> {
         gradients: &mut Gradients<E>,
         learning_rate: impl Fn(&Parameter) -> f64,
     ) -> f64 {
-        let gradients = &*gradients.all();
-        let norm = norm(gradients);
+        let norm = norm_of(&squares(gradients.all(), Shard::WHOLE));
+        self.step_shard(parameters, gradients, norm, Shard::WHOLE, learning_rate);
+        norm
+    }
+
+    /// Takes one step of a process's share of the parameters, given the norm of the whole gradient.
+    ///
+    /// Where the norm is not finite nothing changes, and the step does not count.
+    pub fn step_shard(
+        &mut self,
+        parameters: &mut Parameters<E>,
+        gradients: &mut Gradients<E>,
+        norm: f64,
+        shard: Shard,
+        learning_rate: impl Fn(&Parameter) -> f64,
+    ) {
         if !norm.is_finite() {
-            return norm;
+            return;
         }
+        let gradients = &*gradients.all();
         self.n_steps += 1;
         let AdamWConfig { betas, epsilon, weight_decay, max_norm } = self.config;
         let n = self.n_steps as f64;
@@ -164,17 +195,23 @@ impl<E: Element> AdamW<E> {
             let decay = if decays { weight_decay } else { 0.0 };
             let by = update(learning_rate(parameter), decay);
             let range = plan.range(id);
-            skip(&mut rest, range.start - done);
-            let mut left = range.len();
-            while left > 0 {
-                let n = left.min(CHUNK);
-                chunks.push((skip(&mut rest, n), by));
-                left -= n;
+            for chunk in range.start / CHUNK..range.end.div_ceil(CHUNK) {
+                if !shard.owns(chunk) {
+                    continue;
+                }
+                let whole = chunk_range(chunk, plan.len());
+                let own = whole.start.max(range.start)..whole.end.min(range.end);
+                skip(&mut rest, own.start - done);
+                chunks.push((skip(&mut rest, own.len()), by));
+                done = own.end;
             }
-            done = range.end;
         }
         chunks.into_par_iter().for_each(|((p, g, m, v), by)| update_chunk(p, g, m, v, &by));
-        norm
+    }
+
+    /// Returns both moments for writing.
+    pub fn moments_mut(&mut self) -> [&mut Array1<E>; 2] {
+        self.moments.each_mut()
     }
 }
 

@@ -21,6 +21,11 @@ pub trait Operation<E: Element>: Send + 'static {
         None
     }
 
+    /// Returns all of its parameters.
+    fn parameters(&self) -> [Option<ParameterId>; 2] {
+        [self.parameter(), None]
+    }
+
     /// Computes the result.
     ///
     /// # Errors

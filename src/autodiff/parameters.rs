@@ -17,6 +17,7 @@ use super::element::Element;
 use super::kernel::{PANEL, pack_weight, packed_len, unpack_weight};
 use super::op::elementwise::update;
 use super::random::initial;
+use super::shard::Shard;
 
 /// Where each parameter lies.
 #[derive(Debug)]
@@ -175,15 +176,39 @@ impl<E: Element> Parameters<E> {
         self.plan.unpack(id, self.all())
     }
 
-    /// Moves towards others by a share of the way: θ ← θ + share (other − θ).
+    /// Moves a process's share towards others by a share of the way: θ ← θ + share (other − θ).
     ///
     /// # Panics
     /// When the others are of another network.
-    pub fn approach(&mut self, other: &Self, share: f64) {
+    pub fn approach(&mut self, other: &Self, share: f64, shard: Shard) {
         let (share, other) = (E::from_f64(share), other.all());
         assert_eq!(self.all().len(), other.len(), "parameters of one network");
-        update(self.all_mut(), other, move |x, y| x + share * (y - x));
+        let step = move |x, y| x + share * (y - x);
+        if shard.is_whole() {
+            return update(self.all_mut(), other, step);
+        }
+        for range in shard.ranges(other.len()) {
+            update(&mut self.all_mut()[range.clone()], &other[range], step);
+        }
     }
+
+    /// Returns a copy of a process's share; the rest is zero, in memory that is not touched.
+    pub fn part(&self, shard: Shard) -> Self {
+        if shard.is_whole() {
+            return self.clone();
+        }
+        Self { plan: Arc::clone(&self.plan), values: part_of(self.all(), shard) }
+    }
+}
+
+/// Returns a copy of a process's share of some numbers; the rest is zero, in memory that is not touched.
+pub fn part_of<E: Element>(values: &[E], shard: Shard) -> Array1<E> {
+    let mut part = Arena::aligned(values.len());
+    let all = part.as_slice_mut().expect("one run of memory");
+    for range in shard.ranges(values.len()) {
+        all[range.clone()].copy_from_slice(&values[range]);
+    }
+    part
 }
 
 /// The gradients of a network's parameters.
@@ -246,6 +271,22 @@ impl<E: Element> Gradients<E> {
             }
         }
         values
+    }
+
+    /// Returns the gradients in a range whose parameters are all final; those that nothing was added to are zero.
+    pub fn settled(&mut self, ids: Range<usize>, range: Range<usize>) -> &mut [E] {
+        let values = self.values.as_slice_mut().expect("one run of memory");
+        for id in ids {
+            if !std::mem::replace(&mut self.written[id], true) {
+                values[self.plan.range(ParameterId(id))].fill(E::ZERO);
+            }
+        }
+        &mut values[range]
+    }
+
+    /// Returns where each parameter lies.
+    pub fn plan(&self) -> &Arc<Plan> {
+        &self.plan
     }
 
     /// Adds all gradients of another part of the same batch.

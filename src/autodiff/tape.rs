@@ -1,6 +1,6 @@
 //! The interpreter for training: a list of what was done, to be gone through backwards.
 
-use crate::model::{GraphError, Result};
+use crate::model::{GraphError, ParameterId, Result};
 
 use super::arena::Arena;
 use super::element::Element;
@@ -26,6 +26,30 @@ pub struct Tape<'p, E: Element> {
     n_random: u64,
     recording: bool,
     check_finite: bool,
+    /// How often each parameter was used.
+    n_uses: Vec<u32>,
+}
+
+/// Hears of every parameter whose gradient nothing will be added to any more.
+pub type OnFinal<'h, E> = dyn FnMut(ParameterId, &mut Gradients<E>) + 'h;
+
+/// Uses of parameters that a backward has still to come to.
+struct Uses<'h, 'f, E: Element> {
+    left: Vec<u32>,
+    on_final: Option<&'h mut OnFinal<'f, E>>,
+}
+
+impl<E: Element> Uses<'_, '_, E> {
+    /// Counts an operation that was passed.
+    fn passed(&mut self, parameters: [Option<ParameterId>; 2], gradients: &mut Gradients<E>) {
+        let Some(on_final) = &mut self.on_final else { return };
+        for id in parameters.into_iter().flatten() {
+            self.left[id.0] -= 1;
+            if self.left[id.0] == 0 {
+                on_final(id, gradients);
+            }
+        }
+    }
 }
 
 struct Node<'p, E: Element> {
@@ -73,6 +97,7 @@ impl<'p, E: Element> Tape<'p, E> {
             n_random: 0,
             recording: true,
             check_finite: false,
+            n_uses: vec![0; parameters.list().len()],
         }
     }
 
@@ -129,6 +154,33 @@ impl<'p, E: Element> Tape<'p, E> {
         d_result: Tensor<E>,
         gradients: &mut Gradients<E>,
     ) -> Result<InputGradients<E>> {
+        let mut uses = Uses { left: std::mem::take(&mut self.n_uses), on_final: None };
+        self.go_back(result, d_result, gradients, &mut uses)
+    }
+
+    /// Goes back as [`Tape::backward_from`] does, and tells of each gradient of a parameter that is final. A parameter
+    /// that plays no part in the result is not told of.
+    ///
+    /// # Errors
+    /// As [`Tape::backward`].
+    pub fn backward_telling(
+        mut self,
+        result: Tensor<E>,
+        d_result: Tensor<E>,
+        gradients: &mut Gradients<E>,
+        on_final: &mut OnFinal<'_, E>,
+    ) -> Result<InputGradients<E>> {
+        let left = std::mem::take(&mut self.n_uses);
+        self.go_back(result, d_result, gradients, &mut Uses { left, on_final: Some(on_final) })
+    }
+
+    fn go_back(
+        mut self,
+        result: Tensor<E>,
+        d_result: Tensor<E>,
+        gradients: &mut Gradients<E>,
+        uses: &mut Uses<'_, '_, E>,
+    ) -> Result<InputGradients<E>> {
         let mut slots: Vec<Option<Tensor<E>>> = Vec::new();
         slots.resize_with(self.nodes.len(), || None);
         if let Some(node) = result.node {
@@ -140,7 +192,12 @@ impl<'p, E: Element> Tape<'p, E> {
             if matches!(node.step, NodeKind::Input) {
                 continue;
             }
-            let Some(dy) = slots[place].take() else { continue };
+            let Some(dy) = slots[place].take() else {
+                if let NodeKind::Operation(operation) = &node.step {
+                    uses.passed(operation.parameters(), gradients);
+                }
+                continue;
+            };
             let needs: Vec<_> = node.inputs.iter().map(Option::is_some).collect();
             let found = match node.step {
                 NodeKind::Input => continue,
@@ -155,9 +212,10 @@ impl<'p, E: Element> Tape<'p, E> {
                             check_finite(name, id, parameters, "gradient", dx)?;
                         }
                     }
+                    uses.passed(operation.parameters(), gradients);
                     found
                 }
-                NodeKind::Part(part) => self.backward_part(part, dy, &needs, gradients)?,
+                NodeKind::Part(part) => self.backward_part(part, dy, &needs, gradients, uses)?,
             };
             for (input, dx) in node.inputs.iter().zip(found) {
                 if let (Some(input), Some(dx)) = (input, dx) {
@@ -175,6 +233,7 @@ impl<'p, E: Element> Tape<'p, E> {
         dy: Tensor<E>,
         needs: &[bool],
         gradients: &mut Gradients<E>,
+        uses: &mut Uses<'_, '_, E>,
     ) -> Result<Vec<Option<Tensor<E>>>> {
         let mut tape = Tape::new(self.parameters, &self.arena, self.seed);
         tape.n_random = part.n_random;
@@ -189,7 +248,8 @@ impl<'p, E: Element> Tape<'p, E> {
             })
             .collect();
         let y = (part.run)(&mut tape, &inputs)?;
-        let found = tape.backward_from(y, dy, gradients)?;
+        // The uses of its parameters were counted when it ran for the first time.
+        let found = tape.go_back(y, dy, gradients, uses)?;
         Ok(inputs.iter().map(|x| found.of(x).cloned()).collect())
     }
 }
@@ -223,6 +283,9 @@ impl<'p, E: Element> Interpreter for Tape<'p, E> {
         let inputs: Vec<_> = x.iter().map(|x| x.node).collect();
         let learns = operation.parameter().is_some() || inputs.iter().any(Option::is_some);
         let recording = self.recording && learns;
+        for id in operation.parameters().into_iter().flatten() {
+            self.n_uses[id.0] += 1;
+        }
         let random = self.seed.map(|seed| Stream::new(seed, self.n_random));
         let run = Run { parameters: self.parameters, arena: &self.arena, recording, random };
         let mut y = operation.forward(x, &run)?;

@@ -8,6 +8,7 @@ use anyhow::ensure;
 use super::failure::quoted;
 use super::learned::{learned_path, remember};
 use super::train::budget::{SavingParams, minutes};
+use super::train::ranks::refuse_others;
 use super::train::session::{
     MachineParams, ProgressWatch, check_run_name, claim, claim_path, lease_of, read_phrases,
 };
@@ -18,7 +19,7 @@ use crate::model::Family;
 use crate::store::Location;
 use crate::training::{
     Augmentation, CheckpointKind, Checkpoints, Drive, FinetuneConfig, FinetuneLearner, Journal,
-    Loader, OptimizerConfig, Plan, State, TemporalConfig, TrainingEnd, Windows,
+    Loader, OptimizerConfig, Plan, Ranks, State, TemporalConfig, TrainingEnd, Windows,
     WithholdProbabilities,
 };
 
@@ -286,6 +287,7 @@ impl Stage for Finetune {
     type Params = Params;
 
     fn run(params: Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
+        refuse_others(Self::NAME)?;
         params.check()?;
         let config = params.config();
         let store = Location::open(&params.store, &params.client.options())?;
@@ -372,15 +374,16 @@ impl Stage for Finetune {
             plan,
             state,
             checkpoints,
-            journal: match &lease {
+            journal: Some(match &lease {
                 Some(lease) => journal.under(lease),
                 None => journal,
-            },
+            }),
+            ranks: Ranks::alone(),
             watch: &watch,
             anchor: claim_path(run, Self::NAME),
         };
         let batch_size = plan.batch_size as usize;
-        let end = drive.run(&mut learner, |first| {
+        let end = drive.run(&mut learner, |first, _| {
             Loader::start(&windows, batch_size, first, machine.loader_threads)
         })?;
         let mut account = TrainSummary::new(run, &store, phrases.left_out);

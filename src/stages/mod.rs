@@ -131,6 +131,11 @@ pub trait Summary {
         false
     }
 
+    /// Returns whether there is anything to tell; not where another process tells it.
+    fn is_told(&self) -> bool {
+        true
+    }
+
     /// Returns the figures of the account as a JSON object, for programs; names carry units.
     fn figures(&mut self) -> serde_json::Value;
     /// Returns whether what is written is data, whose bytes are for a program, and no account for people.

@@ -1,12 +1,15 @@
 //! A network in training: its weights, their running average, and the optimizer's moments.
 
-use crate::autodiff::{AdamW, Gradients, Parameters};
+use std::sync::Arc;
+
+use crate::autodiff::{AdamW, Gradients, Parameters, SHARD_CHUNK, norm_of, part_of, squares};
 use crate::weights::{Archive, Section};
 
 use super::checkpoint::Progress;
 use super::config::OptimizerConfig;
 use super::ema::{Ema, EmaConfig};
 use super::error::TrainingError;
+use super::ranks::Ranks;
 
 /// Names of a checkpoint's sections beside that of the weights.
 pub(super) const AVERAGE: &str = "ema.";
@@ -20,6 +23,8 @@ pub struct NetworkState {
     optimizer: AdamW<f32>,
     ema: Ema<f32>,
     ema_config: EmaConfig,
+    /// Those that keep a share of the average and of the moments each.
+    ranks: Arc<Ranks>,
 }
 
 impl NetworkState {
@@ -36,7 +41,14 @@ impl NetworkState {
             ema: Ema::new(ema, &parameters),
             ema_config: ema,
             parameters,
+            ranks: Ranks::alone(),
         }
+    }
+
+    /// Keeps a share of the average and of the moments alone, before the first step.
+    pub fn among(&mut self, ranks: &Arc<Ranks>) {
+        self.ranks = Arc::clone(ranks);
+        self.ema = Ema::new(self.ema_config, &self.parameters).shared(ranks.shard());
     }
 
     /// Returns the weights themselves.
@@ -54,24 +66,79 @@ impl NetworkState {
         self.ema.average()
     }
 
-    /// Takes step number `step` (from 0); returns the norm of the gradient before it was clipped.
+    /// Takes step number `step` (from 0); returns the norm of the gradient before it was clipped. `gradients` needs to
+    /// hold the process's share alone.
     ///
     /// Where loss or gradient is not finite, nothing changes, and the norm is not finite.
+    ///
+    /// # Errors
+    /// When another process is gone.
     pub fn step(
         &mut self,
         gradients: &mut Gradients<f32>,
         loss: f64,
         learning_rate: f64,
         step: u64,
-    ) -> f64 {
+    ) -> Result<f64, TrainingError> {
         if !loss.is_finite() {
-            return f64::NAN;
+            return Ok(f64::NAN);
         }
-        let norm = self.optimizer.step(&mut self.parameters, gradients, learning_rate);
+        let shard = self.ranks.shard();
+        let norm = norm_of(&self.squares(gradients)?);
+        let rate = |_: &_| learning_rate;
+        self.optimizer.step_shard(&mut self.parameters, gradients, norm, shard, rate);
         if norm.is_finite() {
+            self.ranks.spread(self.parameters.all_mut())?;
             self.ema.after_step(step + 1, &self.parameters);
         }
-        norm
+        Ok(norm)
+    }
+
+    /// Returns Σ x² of every chunk of the gradient, whoever has it.
+    fn squares(&self, gradients: &mut Gradients<f32>) -> Result<Vec<f64>, TrainingError> {
+        let values = gradients.all();
+        let own = squares(values, self.ranks.shard());
+        if self.ranks.is_alone() {
+            return Ok(own);
+        }
+        let n_chunks = values.len().div_ceil(SHARD_CHUNK);
+        let all = self.ranks.share_numbers(&own)?;
+        let size = self.ranks.size();
+        let of_chunk = |chunk: usize| all[chunk % size].get(chunk / size).copied();
+        Ok((0..n_chunks).map(|chunk| of_chunk(chunk).unwrap_or(f64::NAN)).collect())
+    }
+
+    /// Puts the average of the weights together on the first process.
+    ///
+    /// # Errors
+    /// When another process is gone.
+    pub fn collect_average(&mut self) -> Result<(), TrainingError> {
+        Ok(self.ranks.collect(self.ema.average_mut().all_mut())?)
+    }
+
+    /// Puts everything together on the first process.
+    ///
+    /// # Errors
+    /// When another process is gone.
+    pub fn collect(&mut self) -> Result<(), TrainingError> {
+        self.collect_average()?;
+        for moment in self.optimizer.moments_mut() {
+            self.ranks.collect(moment.as_slice_mut().expect("one run of memory"))?;
+        }
+        Ok(())
+    }
+
+    /// Gives the memory back in which others' shares were put together.
+    pub fn release(&mut self) {
+        let shard = self.ranks.shard();
+        if shard.is_whole() || !self.ranks.is_first() {
+            return;
+        }
+        let average = self.ema.average_mut();
+        *average = average.part(shard);
+        for moment in self.optimizer.moments_mut() {
+            *moment = part_of(moment.as_slice().expect("one run of memory"), shard);
+        }
     }
 
     /// Returns all numbers, to go on from.
@@ -110,17 +177,30 @@ impl NetworkState {
         let read = |prefix: &str| section(archive, prefix, &self.parameters, place);
         let (parameters, average) = (read(self.prefix)?, read(AVERAGE)?);
         let [m, v] = [read(MOMENTS[0])?, read(MOMENTS[1])?];
-        self.optimizer.restore([m.all(), v.all()], at.n_updates);
-        self.ema = Ema::resume(self.ema_config, average, at.n_averaged);
+        let shard = self.ranks.shard();
+        self.optimizer.restore_shard([m.all(), v.all()], at.n_updates, shard);
+        self.ema = Ema::resume(self.ema_config, average, at.n_averaged).shared(shard);
         self.parameters = parameters;
         Ok(())
     }
 }
 
-/// Writes the methods of [`Learner`](super::drive::Learner) that say what a checkpoint keeps, for a learner that keeps
+/// Writes the methods of [`Learner`](super::learner::Learner) that say what a checkpoint keeps, for a learner that keeps
 /// a [`NetworkState`] and nothing else.
 macro_rules! keeps_network {
     ($field:ident) => {
+        fn collect_average(&mut self) -> Result<(), crate::training::TrainingError> {
+            self.$field.collect_average()
+        }
+
+        fn collect(&mut self) -> Result<(), crate::training::TrainingError> {
+            self.$field.collect()
+        }
+
+        fn release(&mut self) {
+            self.$field.release();
+        }
+
         fn sections(&self) -> Vec<crate::weights::Section<'_, f32>> {
             self.$field.sections()
         }

@@ -68,6 +68,28 @@ impl Batch {
         }
     }
 
+    /// Adds a window of which nothing is known but what it is of: another process learns from it.
+    pub(super) fn push_absent(
+        &mut self,
+        n_dancers: usize,
+        phrase: &Arc<str>,
+        condition_dim: usize,
+    ) {
+        let grow = |values: &mut Vec<f32>, width: usize| {
+            values.resize(values.len() + width, 0.0);
+        };
+        let (motion, frames) = (self.n_slots * self.n_frames * MOTION_DIM, self.n_frames);
+        grow(&mut self.motion, motion);
+        grow(&mut self.noise, motion);
+        grow(&mut self.audio, frames * condition_dim);
+        grow(&mut self.mask, frames);
+        grow(&mut self.style, STYLE_DIM);
+        self.n_dancers.push(n_dancers);
+        self.chances.push(Chances { step: 0.0, no_audio: 0.0, no_style: 0.0, no_clock: 0.0 });
+        self.phrase_ids.push(Arc::clone(phrase));
+        self.n_windows += 1;
+    }
+
     /// Returns some windows of the batch.
     ///
     /// # Panics
@@ -103,13 +125,7 @@ impl Batch {
 
     /// Returns the same windows, pair by pair, in order of the largest number of dancers of a pair.
     pub(super) fn by_number_of_dancers(&self) -> Self {
-        let mut pairs: Vec<usize> = (0..self.n_windows.div_ceil(PAIR)).collect();
-        let windows = |pair: usize| pair * PAIR..((pair + 1) * PAIR).min(self.n_windows);
-        // A window without a partner stays the last.
-        pairs.sort_by_key(|&pair| {
-            (windows(pair).len() < PAIR, windows(pair).map(|i| self.n_dancers[i]).max())
-        });
-        let order: Vec<usize> = pairs.into_iter().flat_map(windows).collect();
+        let order = order_by_dancers(&self.n_dancers);
         let sorted = |values: &[f32]| -> Vec<f32> {
             let width = values.len() / self.n_windows.max(1);
             order.iter().flat_map(|&i| &values[i * width..][..width]).copied().collect()
@@ -143,4 +159,16 @@ impl Batch {
         let (motion, noise) = (kept(&self.motion), kept(&self.noise));
         Self { n_slots, motion, noise, ..self }
     }
+}
+
+/// Returns the windows of a batch pair by pair, in order of the largest number of dancers of a pair.
+pub(super) fn order_by_dancers(n_dancers: &[usize]) -> Vec<usize> {
+    let n = n_dancers.len();
+    let mut pairs: Vec<usize> = (0..n.div_ceil(PAIR)).collect();
+    let windows = |pair: usize| pair * PAIR..((pair + 1) * PAIR).min(n);
+    // A window without a partner stays the last.
+    pairs.sort_by_key(|&pair| {
+        (windows(pair).len() < PAIR, windows(pair).map(|i| n_dancers[i]).max())
+    });
+    pairs.into_iter().flat_map(windows).collect()
 }

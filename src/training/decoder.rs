@@ -14,8 +14,8 @@ use super::averaged::{NetworkState, keeps_network};
 use super::batch::Batch;
 use super::config::DecoderTraining;
 use super::diffusion::tape_seed;
-use super::drive::{Learner, Losses, NoReduction, Reducer, StepResult, Validation};
 use super::error::TrainingError;
+use super::learner::{Learner, Losses, StepResult, Validation};
 use super::objective::{Reconstruction, reconstruction};
 use super::sampling::{Condition, Denoiser, motion_view};
 use super::window::Windows;
@@ -41,7 +41,6 @@ pub struct DecoderLearner<'u> {
     config: DecoderTraining,
     seed: u64,
     windows: Arc<Windows>,
-    reducer: Box<dyn Reducer>,
 }
 
 impl<'u> DecoderLearner<'u> {
@@ -67,7 +66,6 @@ impl<'u> DecoderLearner<'u> {
             config: config.clone(),
             seed,
             windows: Arc::clone(windows),
-            reducer: Box::new(NoReduction),
         }
     }
 
@@ -155,7 +153,6 @@ impl<'u> DecoderLearner<'u> {
         let found = self.losses(&mut tape, batch, &latents)?;
         let losses = named(&found);
         tape.backward(found.all, &mut self.gradients)?;
-        self.reducer.reduce(&mut self.gradients);
         Ok(losses)
     }
 
@@ -246,7 +243,7 @@ impl Learner for DecoderLearner<'_> {
         threads.run(|| {
             let losses = self.differentiate(batch, step)?;
             let gradient_norm =
-                self.network.step(&mut self.gradients, losses.total, learning_rate, step);
+                self.network.step(&mut self.gradients, losses.total, learning_rate, step)?;
             Ok(StepResult { losses, gradient_norm, learning_rate, lr_decoder: None })
         })
     }

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 use std::sync::Arc;
 
 use crate::audio::FEATURE_DIM;
-use crate::autodiff::{Arena, Eager, Gradients, Interpreter, Parameters, Tape, Tensor, Threads};
+use crate::autodiff::{Eager, Interpreter, Parameters, Tape, Tensor, Threads};
 use crate::diffusion::Schedule;
 use crate::model::{Graph as _, UNet1D, UNetInputs};
 use crate::motion::style::STYLE_DIM;
@@ -13,10 +13,12 @@ use crate::motion::{MOTION_DIM, Normalizer};
 use super::averaged::{NetworkState, keeps_network};
 use super::batch::Batch;
 use super::config::{DiffusionTraining, NetworkConfig};
-use super::drive::{Learner, Losses, NoReduction, Reducer, StepResult, Validation};
 use super::error::TrainingError;
 use super::judge::{SampleJudge, sampled_distance};
+use super::learner::{Learner, Losses, Ownership, StepResult, Validation};
 use super::objective::Objective;
+use super::parts::Parts;
+use super::ranks::Ranks;
 use super::sampling::{Denoiser, is_partial, motion_view};
 use super::window::Windows;
 
@@ -41,17 +43,12 @@ pub struct Baselines {
 pub struct DiffusionLearner {
     unet: Arc<UNet1D>,
     network: NetworkState,
-    /// Of the parts that are done side by side; the first gathers all.
-    gradients: Vec<Gradients<f32>>,
-    /// Of the parts that are done side by side.
-    arenas: Vec<Arena<f32>>,
-    threads: Arc<Threads>,
+    parts: Parts,
     schedule: Schedule,
     config: DiffusionTraining,
     takes_style: bool,
     seed: u64,
     windows: Arc<Windows>,
-    reducer: Box<dyn Reducer>,
     judge: Option<Box<dyn SampleJudge>>,
 }
 
@@ -71,25 +68,20 @@ impl DiffusionLearner {
         let parameters = Parameters::new(list, seed);
         Ok(Self {
             unet: Arc::new(unet),
-            gradients: (0..config.side_by_side.max(1))
-                .map(|_| Gradients::new(&parameters))
-                .collect(),
+            parts: Parts::new(&parameters, config.accumulate, config.side_by_side),
             network: NetworkState::new(UNET, parameters, &config.optimizer, config.ema),
-            arenas: (0..config.side_by_side.max(1)).map(|_| Arena::default()).collect(),
-            threads: Arc::new(Threads::of_process()),
             schedule: Schedule::new(&network.diffusion)?,
             config: config.clone(),
             takes_style: network.unet.style_dim > 0,
             seed,
             windows: Arc::clone(windows),
-            reducer: Box::new(NoReduction),
             judge: None,
         })
     }
 
     /// Has steps run on threads; the results are the same on any.
     pub fn on(mut self, threads: &Arc<Threads>) -> Self {
-        self.threads = Arc::clone(threads);
+        self.parts.on(threads);
         self
     }
 
@@ -99,67 +91,51 @@ impl DiffusionLearner {
         self
     }
 
-    /// Has gradients pass through a reducer.
-    pub fn reducing(mut self, reducer: Box<dyn Reducer>) -> Self {
-        self.reducer = reducer;
-        self
+    /// Trains together with other processes.
+    ///
+    /// # Errors
+    /// When the parts of a batch cannot be shared out evenly.
+    pub fn among(mut self, ranks: &Arc<Ranks>) -> Result<Self, TrainingError> {
+        self.parts.among(ranks)?;
+        self.network.among(ranks);
+        Ok(self)
     }
 
     /// Computes the gradients of a batch, part by part; returns its loss.
     fn differentiate(&mut self, batch: &Batch, step: u64) -> Result<f64, TrainingError> {
-        let side_by_side = self.gradients.len();
-        let n_parts = (self.config.accumulate * side_by_side).clamp(1, batch.n_windows);
-        let all: f64 = batch.mask.iter().map(|&w| f64::from(w)).sum();
+        let Self { parts, network, unet, schedule, config, takes_style, seed, windows, .. } =
+            &mut *self;
+        let n_parts = parts.number(batch.n_windows);
         let at = |part: usize| part * batch.n_windows / n_parts;
-        let Self {
-            gradients,
-            arenas,
-            network,
-            unet,
-            schedule,
-            config,
-            threads,
-            takes_style,
-            seed,
-            windows,
-            ..
-        } = &mut *self;
+        let weights = parts.weights(n_parts, |part| {
+            let mask = &batch.mask[at(part) * batch.n_frames..at(part + 1) * batch.n_frames];
+            mask.iter().map(|&w| f64::from(w)).sum()
+        })?;
+        let all: f64 = weights.iter().sum();
         let (withhold, takes_style, seed) =
             (WithholdProbabilities::of(config), *takes_style, *seed);
         let normalizer = windows.normalizer();
         let parameters = network.live();
-        gradients.iter_mut().for_each(Gradients::clear);
-        let mut loss = 0.0;
-        for first in (0..n_parts).step_by(side_by_side) {
-            let numbers = first..(first + side_by_side).min(n_parts);
-            let parts: Vec<_> = numbers.zip(gradients.iter_mut().zip(arenas.iter())).collect();
-            let losses = threads.side_by_side(parts, |(part, (gradients, arena))| {
-                let batch = batch.windows(at(part)..at(part + 1));
-                // Parts weigh as much as they have frames, so that any number of parts has one loss.
-                let share = batch.mask.iter().map(|&w| f64::from(w)).sum::<f64>() / all.max(1.0);
-                let seed = tape_seed(seed, step * n_parts as u64 + part as u64);
-                let mut tape = Tape::new(parameters, arena, Some(seed));
-                let given = DiffusionInputs::of(&batch, schedule, withhold, takes_style);
-                let loss = given.loss(&mut tape, unet, normalizer, schedule, &config.objective)?;
-                let value = share * f64::from(loss.scalar());
-                let weight = tape.constant(&[], &[share as f32]);
-                tape.backward_from(loss, weight, gradients)?;
-                Ok::<_, TrainingError>(value)
-            });
-            for part in losses {
-                loss += part?;
-            }
-        }
-        let (whole, others) = gradients.split_first_mut().expect("at least one");
-        threads.run(|| others.iter_mut().for_each(|other| whole.add_all(other)));
-        self.reducer.reduce(&mut self.gradients[0]);
-        Ok(loss)
+        let losses = parts.differentiate(n_parts, |part| {
+            let number = part.number;
+            let batch = batch.windows(at(number)..at(number + 1));
+            // Parts weigh as much as they have frames, so that any number of parts has one loss.
+            let share = weights[number] / all.max(1.0);
+            let seed = tape_seed(seed, step * n_parts as u64 + number as u64);
+            let mut tape = Tape::new(parameters, part.arena, Some(seed));
+            let given = DiffusionInputs::of(&batch, schedule, withhold, takes_style);
+            let loss = given.loss(&mut tape, unet, normalizer, schedule, &config.objective)?;
+            let value = share * f64::from(loss.scalar());
+            part.backward(tape, loss, share)?;
+            Ok(vec![value])
+        })?;
+        Ok(parts.of_all(n_parts, losses)?.into_iter().flatten().sum())
     }
 
     /// Returns the mean loss of the validation windows with some weights, nothing dropped.
     fn validation_loss(&self, parameters: &Parameters<f32>) -> Result<f64, TrainingError> {
         let [loss] = self.mean_over_validation(|given| {
-            let mut g = Eager::new(parameters, &self.arenas[0]);
+            let mut g = Eager::new(parameters, self.parts.arena());
             let (normalizer, objective) = (self.windows.normalizer(), &self.config.objective);
             let loss = given.loss(&mut g, &self.unet, normalizer, &self.schedule, objective)?;
             Ok([loss.scalar().into()])
@@ -176,7 +152,7 @@ impl DiffusionLearner {
         let [constant, untrained] = self.mean_over_validation(|given| {
             let batch = given.batch;
             let shape = [batch.n_windows, batch.n_frames, MOTION_DIM];
-            let mut g = Eager::new(self.network.live(), &self.arenas[0]);
+            let mut g = Eager::new(self.network.live(), self.parts.arena());
             let mut loss_of = |frame: [f32; MOTION_DIM]| {
                 let says = g.constant(&shape, &frame.repeat(batch.n_windows * batch.n_frames));
                 let (normalizer, objective) = (self.windows.normalizer(), &self.config.objective);
@@ -206,7 +182,7 @@ impl DiffusionLearner {
                 WithholdProbabilities::of(&self.config),
                 self.takes_style,
             );
-            let found = self.threads.run(|| mean_losses(&given))?;
+            let found = self.parts.threads().run(|| mean_losses(&given))?;
             for (sum, value) in sums.iter_mut().zip(found) {
                 *sum += weight * value;
             }
@@ -219,7 +195,7 @@ impl DiffusionLearner {
         let Some(judge) = &self.judge else { return Ok(None) };
         let (denoiser, normalizer) = (self.denoiser(), self.windows.normalizer());
         let distance = || sampled_distance(judge.as_ref(), &denoiser, &self.schedule, normalizer);
-        self.threads.run(distance)
+        self.parts.threads().run(distance)
     }
 
     /// Returns the UNet with its averaged weights, for sampling.
@@ -227,7 +203,7 @@ impl DiffusionLearner {
         Denoiser {
             unet: &self.unet,
             parameters: self.network.average(),
-            arena: &self.arenas[0],
+            arena: self.parts.arena(),
             takes_style: self.takes_style,
         }
     }
@@ -423,9 +399,10 @@ impl Learner for DiffusionLearner {
     ) -> Result<StepResult, TrainingError> {
         let loss = self.differentiate(batch, step)?;
         let learning_rate = self.config.learning_rate.at(step, n_steps);
-        let Self { network, gradients, threads, .. } = self;
+        let Self { network, parts, .. } = self;
+        let threads = Arc::clone(parts.threads());
         let gradient_norm =
-            threads.run(|| network.step(&mut gradients[0], loss, learning_rate, step));
+            threads.run(|| network.step(parts.gradients(), loss, learning_rate, step))?;
         let losses = Losses { total: loss, parts: vec![("diffusion", loss)] };
         Ok(StepResult { losses, gradient_norm, learning_rate, lr_decoder: None })
     }
@@ -442,6 +419,10 @@ impl Learner for DiffusionLearner {
         parts.extend(distance.map(|distance| ("sampled_distance", distance)));
         let losses = Losses { total: loss, parts };
         Ok(Validation { losses, live: Some(live), distance })
+    }
+
+    fn ownership(&self) -> Ownership {
+        self.parts.ownership(1)
     }
 
     keeps_network!(network);

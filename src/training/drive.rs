@@ -1,19 +1,21 @@
 //! The course of a training: steps, epochs, validations, checkpoints, and every way it can end.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use crate::autodiff::Gradients;
 use crate::store::{Patience, StoreError};
-use crate::weights::{Archive, Section};
+use crate::weights::Section;
 
 use super::batch::Batch;
-use super::checkpoint::{Best, CheckpointKind, Checkpoints, Progress, State};
+use super::checkpoint::{Best, CheckpointKind, Checkpoints, State};
 use super::error::TrainingError;
 use super::journal::{Entry, Journal, RowKind};
+use super::learner::{Learner, Losses, Ownership, StepResult, Validation};
 use super::loader::Loader;
+use super::ranks::Ranks;
 
 /// Steps in a row that may be skipped because something is not finite.
 const MAX_SKIPPED_IN_A_ROW: u32 = 10;
@@ -25,122 +27,6 @@ const SHARE_TRIED: f64 = 0.02;
 /// Share of the time that steps may take when their number is chosen; the optimizer and
 /// validations take the rest.
 const SHARE_OF_TIME: f64 = 0.92;
-
-/// The loss that is minimised, and its parts by name.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Losses {
-    pub total: f64,
-    /// Names are columns of the table of training.
-    pub parts: Vec<(&'static str, f64)>,
-}
-
-impl Losses {
-    /// Adds another's losses, weighted.
-    pub fn add(&mut self, other: &Self, weight: f64) {
-        self.total += weight * other.total;
-        for &(name, value) in &other.parts {
-            match self.parts.iter_mut().find(|(known, _)| *known == name) {
-                Some((_, sum)) => *sum += weight * value,
-                None => self.parts.push((name, weight * value)),
-            }
-        }
-    }
-}
-
-/// The result of a training step.
-#[derive(Clone, Debug)]
-pub struct StepResult {
-    pub losses: Losses,
-    /// Norm of the gradient before it was clipped.
-    pub gradient_norm: f64,
-    pub learning_rate: f64,
-    pub lr_decoder: Option<f64>,
-}
-
-impl StepResult {
-    fn is_finite(&self) -> bool {
-        self.losses.total.is_finite() && self.gradient_norm.is_finite()
-    }
-}
-
-/// The losses of a validation.
-#[derive(Clone, Debug)]
-pub struct Validation {
-    /// Of the weights that would be used: the average, where there is one.
-    pub losses: Losses,
-    /// Of the weights themselves, where they are not the ones that would be used.
-    pub live: Option<f64>,
-    /// Distance of sampled motion from real motion, where motion is sampled.
-    pub distance: Option<f64>,
-}
-
-/// Gradients on their way from the tape to the optimizer.
-///
-/// All gradients pass through here once a step. A trainer over several processes adds those of the others.
-pub trait Reducer: Send + Sync {
-    /// Replaces the gradients of this process by those of all.
-    fn reduce(&mut self, gradients: &mut Gradients<f32>);
-}
-
-/// The reducer of a single process: leaves the gradients as they are.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct NoReduction;
-
-impl Reducer for NoReduction {
-    fn reduce(&mut self, _gradients: &mut Gradients<f32>) {}
-}
-
-/// A network, or both, with its optimizer: takes training steps and validates.
-pub trait Learner: Send {
-    /// Name of the stage, as tables and folders spell it.
-    const STAGE: &'static str;
-
-    /// Learns from a batch: step number `step` (from 0) of `n_steps`.
-    ///
-    /// Where loss or gradient is not finite, nothing changes.
-    ///
-    /// # Errors
-    /// Shapes that do not fit.
-    fn step(&mut self, batch: &Batch, step: u64, n_steps: u64)
-    -> Result<StepResult, TrainingError>;
-
-    /// Does the work of a step but for the optimizer's, and forgets it, to see how long it takes.
-    ///
-    /// # Errors
-    /// As [`Learner::step`].
-    fn rehearse(&mut self, batch: &Batch) -> Result<(), TrainingError>;
-
-    /// Returns how many steps a rehearsal is worth.
-    fn steps_of_rehearsal(&self) -> u64 {
-        1
-    }
-
-    /// Measures what was learned.
-    ///
-    /// # Errors
-    /// As [`Learner::step`], and what the store says.
-    fn validate(&mut self) -> Result<Validation, TrainingError>;
-
-    /// Returns all numbers, to go on from.
-    fn sections(&self) -> Vec<Section<'_, f32>>;
-
-    /// Returns the weights to use.
-    fn best(&self) -> Vec<Section<'_, f32>>;
-
-    /// Returns how many updates optimizer and average have seen.
-    fn n_updates(&self) -> (u64, u64);
-
-    /// Takes up the numbers of [`Learner::sections`].
-    ///
-    /// # Errors
-    /// When they are not those of these networks.
-    fn restore(
-        &mut self,
-        archive: &Archive,
-        place: &str,
-        at: &Progress,
-    ) -> Result<(), TrainingError>;
-}
 
 /// When training ends, saves and validates.
 #[derive(Clone, Copy, Debug)]
@@ -217,12 +103,21 @@ pub enum TrainingEnd {
     Interrupted,
 }
 
+/// What all processes do before the next step.
+struct Decided {
+    is_interrupted: bool,
+    is_out_of_time: bool,
+    saves: bool,
+}
+
 /// A stage of a run that is under way.
 pub struct Drive<'a, C> {
     pub plan: Plan,
     pub state: State<C>,
     pub checkpoints: Checkpoints<'a>,
-    pub journal: Journal<'a>,
+    /// None on processes that only take part.
+    pub journal: Option<Journal<'a>>,
+    pub ranks: Arc<Ranks>,
     pub watch: &'a dyn Watch,
     /// A file of the run, below the store. Where it is missing so is the store (a disk that is not
     /// mounted, a folder that was moved), and nothing is written in its place.
@@ -237,9 +132,9 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
     pub fn run<L: Learner>(
         &mut self,
         learner: &mut L,
-        start_loader: impl FnOnce(u64) -> Loader,
+        start_loader: impl FnOnce(u64, &Ownership) -> Loader,
     ) -> Result<TrainingEnd, TrainingError> {
-        let mut loader = start_loader(self.state.progress.step);
+        let mut loader = start_loader(self.state.progress.step, &learner.ownership());
         let mut first = Some(loader.next_batch()?);
         if self.state.progress.n_steps == 0 {
             let batch = first.as_ref().expect("just put there");
@@ -250,8 +145,10 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
         self.state.progress.has_ended = false;
         let n_steps = self.state.progress.n_steps;
         self.watch.begin(L::STAGE, self.state.progress.step, n_steps);
-        self.journal.determined_by(&self.state.config, &self.state.data, n_steps);
-        self.journal.begin(self.state.progress.step);
+        if let Some(journal) = &mut self.journal {
+            journal.determined_by(&self.state.config, &self.state.data, n_steps);
+            journal.begin(self.state.progress.step);
+        }
         let before_s = self.state.progress.elapsed_s;
         let started = Instant::now();
         let mut last_save = Instant::now();
@@ -263,12 +160,18 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
             if step >= n_steps {
                 break TrainingEnd::Done;
             }
-            if self.watch.is_interrupted() {
+            let elapsed_s = before_s + started.elapsed().as_secs_f64();
+            let decided = self.decide(elapsed_s, last_save.elapsed())?;
+            if decided.is_interrupted {
                 break TrainingEnd::Interrupted;
             }
-            let elapsed_s = before_s + started.elapsed().as_secs_f64();
-            if self.plan.time.is_some_and(|time| elapsed_s >= time.as_secs_f64()) {
+            if decided.is_out_of_time {
                 break TrainingEnd::OutOfTime;
+            }
+            if decided.saves {
+                self.state.progress.elapsed_s = elapsed_s;
+                self.save(learner)?;
+                last_save = Instant::now();
             }
             let batch = match first.take() {
                 Some(batch) => batch,
@@ -294,8 +197,7 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
                 }
             }
             let by_steps = self.plan.save_every_steps.is_some_and(|n| done.is_multiple_of(n));
-            let by_time = last_save.elapsed() >= self.plan.save_every;
-            if (every(self.plan.save_every_epochs) || by_steps || by_time) && !is_last {
+            if (every(self.plan.save_every_epochs) || by_steps) && !is_last {
                 self.state.progress.elapsed_s = before_s + started.elapsed().as_secs_f64();
                 self.save(learner)?;
                 last_save = Instant::now();
@@ -326,14 +228,36 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
         let started = Instant::now();
         let enough_s = TRIED_S.min(SHARE_TRIED * time.as_secs_f64());
         let mut n_tried = 0;
-        while n_tried < MIN_TRIED || started.elapsed().as_secs_f64() < enough_s {
+        // The first process's clock counts: a rehearsal is one of all processes.
+        while self
+            .is_true_of_first(n_tried < MIN_TRIED || started.elapsed().as_secs_f64() < enough_s)?
+        {
             learner.rehearse(batch)?;
             n_tried += 1;
         }
         let n_tried = n_tried * learner.steps_of_rehearsal();
         let step_s = started.elapsed().as_secs_f64() / n_tried as f64;
-        let fitting = (SHARE_OF_TIME * time.as_secs_f64() / step_s.max(1e-6)).floor() as u64;
+        let fitting = (SHARE_OF_TIME * time.as_secs_f64() / step_s.max(1e-6)).floor();
+        let fitting = self.ranks.of_first(&[fitting])?[0] as u64;
         Ok(named.unwrap_or(u64::MAX).min(fitting.max(1)))
+    }
+
+    /// Decides with the other processes what comes before the next step: any may ask for an end, the clock is that of the
+    /// first.
+    fn decide(&self, elapsed_s: f64, unsaved: Duration) -> Result<Decided, TrainingError> {
+        let is_out_of_time = self.plan.time.is_some_and(|time| elapsed_s >= time.as_secs_f64());
+        let own = [self.watch.is_interrupted(), is_out_of_time, unsaved >= self.plan.save_every];
+        let all = self.ranks.share_numbers(&own.map(|x| f64::from(u8::from(x))))?;
+        let is_true = |numbers: &Vec<f64>, i: usize| numbers.get(i).is_some_and(|&x| x > 0.0);
+        Ok(Decided {
+            is_interrupted: all.iter().any(|one| is_true(one, 0)),
+            is_out_of_time: is_true(&all[0], 1),
+            saves: is_true(&all[0], 2),
+        })
+    }
+
+    fn is_true_of_first(&self, is_true: bool) -> Result<bool, TrainingError> {
+        Ok(self.ranks.of_first(&[f64::from(u8::from(is_true))])?[0] > 0.0)
     }
 
     fn after_step<L: Learner>(
@@ -358,7 +282,7 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
             progress.epoch_loss.1 += 1;
         }
         let (step, in_a_row) = (progress.step, progress.n_skipped_in_a_row);
-        self.journal.add(Entry {
+        let entry = Entry {
             kind: RowKind::Step,
             epoch,
             step,
@@ -370,7 +294,10 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
             data_wait_s: Some(waited.as_secs_f64()),
             resident_bytes: self.watch.resident_bytes(),
             elapsed_s: progress.elapsed_s,
-        });
+        };
+        if let Some(journal) = &mut self.journal {
+            journal.add(entry);
+        }
         self.watch.step(&format!("epoch {} loss {:.4}", epoch + 1, taken.losses.total));
         if in_a_row >= MAX_SKIPPED_IN_A_ROW {
             let mut phrases: Vec<_> = batch.phrase_ids.iter().map(ToString::to_string).collect();
@@ -387,11 +314,14 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
         let progress = &mut self.state.progress;
         let (sum, n) = std::mem::take(&mut progress.epoch_loss);
         let losses = Losses { total: sum / n as f64, parts: Vec::new() };
-        self.journal.add(Entry::of_epoch(RowKind::Epoch, epochs - 1, progress, &losses, None));
+        if let Some(journal) = &mut self.journal {
+            journal.add(Entry::of_epoch(RowKind::Epoch, epochs - 1, progress, &losses, None));
+        }
     }
 
     fn validate<L: Learner>(&mut self, learner: &mut L) -> Result<(), TrainingError> {
-        let found = learner.validate()?;
+        learner.collect_average()?;
+        let found = self.validation(learner)?;
         let progress = &mut self.state.progress;
         let epoch = self.plan.epoch(progress.step.saturating_sub(1));
         let loss = found.losses.total;
@@ -399,7 +329,9 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
         let is_better =
             loss.is_finite() && progress.best.is_none_or(|best| now.is_better_than(&best));
         let kind = RowKind::Validation;
-        self.journal.add(Entry::of_epoch(kind, epoch, progress, &found.losses, found.live));
+        if let Some(journal) = &mut self.journal {
+            journal.add(Entry::of_epoch(kind, epoch, progress, &found.losses, found.live));
+        }
         if is_better {
             progress.best = Some(now);
             progress.n_stale = 0;
@@ -413,11 +345,27 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
             found.distance.map_or(String::new(), |d| format!(", sampled distance {d:.3}")),
             if is_better { ", the best so far" } else { "" }
         ));
-        if is_better {
+        if is_better && self.ranks.is_first() {
             let best = learner.best();
             self.write(CheckpointKind::Best, &best)?;
         }
+        learner.release();
         Ok(())
+    }
+
+    /// Has the first process validate, and tells the others what it found.
+    fn validation<L: Learner>(&self, learner: &mut L) -> Result<Validation, TrainingError> {
+        if self.ranks.is_first() {
+            let found = learner.validate()?;
+            let distance = found.distance.unwrap_or(f64::NAN);
+            self.ranks.of_first(&[found.losses.total, distance])?;
+            return Ok(found);
+        }
+        let found = self.ranks.of_first(&[])?;
+        let at = |i: usize| found.get(i).copied().unwrap_or(f64::NAN);
+        let losses = Losses { total: at(0), parts: Vec::new() };
+        let distance = Some(at(1)).filter(|distance| !distance.is_nan());
+        Ok(Validation { losses, live: None, distance })
     }
 
     fn is_stale(&self) -> bool {
@@ -428,8 +376,10 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
     ///
     /// In this order, so that no checkpoint is ahead of the log: what was logged and not saved is done,
     /// and logged, again.
-    fn save<L: Learner>(&mut self, learner: &L) -> Result<(), TrainingError> {
+    fn save<L: Learner>(&mut self, learner: &mut L) -> Result<(), TrainingError> {
         let step = self.state.progress.step;
+        learner.collect()?;
+        let Some(journal) = &mut self.journal else { return Ok(()) };
         let done = {
             let watch = self.watch;
             let notice = |error: &StoreError, pause| notice(watch, error, pause);
@@ -437,9 +387,10 @@ impl<C: Serialize + DeserializeOwned> Drive<'_, C> {
             patience
                 .wait_out(notice, || self.checkpoints.check_anchor(&self.anchor))
                 .map_err(TrainingError::from)
-                .and_then(|()| self.journal.commit(step, patience, &notice))
+                .and_then(|()| journal.commit(step, patience, &notice))
         };
         let done = done.and_then(|()| self.write(CheckpointKind::Step, &learner.sections()));
+        learner.release();
         done.map_err(|source| TrainingError::NotSaved {
             stage: L::STAGE,
             step,

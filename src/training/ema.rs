@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::autodiff::{Element, Parameters};
+use crate::autodiff::{Element, Parameters, Shard};
 
 /// The settings of an [`Ema`].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -28,21 +28,33 @@ pub struct Ema<E: Element> {
     config: EmaConfig,
     average: Parameters<E>,
     n_updates: u64,
+    /// What of the average this process keeps.
+    shard: Shard,
 }
 
 impl<E: Element> Ema<E> {
     /// Begins with the parameters as they are.
     pub fn new(config: EmaConfig, parameters: &Parameters<E>) -> Self {
-        Self { config, average: parameters.clone(), n_updates: 0 }
+        Self { config, average: parameters.clone(), n_updates: 0, shard: Shard::WHOLE }
+    }
+
+    /// Keeps a share of the average alone.
+    pub fn shared(self, shard: Shard) -> Self {
+        Self { average: self.average.part(shard), shard, ..self }
     }
 
     /// Goes on from an average that has seen `n_updates`.
     pub fn resume(config: EmaConfig, average: Parameters<E>, n_updates: u64) -> Self {
-        Self { config, average, n_updates }
+        Self { config, average, n_updates, shard: Shard::WHOLE }
     }
 
     pub fn average(&self) -> &Parameters<E> {
         &self.average
+    }
+
+    /// Returns the average for writing, to put together what several processes keep.
+    pub fn average_mut(&mut self) -> &mut Parameters<E> {
+        &mut self.average
     }
 
     pub fn n_updates(&self) -> u64 {
@@ -56,7 +68,7 @@ impl<E: Element> Ema<E> {
         }
         let n = self.n_updates as f64;
         let decay = self.config.decay.min((1.0 + n) / (10.0 + n));
-        self.average.approach(parameters, 1.0 - decay);
+        self.average.approach(parameters, 1.0 - decay, self.shard);
         self.n_updates += 1;
     }
 }

@@ -6,6 +6,7 @@ use crate::store::StoreError;
 use crate::weights::WeightsError;
 
 use super::dataset::DatasetError;
+use super::ranks::RanksError;
 
 /// Why training could not begin or go on.
 #[derive(Debug, thiserror::Error)]
@@ -19,6 +20,8 @@ pub enum TrainingError {
     Network(#[from] GraphError),
     #[error(transparent)]
     Diffusion(#[from] DiffusionError),
+    #[error(transparent)]
+    Ranks(#[from] RanksError),
     #[error("{0}")]
     Config(String),
     #[error(

@@ -28,8 +28,8 @@ use super::checkpoint::Progress;
 use super::config::{FinetuneConfig, NetworkConfig};
 use super::decoder::DECODER;
 use super::diffusion::{DiffusionInputs, UNET, WithholdProbabilities, tape_seed};
-use super::drive::{Learner, Losses, NoReduction, Reducer, StepResult, Validation};
 use super::error::TrainingError;
+use super::learner::{Learner, Losses, StepResult, Validation};
 use super::objective::{Objective, reconstruction};
 use super::pipeline::{Pipeline, weighted_sum};
 use super::sampling::motion_view;
@@ -74,7 +74,6 @@ pub struct FinetuneLearner {
     withhold: WithholdProbabilities,
     config: FinetuneConfig,
     windows: Arc<Windows>,
-    reducer: Box<dyn Reducer>,
 }
 
 impl FinetuneLearner {
@@ -111,7 +110,6 @@ impl FinetuneLearner {
             withhold,
             config: config.clone(),
             windows: Arc::clone(windows),
-            reducer: Box::new(NoReduction),
         })
     }
 
@@ -232,7 +230,6 @@ impl FinetuneLearner {
         );
         drop(sampled);
         second.backward(rest, &mut self.gradients)?;
-        self.reducer.reduce(&mut self.gradients);
         Ok(losses)
     }
 }

@@ -11,8 +11,8 @@ use crate::store::{
 };
 
 use super::checkpoint::Progress;
-use super::drive::{Losses, StepResult};
 use super::error::TrainingError;
+use super::learner::{Losses, StepResult};
 
 /// The event that a row records.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 use crate::store::StoreError;
 
 use super::batch::Batch;
+use super::learner::{Ownership, all_windows};
 use super::window::Windows;
 
 /// Batches that each thread makes ahead.
@@ -34,15 +35,27 @@ impl Loader {
         first: u64,
         n_threads: NonZeroUsize,
     ) -> Self {
+        Self::start_some(windows, batch_size, first, n_threads, &all_windows())
+    }
+
+    /// Starts as [`Loader::start`] does, for a process that learns from some windows of each batch alone.
+    pub fn start_some(
+        windows: &Arc<Windows>,
+        batch_size: usize,
+        first: u64,
+        n_threads: NonZeroUsize,
+        ownership: &Ownership,
+    ) -> Self {
         let n = n_threads.get() as u64;
         let (threads, batches) = (0..n)
             .map(|thread| {
                 let (sender, receiver) = sync_channel(AHEAD);
-                let windows = Arc::clone(windows);
+                let (windows, ownership) = (Arc::clone(windows), Arc::clone(ownership));
                 let work = move || {
                     let mut order = Order::default();
                     for number in (first + thread..).step_by(n as usize) {
-                        let batch = windows.train(&order.batch(&windows, number, batch_size));
+                        let wanted = order.batch(&windows, number, batch_size);
+                        let batch = windows.train_some(&wanted, &ownership);
                         let failed = batch.is_err();
                         // The receiver is dropped once training is over.
                         if sender.send(batch).is_err() || failed {

@@ -19,11 +19,14 @@ mod finetune;
 mod group;
 mod journal;
 mod judge;
+mod learner;
 mod learning_rate;
 mod loader;
 mod objective;
 mod pairs;
+mod parts;
 mod pipeline;
+mod ranks;
 mod sampling;
 mod temporal;
 mod tokens;
@@ -38,9 +41,7 @@ pub use config::{
 pub use dataset::{Dataset, DatasetError, DatasetOptions, Ensemble, ExcludedPhrase, Phrase, Split};
 pub use decoder::DecoderLearner;
 pub use diffusion::{Baselines, DiffusionInputs, DiffusionLearner, WithholdProbabilities};
-pub use drive::{
-    Drive, Learner, Losses, NoReduction, Plan, Reducer, StepResult, TrainingEnd, Validation, Watch,
-};
+pub use drive::{Drive, Plan, TrainingEnd, Watch};
 pub use ema::{Ema, EmaConfig};
 pub use error::TrainingError;
 pub use estimate::EstimateLosses;
@@ -50,9 +51,13 @@ pub use group::{
 };
 pub use journal::{Journal, RowKind};
 pub use judge::SampleJudge;
+pub use learner::{Learner, Losses, Ownership, StepResult, Validation};
 pub use learning_rate::{LearningRate, LearningRateSchedule};
 pub use loader::Loader;
 pub use objective::{ChannelWeights, Objective, Reconstruction, reconstruction};
+#[cfg(feature = "mpi")]
+pub use ranks::MpiLink;
+pub use ranks::{ByOne, Ranks, RanksError};
 pub use sampling::{Condition, Denoiser};
 pub use temporal::{TemporalConfig, TemporalLosses, temporal_losses};
 pub use tokens::{

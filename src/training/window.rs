@@ -16,6 +16,7 @@ use crate::store::StoreError;
 
 use super::batch::{Batch, Chances, PAIR};
 use super::dataset::{Dataset, Phrase, Split};
+use super::learner::{Ownership, all_windows};
 use super::pairs::in_pairs;
 
 /// Augmentation of windows; zero and false leave them as they are.
@@ -195,10 +196,29 @@ impl Windows {
     /// # Errors
     /// [`StoreError`] when the frames at hand cannot be read.
     pub fn train(&self, windows: &[(u64, u32)]) -> Result<Batch, StoreError> {
+        self.train_some(windows, &all_windows())
+    }
+
+    /// Returns training windows as [`Windows::train`] does, of which only those are read that a process learns from.
+    ///
+    /// # Errors
+    /// As [`Windows::train`].
+    pub fn train_some(
+        &self,
+        windows: &[(u64, u32)],
+        ownership: &Ownership,
+    ) -> Result<Batch, StoreError> {
         let mut batch =
             Batch::empty(windows.len(), self.n_frames, self.n_slots, self.condition_dim());
-        for &(number, phrase) in windows {
-            let phrase = &self.dataset.phrases()[phrase as usize];
+        let phrase_of = |phrase: u32| &self.dataset.phrases()[phrase as usize];
+        let n_dancers: Vec<usize> =
+            windows.iter().map(|&(_, phrase)| phrase_of(phrase).n_dancers).collect();
+        for (&(number, phrase), is_own) in windows.iter().zip(ownership(&n_dancers)) {
+            let phrase = phrase_of(phrase);
+            if !is_own {
+                batch.push_absent(phrase.n_dancers, &phrase.id, self.condition_dim());
+                continue;
+            }
             let (dancers, audio) = self.augmented(phrase, number)?;
             self.push(&mut batch, phrase, dancers, audio);
             let mut drawn = [0.0_f64; 4];

@@ -76,6 +76,10 @@ impl<E: Element> Operation<E> for Product<E> {
         Some(self.weight)
     }
 
+    fn parameters(&self) -> [Option<ParameterId>; 2] {
+        [Some(self.weight), self.bias]
+    }
+
     fn forward(&mut self, x: &[&Tensor<E>], run: &Run<E>) -> Result<Tensor<E>> {
         let x = x[0];
         let label = self.label();

@@ -169,6 +169,10 @@ impl<E: Element> Operation<E> for NormFilmActivate<E> {
         Some(self.norm.weight)
     }
 
+    fn parameters(&self) -> [Option<ParameterId>; 2] {
+        [self.norm.weight, self.norm.bias].map(Some)
+    }
+
     fn forward(&mut self, x: &[&Tensor<E>], run: &Run<E>) -> Result<Tensor<E>> {
         let (x, film) = (x[0], x.get(1).copied());
         let norm = self.norm;

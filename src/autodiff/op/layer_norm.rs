@@ -41,6 +41,10 @@ impl<E: Element> Operation<E> for LayerNormalize<E> {
         self.affine.map(|[weight, _]| weight)
     }
 
+    fn parameters(&self) -> [Option<ParameterId>; 2] {
+        [self.affine.map(|[weight, _]| weight), self.affine.map(|[_, bias]| bias)]
+    }
+
     fn forward(&mut self, x: &[&Tensor<E>], run: &Run<E>) -> Result<Tensor<E>> {
         let x = x[0];
         let channels = x.channels().max(1);

@@ -6,48 +6,46 @@ use std::sync::Arc;
 use anyhow::{Context as _, ensure};
 
 use super::budget::StageBudget;
-use super::session::{ProgressWatch, claim, lease_of, scales};
-use super::{Params, Run, TrainDryRun, TrainSummary, resume_command};
+use super::ranks::agreed;
+use super::session::{ProgressWatch, scales};
+use super::{Params, Run, TrainDryRun, TrainSummary, lease, resume_command};
 use crate::model::{Family, GroupNetworks};
 use crate::motion::Normalizer;
-use crate::stages::train::Train;
-use crate::stages::{Progress, Stage as _, Summary};
+use crate::stages::{Progress, Summary};
 use crate::store::Location;
 use crate::training::{
-    Augmentation, CheckpointKind, GroupLearner, GroupTrainConfig, Learner as _, PAIR, TrainingEnd,
-    Windows,
+    Augmentation, GroupLearner, GroupTrainConfig, Learner as _, PAIR, Ranks, TrainingEnd, Windows,
 };
 
 /// Runs the stage.
 ///
 /// # Errors
 /// Settings of which no network can be made, and what the store says.
-pub fn run(params: &Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
-    let config = params.config.group_config(params.seed).with_context(|| {
-        format!(
-            "--preset {} is none of the family group; give tiny, small or base",
-            params.config.network.preset.name()
-        )
-    })?;
-    config.network.check()?;
-    check_numbers(&config)?;
-    let store = Location::open(&params.store, &params.client.options())?;
-    let watch = ProgressWatch(progress);
-    let lease = match params.dry_run {
-        true => None,
-        false => Some(lease_of(&store, &params.run, &watch)?),
+pub fn run(
+    params: &Params,
+    ranks: &Arc<Ranks>,
+    progress: &dyn Progress,
+) -> anyhow::Result<Box<dyn Summary>> {
+    let checked = || -> anyhow::Result<_> {
+        let config = params.config.group_config(params.seed).with_context(|| {
+            format!(
+                "--preset {} is none of the family group; give tiny, small or base",
+                params.config.network.preset.name()
+            )
+        })?;
+        config.network.check()?;
+        check_numbers(&config)?;
+        Ok((config, Location::open(&params.store, &params.client.options())?))
     };
-    let mut run = Run { params, store: &store, watch: &watch, lease: lease.as_ref() };
-    ensure!(
-        !params.resume
-            || !run.checkpoints(GroupLearner::STAGE).steps(CheckpointKind::Step)?.is_empty(),
-        "run {} has no checkpoint to resume from in {store}; leave --resume out to start it",
-        params.run
-    );
+    let (config, store) = agreed(ranks, checked())?;
+    let watch = ProgressWatch(progress);
+    let lease = agreed(ranks, lease(params, &store, ranks, &watch))?;
+    let mut run = Run { params, store: &store, watch: &watch, lease: lease.as_ref(), ranks };
+    agreed(ranks, run.check_resume(GroupLearner::STAGE))?;
     if params.dry_run {
         return run.dry_run_of_group(&config, progress);
     }
-    store.sweep();
+    run.sweep();
     run.train_group(&config, progress)
 }
 
@@ -126,13 +124,10 @@ impl Run<'_> {
         );
         let windows = Arc::new(windows.paired().heard_by(config.network.group.condition()));
         let mut account = TrainSummary::new(&params.run, self.store, phrases.left_out.clone());
-        let mut learner =
+        let learner =
             GroupLearner::new(&config.network, &config.group, &windows, params.seed)?.on(&threads);
-        // Only now is it certain that there is something to train and to train on.
-        if params.force {
-            self.clear()?;
-        }
-        claim(self.store, &params.run, Train::NAME, config, machine.patience(), self.watch)?;
+        let mut learner = agreed(self.ranks, learner.among(self.ranks).map_err(Into::into))?;
+        self.begin(config)?;
         let steps =
             StageBudget { share: 1.0, ..params.budget.of_denoiser(config.group.batch_size) };
         let end = self.stage(config, steps, &mut learner, &windows, &mut account)?;

@@ -1,14 +1,16 @@
-//! `train`: the UNet learns to remove noise from motion, then the decoder to make motion of latents.
+//! `train`: networks of any family learn from the phrases of a store.
 
 pub mod budget;
 mod group;
 mod judge;
 mod params;
 mod planner;
+pub(in crate::stages) mod ranks;
 pub mod session;
 mod summary;
 pub(in crate::stages) mod survey;
 mod tokens;
+mod unet;
 
 use std::sync::Arc;
 
@@ -16,23 +18,19 @@ use anyhow::{bail, ensure};
 
 use super::failure::quoted;
 use super::learned::{learned_path, remember};
-use super::trained::best;
 use super::{ClientParams, Contract, Progress, RARE, Stage, Summary};
-use crate::autodiff::{Arena, Parameters};
-use crate::diffusion::Schedule;
-use crate::model::{Family, UNet1D};
-use crate::motion::Normalizer;
+use crate::model::Family;
 use crate::store::{Lease, Location};
 use crate::training::{
-    Augmentation, CheckpointKind, Checkpoints, DecoderLearner, Denoiser, DiffusionLearner, Drive,
-    GroupLearner, Journal, Learner, Loader, PlannerLearner, State, TokensLearner, TrainConfig,
-    TrainingEnd, TrainingError, Windows,
+    CheckpointKind, Checkpoints, DecoderLearner, DiffusionLearner, Drive, GroupLearner, Journal,
+    Learner, Loader, PlannerLearner, Ranks, State, TokensLearner, TrainingEnd, TrainingError,
+    Windows,
 };
-use budget::{BudgetParams, KeptCheckpoint, StageBudget};
-use judge::ValidationJudge;
+use budget::{BudgetParams, StageBudget};
+use ranks::{agreed, check_same};
 use session::{
     MachineParams, ProgressWatch, TrainingPhrases, check_run_name, claim, claim_path, lease_of,
-    read_phrases, scales,
+    read_phrases,
 };
 pub use summary::{StageSummary, TrainDryRun, TrainSummary};
 
@@ -89,90 +87,31 @@ impl Stage for Train {
     type Params = Params;
 
     fn run(params: Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
-        check_run_name(&params.run)?;
-        match params.config.network.family {
-            Family::Unet => {}
-            Family::Group => return group::run(&params, progress),
-            Family::Tokens if params.config.tokens.tokenizer.is_some() => {
-                return planner::run(&params, progress);
+        ranks::on_all(progress, |ranks, progress| {
+            agreed(ranks, check_run_name(&params.run))?;
+            match params.config.network.family {
+                Family::Unet => unet::run(&params, ranks, progress),
+                Family::Group => group::run(&params, ranks, progress),
+                Family::Tokens if params.config.tokens.tokenizer.is_some() => {
+                    planner::run(&params, ranks, progress)
+                }
+                Family::Tokens => tokens::run(&params, ranks, progress),
             }
-            Family::Tokens => return tokens::run(&params, progress),
-        }
-        let config = params.config.config(params.seed);
-        config.network.check()?;
-        check_numbers(&params, &config)?;
-        let store = Location::open(&params.store, &params.client.options())?;
-        let watch = ProgressWatch(progress);
-        let lease = match params.dry_run {
-            true => None,
-            false => Some(lease_of(&store, &params.run, &watch)?),
-        };
-        let lease = lease.as_ref();
-        let mut run = Run { params: &params, store: &store, watch: &watch, lease };
-        let first = run.checkpoints(DiffusionLearner::STAGE);
-        ensure!(
-            !params.resume || !first.steps(CheckpointKind::Step)?.is_empty(),
-            "run {} has no checkpoint to resume from in {store}; leave --resume out to start it",
-            params.run
-        );
-        if params.dry_run {
-            return run.dry_run(&config, progress);
-        }
-        store.sweep();
-        run.train(&config, progress)
+        })
     }
 }
 
-fn check_numbers(params: &Params, config: &TrainConfig) -> anyhow::Result<()> {
-    let share = |flag: &str, x: f64| {
-        ensure!((0.0..1.0).contains(&x), "{flag} {x} is no share; give a number from 0 to below 1");
-        Ok(())
-    };
-    let d = &config.diffusion;
-    share("--condition-dropout", d.condition_dropout)?;
-    share("--clock-dropout", d.clock_dropout)?;
-    share("--style-dropout", d.style_dropout)?;
-    share("--time-stretch", d.augmentation.stretch)?;
-    share("--decoder-dropout", config.network.decoder.dropout)?;
-    share("--decoder-noised-to", config.decoder.noised_to)?;
-    share("--decoder-sampled-from", config.decoder.sampled_from)?;
-    let losses = &params.config.diffusion;
-    ensure!(
-        losses.difference_losses.len() == 3,
-        "--difference-losses has {} weights; give three, for the first to the third difference",
-        losses.difference_losses.len()
-    );
-    let weights = [
-        ("--style-weight", losses.style_weight),
-        ("--vertical-weight", losses.vertical_weight),
-        ("--velocity-loss", losses.velocity_loss),
-        ("--acceleration-loss", losses.acceleration_loss),
-    ];
-    let differences = losses.difference_losses.iter().map(|&x| ("--difference-losses", x));
-    for (flag, x) in weights.into_iter().chain(differences) {
-        ensure!(x.is_finite() && x >= 0.0, "{flag} {x} is no weight; give 0 or more");
+/// Takes the lease to write the run: the first process has it, and none in a dry run.
+fn lease(
+    params: &Params,
+    store: &Location,
+    ranks: &Ranks,
+    watch: &ProgressWatch,
+) -> anyhow::Result<Option<Lease>> {
+    if params.dry_run || !ranks.is_first() {
+        return Ok(None);
     }
-    for beta in d.optimizer.betas {
-        share("--betas", beta)?;
-    }
-    let decoder = &config.network.decoder;
-    ensure!(
-        decoder.hidden_dim > 0 && decoder.expansion > 0,
-        "--decoder-hidden-dim and --decoder-expansion must be at least 1"
-    );
-    let positive = |flag: &str, x: f64| {
-        ensure!(x > 0.0 && x.is_finite(), "{flag} {x} is not above 0; give a positive number");
-        Ok(())
-    };
-    positive("--learning-rate", d.learning_rate.peak)?;
-    positive("--decoder-learning-rate", config.decoder.learning_rate.peak)?;
-    positive("--save-every-minutes", params.budget.saving.save_every_minutes)?;
-    params.budget.minutes.map_or(Ok(()), |minutes| positive("--minutes", minutes))?;
-    ensure!(
-        d.augmentation.condition_noise >= 0.0 && d.augmentation.yaw_deg >= 0.0,
-        "--condition-noise and --yaw-rotation may not be below 0"
-    );
-    Ok(())
+    Ok(Some(lease_of(store, &params.run, watch)?))
 }
 
 /// A run of the stage.
@@ -181,9 +120,47 @@ struct Run<'a> {
     store: &'a Location,
     watch: &'a ProgressWatch<'a>,
     lease: Option<&'a Lease>,
+    ranks: &'a Arc<Ranks>,
 }
 
 impl<'a> Run<'a> {
+    /// Refuses to resume a run that has no checkpoint.
+    fn check_resume(&self, stage: &str) -> anyhow::Result<()> {
+        let Self { params, store, .. } = self;
+        ensure!(
+            !params.resume || !self.checkpoints(stage).steps(CheckpointKind::Step)?.is_empty(),
+            "run {} has no checkpoint to resume from in {store}; leave --resume out to start it",
+            params.run
+        );
+        Ok(())
+    }
+
+    /// Removes what writers of the store left behind.
+    fn sweep(&self) {
+        if self.ranks.is_first() {
+            self.store.sweep();
+        }
+    }
+
+    /// Makes the run this configuration's, anew where that is asked for. Only to be called when it is certain that there
+    /// is something to train and to train on.
+    fn begin<C>(&self, config: &C) -> anyhow::Result<()>
+    where
+        C: serde::Serialize + serde::de::DeserializeOwned,
+    {
+        let begun = || -> anyhow::Result<()> {
+            if !self.ranks.is_first() {
+                return Ok(());
+            }
+            if self.params.force {
+                self.clear()?;
+            }
+            let patience = self.params.machine.patience();
+            claim(self.store, &self.params.run, Train::NAME, config, patience, self.watch)
+        };
+        agreed(self.ranks, begun())
+    }
+
     fn checkpoints(&self, stage: &str) -> Checkpoints<'a> {
         Checkpoints::new(self.store, &self.params.run, stage)
     }
@@ -200,11 +177,16 @@ impl<'a> Run<'a> {
     fn phrases(&self, family: Family, progress: &dyn Progress) -> anyhow::Result<TrainingPhrases> {
         let Params { machine, dry_run, .. } = self.params;
         let (store, watch) = (self.store, self.watch);
-        read_phrases(store, Train::NAME, (machine, family), None, progress, watch, *dry_run)
+        let is_dry_run = *dry_run || !self.ranks.is_first();
+        let machine = (machine, family);
+        let read = read_phrases(store, Train::NAME, machine, None, progress, watch, is_dry_run);
+        let phrases = agreed(self.ranks, read)?;
+        check_same(self.ranks, &self.params.store, phrases.dataset.fingerprint())?;
+        Ok(phrases)
     }
 
     /// Removes what the run has left, so that it can begin anew.
-    fn clear(&mut self) -> anyhow::Result<()> {
+    fn clear(&self) -> anyhow::Result<()> {
         for stage in STAGES {
             self.checkpoints(stage).clear()?;
             self.journal(stage)?.clear()?;
@@ -216,107 +198,6 @@ impl<'a> Run<'a> {
             self.store.remove(&learned_path(&self.params.run, command))?;
         }
         Ok(())
-    }
-
-    fn dry_run(
-        &self,
-        config: &TrainConfig,
-        progress: &dyn Progress,
-    ) -> anyhow::Result<Box<dyn Summary>> {
-        let phrases = self.phrases(Family::Unet, progress)?;
-        let n_frames = config.network.window_frames;
-        let windows = Windows::new(
-            phrases.dataset,
-            Normalizer::identity(),
-            Augmentation::default(),
-            n_frames,
-            0,
-        );
-        let (_, list) = UNet1D::new(&config.network.unet);
-        Ok(Box::new(TrainDryRun {
-            run: self.params.run.clone(),
-            what: format!("train a UNet of {} parameters", list.n_elements()),
-            n_train: windows.n_train(),
-            n_validation: windows.n_validation(),
-            n_left_out: phrases.left_out.len(),
-            steps_per_epoch: windows.n_train().div_ceil(config.diffusion.batch_size),
-        }))
-    }
-
-    fn train(
-        &mut self,
-        config: &TrainConfig,
-        progress: &dyn Progress,
-    ) -> anyhow::Result<Box<dyn Summary>> {
-        let params = self.params;
-        let phrases = self.phrases(Family::Unet, progress)?;
-        let threads = Arc::new(params.machine.start_threads()?);
-        let n_frames = config.network.window_frames;
-        let scales = scales(&phrases.dataset, n_frames, self.watch)?;
-        let windows = |augmentation: Augmentation| {
-            let (dataset, scales) = (Arc::clone(&phrases.dataset), scales.clone());
-            let windows = Windows::new(dataset, scales, augmentation, n_frames, params.seed);
-            Arc::new(windows.heard_by(&config.network.unet))
-        };
-        let mut account = TrainSummary::new(&params.run, self.store, phrases.left_out.clone());
-
-        let augmented = windows(config.diffusion.augmentation.clone());
-        let mut learner =
-            DiffusionLearner::new(&config.network, &config.diffusion, &augmented, params.seed)?
-                .on(&threads);
-        if params.budget.keep == KeptCheckpoint::Motion
-            && let Some(judge) =
-                ValidationJudge::new(&config.network, &phrases.dataset, &scales.features)?
-        {
-            learner = learner.judged_by(judge);
-        }
-        // Only now is it certain that there is something to train and to train on.
-        if params.force {
-            self.clear()?;
-        }
-        let patience = params.machine.patience();
-        claim(self.store, &params.run, Train::NAME, config, patience, self.watch)?;
-        let end = self.stage(
-            config,
-            params.budget.of_denoiser(config.diffusion.batch_size),
-            &mut learner,
-            &augmented,
-            &mut account,
-        )?;
-        if end == TrainingEnd::Interrupted {
-            return Ok(Box::new(account.interrupted(&resume_command(params))));
-        }
-        account.beside(learner.baselines()?);
-        drop(learner);
-
-        let (unet, list) = UNet1D::new(&config.network.unet);
-        let weights = best_unet(&self.checkpoints(DiffusionLearner::STAGE), &params.run, list)?;
-        let arena = Arena::default();
-        let takes_style = config.network.unet.style_dim > 0;
-        let denoiser = Denoiser { unet: &unet, parameters: &weights, arena: &arena, takes_style };
-        let schedule = Schedule::new(&config.network.diffusion)?;
-        let augmented =
-            windows(Augmentation { condition_noise: 0.0, ..config.diffusion.augmentation.clone() });
-        let mut learner = DecoderLearner::new(
-            &config.network.decoder,
-            &config.decoder,
-            denoiser,
-            schedule,
-            &augmented,
-            params.seed,
-        )
-        .on(&threads);
-        let end = self.stage(
-            config,
-            params.budget.of_decoder(config.decoder.batch_size),
-            &mut learner,
-            &augmented,
-            &mut account,
-        )?;
-        if end == TrainingEnd::Interrupted {
-            return Ok(Box::new(account.interrupted(&resume_command(params))));
-        }
-        Ok(Box::new(account))
     }
 
     /// Trains one network, from its newest checkpoint on.
@@ -341,24 +222,60 @@ impl<'a> Run<'a> {
             windows.dataset().fingerprint(),
             windows.scales().clone(),
         );
-        let state = restore(learner, &checkpoints, state, &self.params.run, self.watch)?;
+        let state = self.restore(learner, &checkpoints, state)?;
         let (run, dataset) = (&self.params.run, windows.dataset());
-        remember(self.store, run, Train::NAME, dataset, patience, self.watch)?;
+        if self.ranks.is_first() {
+            remember(self.store, run, Train::NAME, dataset, patience, self.watch)?;
+        }
         let started_at = state.progress.step;
         let mut drive = Drive {
             plan,
             state,
             checkpoints,
-            journal: self.journal(L::STAGE)?,
+            journal: self.ranks.is_first().then(|| self.journal(L::STAGE)).transpose()?,
+            ranks: Arc::clone(self.ranks),
             watch: self.watch,
             anchor: claim_path(&self.params.run, Train::NAME),
         };
         let machine = &self.params.machine;
-        let end = drive.run(learner, |first| {
-            Loader::start(windows, plan.batch_size as usize, first, machine.loader_threads)
+        let end = drive.run(learner, |first, ownership| {
+            let (size, n_threads) = (plan.batch_size as usize, machine.loader_threads);
+            Loader::start_some(windows, size, first, n_threads, ownership)
         })?;
         account.add(StageSummary::of(L::STAGE, &drive.state.progress, started_at, end));
         Ok(end)
+    }
+
+    /// Takes up the newest checkpoint that the first process can read, on all of them.
+    fn restore<L, C>(
+        &self,
+        learner: &mut L,
+        checkpoints: &Checkpoints,
+        fresh: State<C>,
+    ) -> anyhow::Result<State<C>>
+    where
+        L: Learner,
+        C: serde::Serialize + serde::de::DeserializeOwned,
+    {
+        let (run, ranks) = (&self.params.run, self.ranks);
+        if ranks.is_first() {
+            let state = agreed(ranks, restore(learner, checkpoints, fresh, run, self.watch))?;
+            let (step, n_steps) = (state.progress.step, state.progress.n_steps);
+            // Steps in all are chosen before the first is saved.
+            ranks.of_first(&[f64::from(u8::from(n_steps > 0)), step as f64])?;
+            return agreed(ranks, Ok(state));
+        }
+        agreed(ranks, Ok(()))?;
+        let step = match ranks.of_first(&[])?[..] {
+            [has_checkpoint, step] if has_checkpoint > 0.0 => step as u64,
+            _ => return agreed(ranks, Ok(fresh)),
+        };
+        let read = checkpoints.read(CheckpointKind::Step, step, |archive, place| {
+            let state = State::<C>::of(archive, place)?;
+            learner.restore(archive, place, &state.progress)?;
+            Ok(state)
+        });
+        agreed(ranks, read.map_err(Into::into))
     }
 }
 
@@ -416,18 +333,6 @@ where
 
 fn is_damaged(error: &crate::weights::WeightsError) -> bool {
     matches!(error, crate::weights::WeightsError::Format(_))
-}
-
-/// Reads the UNet of a run that validated best.
-///
-/// # Errors
-/// When there is none, or it is of another network.
-pub fn best_unet(
-    checkpoints: &Checkpoints,
-    run: &str,
-    list: crate::model::ParameterList,
-) -> Result<Parameters<f32>, TrainingError> {
-    Ok(best(checkpoints, run, "unet.", "trained UNet", list)?.parameters)
 }
 
 /// Returns the command that goes on where this one stopped.

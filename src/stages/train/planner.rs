@@ -5,58 +5,58 @@ use std::sync::Arc;
 use anyhow::{Context as _, ensure};
 
 use super::budget::StageBudget;
-use super::session::{ProgressWatch, check_run_name, claim, lease_of, scales};
-use super::{Params, Run, TrainDryRun, TrainSummary, resume_command};
+use super::ranks::agreed;
+use super::session::{ProgressWatch, check_run_name, scales};
+use super::{Params, Run, TrainDryRun, TrainSummary, lease, resume_command};
 use crate::model::{Family, Planner};
 use crate::motion::Normalizer;
-use crate::stages::train::Train;
 use crate::stages::trained::{TrainedPlanner, TrainedTokenizer};
-use crate::stages::{Progress, Stage as _, Summary};
+use crate::stages::{Progress, Summary};
 use crate::store::Location;
 use crate::training::{
-    Augmentation, CheckpointKind, FrozenTokenizer, Learner as _, PlannerLearner,
-    PlannerTrainConfig, Scales, TokenizerSource, TrainingEnd, Windows,
+    Augmentation, FrozenTokenizer, Learner as _, PlannerLearner, PlannerTrainConfig, Ranks, Scales,
+    TokenizerSource, TrainingEnd, Windows,
 };
 
 /// Runs the stage.
 ///
 /// # Errors
 /// A run that is no tokenizer, settings of which no network can be made, and what the store says.
-pub fn run(params: &Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
-    let tokenizer = params.config.tokens.tokenizer.as_deref().unwrap_or_default();
-    check_run_name(tokenizer).with_context(|| format!("--tokenizer {tokenizer:?}"))?;
-    ensure!(
-        tokenizer != params.run,
-        "--run and --tokenizer are both {tokenizer}; give the planner a name of its own with --run"
-    );
-    let store = Location::open(&params.store, &params.client.options())?;
-    ensure!(
-        !TrainedPlanner::is_of(&store, tokenizer)?,
-        "--tokenizer {tokenizer} is a planner; name the run of the tokenizer that it was trained with"
-    );
-    ensure!(
-        !TrainedTokenizer::is_of(&store, &params.run)?,
-        "run {} is a tokenizer; give the planner a name of its own with --run",
-        params.run
-    );
-    let trained = TrainedTokenizer::read(&store, tokenizer)?;
-    let config = config(params, tokenizer, &trained)?;
-    let watch = ProgressWatch(progress);
-    let lease = match params.dry_run {
-        true => None,
-        false => Some(lease_of(&store, &params.run, &watch)?),
+pub fn run(
+    params: &Params,
+    ranks: &Arc<Ranks>,
+    progress: &dyn Progress,
+) -> anyhow::Result<Box<dyn Summary>> {
+    let checked = || -> anyhow::Result<_> {
+        let tokenizer = params.config.tokens.tokenizer.as_deref().unwrap_or_default();
+        check_run_name(tokenizer).with_context(|| format!("--tokenizer {tokenizer:?}"))?;
+        ensure!(
+            tokenizer != params.run,
+            "--run and --tokenizer are both {tokenizer}; give the planner a name of its own with --run"
+        );
+        let store = Location::open(&params.store, &params.client.options())?;
+        ensure!(
+            !TrainedPlanner::is_of(&store, tokenizer)?,
+            "--tokenizer {tokenizer} is a planner; name the run of the tokenizer that it was trained with"
+        );
+        ensure!(
+            !TrainedTokenizer::is_of(&store, &params.run)?,
+            "run {} is a tokenizer; give the planner a name of its own with --run",
+            params.run
+        );
+        let trained = TrainedTokenizer::read(&store, tokenizer)?;
+        let config = config(params, tokenizer, &trained)?;
+        Ok((config, trained, store))
     };
-    let mut run = Run { params, store: &store, watch: &watch, lease: lease.as_ref() };
-    ensure!(
-        !params.resume
-            || !run.checkpoints(PlannerLearner::STAGE).steps(CheckpointKind::Step)?.is_empty(),
-        "run {} has no checkpoint to resume from in {store}; leave --resume out to start it",
-        params.run
-    );
+    let (config, trained, store) = agreed(ranks, checked())?;
+    let watch = ProgressWatch(progress);
+    let lease = agreed(ranks, lease(params, &store, ranks, &watch))?;
+    let mut run = Run { params, store: &store, watch: &watch, lease: lease.as_ref(), ranks };
+    agreed(ranks, run.check_resume(PlannerLearner::STAGE))?;
     if params.dry_run {
         return run.dry_run_of_planner(&config, progress);
     }
-    store.sweep();
+    run.sweep();
     run.train_planner(&config, trained, progress)
 }
 
@@ -170,7 +170,7 @@ impl Run<'_> {
         let tokenizer =
             FrozenTokenizer::new(&trained.state.config.network.tokens, trained.parameters);
         let mut account = TrainSummary::new(&params.run, self.store, phrases.left_out.clone());
-        let mut learner = PlannerLearner::new(
+        let learner = PlannerLearner::new(
             &config.network,
             &config.planner,
             tokenizer,
@@ -178,11 +178,8 @@ impl Run<'_> {
             params.seed,
         )?
         .on(&threads);
-        // Only now is it certain that there is something to train and to train on.
-        if params.force {
-            self.clear()?;
-        }
-        claim(self.store, &params.run, Train::NAME, config, machine.patience(), self.watch)?;
+        let mut learner = agreed(self.ranks, learner.among(self.ranks).map_err(Into::into))?;
+        self.begin(config)?;
         let steps =
             StageBudget { share: 1.0, ..params.budget.of_denoiser(config.planner.batch_size) };
         let end = self.stage(config, steps, &mut learner, &windows, &mut account)?;

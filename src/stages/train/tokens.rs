@@ -5,54 +5,56 @@ use std::sync::Arc;
 use anyhow::{Context as _, ensure};
 
 use super::budget::StageBudget;
-use super::session::{ProgressWatch, claim, lease_of, scales};
-use super::{Params, Run, TrainDryRun, TrainSummary, resume_command};
+use super::ranks::agreed;
+use super::session::{ProgressWatch, scales};
+use super::{Params, Run, TrainDryRun, TrainSummary, lease, resume_command};
 use crate::model::{Family, Tokenizer};
 use crate::motion::Normalizer;
-use crate::stages::train::Train;
 use crate::stages::trained::TrainedPlanner;
-use crate::stages::{Progress, Stage as _, Summary};
+use crate::stages::{Progress, Summary};
 use crate::store::Location;
 use crate::training::{
-    Augmentation, CheckpointKind, Learner as _, TokensLearner, TokensTrainConfig, TrainingEnd,
-    Windows,
+    Augmentation, Learner as _, Ranks, TokensLearner, TokensTrainConfig, TrainingEnd, Windows,
 };
 
 /// Runs the stage.
 ///
 /// # Errors
 /// Settings of which no network can be made, and what the store says.
-pub fn run(params: &Params, progress: &dyn Progress) -> anyhow::Result<Box<dyn Summary>> {
-    let config = params.config.tokens_config(params.seed).with_context(|| {
-        format!(
-            "--preset {} is none of the family tokens; give tiny, small or base",
-            params.config.network.preset.name()
-        )
-    })?;
-    config.network.check()?;
-    check_numbers(&config)?;
-    let store = Location::open(&params.store, &params.client.options())?;
-    let watch = ProgressWatch(progress);
-    let lease = match params.dry_run {
-        true => None,
-        false => Some(lease_of(&store, &params.run, &watch)?),
+pub fn run(
+    params: &Params,
+    ranks: &Arc<Ranks>,
+    progress: &dyn Progress,
+) -> anyhow::Result<Box<dyn Summary>> {
+    let checked = || -> anyhow::Result<_> {
+        let config = params.config.tokens_config(params.seed).with_context(|| {
+            format!(
+                "--preset {} is none of the family tokens; give tiny, small or base",
+                params.config.network.preset.name()
+            )
+        })?;
+        config.network.check()?;
+        check_numbers(&config)?;
+        Ok((config, Location::open(&params.store, &params.client.options())?))
     };
-    let mut run = Run { params, store: &store, watch: &watch, lease: lease.as_ref() };
-    ensure!(
-        !params.resume
-            || !run.checkpoints(TokensLearner::STAGE).steps(CheckpointKind::Step)?.is_empty(),
-        "run {} has no checkpoint to resume from in {store}; leave --resume out to start it",
-        params.run
-    );
+    let (config, store) = agreed(ranks, checked())?;
+    let watch = ProgressWatch(progress);
+    let lease = agreed(ranks, lease(params, &store, ranks, &watch))?;
+    let mut run = Run { params, store: &store, watch: &watch, lease: lease.as_ref(), ranks };
+    agreed(ranks, run.check_resume(TokensLearner::STAGE))?;
     if params.dry_run {
         return run.dry_run_of_tokens(&config, progress);
     }
-    ensure!(
-        !TrainedPlanner::is_of(&store, &params.run)?,
-        "run {} is a planner; give the tokenizer a name of its own with --run",
-        params.run
-    );
-    store.sweep();
+    let is_free = || -> anyhow::Result<()> {
+        ensure!(
+            !TrainedPlanner::is_of(&store, &params.run)?,
+            "run {} is a planner; give the tokenizer a name of its own with --run",
+            params.run
+        );
+        Ok(())
+    };
+    agreed(ranks, is_free())?;
+    run.sweep();
     run.train_tokens(&config, progress)
 }
 
@@ -124,14 +126,10 @@ impl Run<'_> {
             params.seed,
         ));
         let mut account = TrainSummary::new(&params.run, self.store, phrases.left_out.clone());
-        let mut learner =
-            TokensLearner::new(&config.network, &config.tokens, &windows, params.seed)?
-                .on(&threads);
-        // Only now is it certain that there is something to train and to train on.
-        if params.force {
-            self.clear()?;
-        }
-        claim(self.store, &params.run, Train::NAME, config, machine.patience(), self.watch)?;
+        let learner = TokensLearner::new(&config.network, &config.tokens, &windows, params.seed)?
+            .on(&threads);
+        let mut learner = agreed(self.ranks, learner.among(self.ranks).map_err(Into::into))?;
+        self.begin(config)?;
         let steps =
             StageBudget { share: 1.0, ..params.budget.of_denoiser(config.tokens.batch_size) };
         let end = self.stage(config, steps, &mut learner, &windows, &mut account)?;

@@ -14,8 +14,8 @@ use crate::model::{
 use crate::motion::{Channel, MOTION_DIM, Normalizer};
 use crate::training::batch::Batch;
 use crate::training::diffusion::without_clock;
-use crate::training::drive::Losses;
 use crate::training::error::TrainingError;
+use crate::training::learner::Losses;
 use crate::training::sampling::motion_view;
 
 use super::GroupTraining;

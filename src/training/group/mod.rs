@@ -6,17 +6,19 @@ mod inputs;
 mod markers;
 mod negatives;
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
-use crate::autodiff::{Arena, Eager, Gradients, Interpreter as _, Parameters, Tape, Threads};
+use crate::autodiff::{Eager, Parameters, Tape, Threads};
 use crate::diffusion::Schedule;
 use crate::model::{GroupConfig, GroupNetworks};
 
 use super::averaged::{NetworkState, keeps_network};
-use super::batch::{Batch, PAIR};
+use super::batch::{Batch, PAIR, order_by_dancers};
 use super::diffusion::tape_seed;
-use super::drive::{Learner, Losses, NoReduction, Reducer, StepResult, Validation};
 use super::error::TrainingError;
+use super::learner::{Learner, Losses, Ownership, StepResult, Validation};
+use super::parts::Parts;
+use super::ranks::Ranks;
 use super::window::Windows;
 pub use config::{GroupLosses, GroupNetworkConfig, GroupTrainConfig, GroupTraining};
 use inputs::{GroupBatch, WithholdAll};
@@ -34,16 +36,12 @@ pub const GROUP: &str = "group.";
 pub struct GroupLearner {
     networks: Arc<GroupNetworks>,
     network: NetworkState,
-    /// Of the parts that are done side by side; the first gathers all.
-    gradients: Vec<Gradients<f32>>,
-    arenas: Vec<Arena<f32>>,
-    threads: Arc<Threads>,
+    parts: Parts,
     schedule: Schedule,
     sizes: GroupConfig,
     config: GroupTraining,
     seed: u64,
     windows: Arc<Windows>,
-    reducer: Box<dyn Reducer>,
 }
 
 impl GroupLearner {
@@ -60,26 +58,32 @@ impl GroupLearner {
         network.check()?;
         let (networks, list) = GroupNetworks::new(&network.group);
         let parameters = Parameters::new(list, seed);
-        let n_parts = config.side_by_side.max(1);
         Ok(Self {
             networks: Arc::new(networks),
-            gradients: (0..n_parts).map(|_| Gradients::new(&parameters)).collect(),
+            parts: Parts::new(&parameters, config.accumulate, config.side_by_side),
             network: NetworkState::new(GROUP, parameters, &config.optimizer, config.ema),
-            arenas: (0..n_parts).map(|_| Arena::default()).collect(),
-            threads: Arc::new(Threads::of_process()),
             schedule: Schedule::new(&network.diffusion)?,
             sizes: network.group.clone(),
             config: config.clone(),
             seed,
             windows: Arc::clone(windows),
-            reducer: Box::new(NoReduction),
         })
     }
 
     /// Has steps run on threads; the results are the same on any.
     pub fn on(mut self, threads: &Arc<Threads>) -> Self {
-        self.threads = Arc::clone(threads);
+        self.parts.on(threads);
         self
+    }
+
+    /// Trains together with other processes.
+    ///
+    /// # Errors
+    /// When the parts of a batch cannot be shared out evenly.
+    pub fn among(mut self, ranks: &Arc<Ranks>) -> Result<Self, TrainingError> {
+        self.parts.among(ranks)?;
+        self.network.among(ranks);
+        Ok(self)
     }
 
     /// Computes the gradients of a batch, part by part; returns its losses.
@@ -87,52 +91,34 @@ impl GroupLearner {
     /// Pairs of windows are sorted by their number of dancers, so that a part has few places without one, and stay
     /// together.
     fn differentiate(&mut self, batch: &Batch, step: u64) -> Result<Losses, TrainingError> {
-        let side_by_side = self.gradients.len();
+        let Self { parts, network, networks, schedule, sizes, config, seed, windows, .. } =
+            &mut *self;
         let n_pairs = batch.n_windows.div_ceil(PAIR);
-        let n_parts = (self.config.accumulate * side_by_side).clamp(1, n_pairs);
+        let n_parts = parts.number(n_pairs);
         let batch = batch.by_number_of_dancers();
-        let all = batch.weight();
         let at = |part: usize| (part * n_pairs / n_parts * PAIR).min(batch.n_windows);
-        let Self {
-            gradients,
-            arenas,
-            network,
-            networks,
-            schedule,
-            sizes,
-            config,
-            threads,
-            seed,
-            windows,
-            ..
-        } = &mut *self;
+        let of_part = |part: usize| batch.windows(at(part)..at(part + 1));
+        let weights = parts.weights(n_parts, |part| of_part(part).weight())?;
+        let all: f64 = weights.iter().sum();
         let normalizer = windows.normalizer();
         let parameters = network.live();
-        gradients.iter_mut().for_each(Gradients::clear);
+        let names = Mutex::new(Vec::new());
+        let found = parts.differentiate(n_parts, |part| {
+            let number = part.number;
+            let batch = of_part(number).without_empty_slots();
+            let share = weights[number] / all.max(1.0);
+            let seed = tape_seed(*seed, step * n_parts as u64 + number as u64);
+            let mut tape = Tape::new(parameters, part.arena, Some(seed));
+            let given = GroupBatch::of(&batch, schedule, sizes, (&*config).into(), seed);
+            let (loss, losses) = given.loss(&mut tape, networks, normalizer, schedule, config)?;
+            part.backward(tape, loss, share)?;
+            Ok(losses.numbers(&names))
+        })?;
+        let names = names.into_inner().unwrap_or_else(PoisonError::into_inner);
         let mut losses = Losses::default();
-        for first in (0..n_parts).step_by(side_by_side) {
-            let numbers = first..(first + side_by_side).min(n_parts);
-            let parts: Vec<_> = numbers.zip(gradients.iter_mut().zip(arenas.iter())).collect();
-            let found = threads.side_by_side(parts, |(part, (gradients, arena))| {
-                let batch = batch.windows(at(part)..at(part + 1)).without_empty_slots();
-                let share = batch.weight() / all.max(1.0);
-                let seed = tape_seed(*seed, step * n_parts as u64 + part as u64);
-                let mut tape = Tape::new(parameters, arena, Some(seed));
-                let given = GroupBatch::of(&batch, schedule, sizes, (&*config).into(), seed);
-                let (loss, parts) =
-                    given.loss(&mut tape, networks, normalizer, schedule, config)?;
-                let weight = tape.constant(&[], &[share as f32]);
-                tape.backward_from(loss, weight, gradients)?;
-                Ok::<_, TrainingError>((parts, share))
-            });
-            for part in found {
-                let (part, share) = part?;
-                losses.add(&part, share);
-            }
+        for (part, share) in parts.of_all(n_parts, found)?.iter().zip(weights) {
+            losses.add(&Losses::of_numbers(part, &names), share / all.max(1.0));
         }
-        let (whole, others) = gradients.split_first_mut().expect("at least one");
-        threads.run(|| others.iter_mut().for_each(|other| whole.add_all(other)));
-        self.reducer.reduce(&mut self.gradients[0]);
         Ok(losses)
     }
 
@@ -151,8 +137,8 @@ impl GroupLearner {
                 WithholdAll::default(),
                 first as u64,
             );
-            let (_, found) = self.threads.run(|| {
-                let mut g = Eager::new(parameters, &self.arenas[0]);
+            let (_, found) = self.parts.threads().run(|| {
+                let mut g = Eager::new(parameters, self.parts.arena());
                 let normalizer = self.windows.normalizer();
                 given.loss(&mut g, &self.networks, normalizer, &self.schedule, &self.config)
             })?;
@@ -176,9 +162,10 @@ impl Learner for GroupLearner {
     ) -> Result<StepResult, TrainingError> {
         let losses = self.differentiate(batch, step)?;
         let learning_rate = self.config.learning_rate.at(step, n_steps);
-        let Self { network, gradients, threads, .. } = self;
+        let Self { network, parts, .. } = self;
+        let threads = Arc::clone(parts.threads());
         let gradient_norm =
-            threads.run(|| network.step(&mut gradients[0], losses.total, learning_rate, step));
+            threads.run(|| network.step(parts.gradients(), losses.total, learning_rate, step))?;
         Ok(StepResult { losses, gradient_norm, learning_rate, lr_decoder: None })
     }
 
@@ -190,6 +177,17 @@ impl Learner for GroupLearner {
         let losses = self.validation_losses(self.network.average())?;
         let live = self.validation_losses(self.network.live())?;
         Ok(Validation { losses, live: Some(live.total), distance: None })
+    }
+
+    fn ownership(&self) -> Ownership {
+        let in_order = self.parts.ownership(PAIR);
+        Arc::new(move |n_dancers| {
+            let order = order_by_dancers(n_dancers);
+            let sorted: Vec<usize> = order.iter().map(|&i| n_dancers[i]).collect();
+            let mut owned = vec![false; order.len()];
+            order.into_iter().zip(in_order(&sorted)).for_each(|(i, is_own)| owned[i] = is_own);
+            owned
+        })
     }
 
     keeps_network!(network);

@@ -6,8 +6,8 @@ use crate::diffusion::Schedule;
 use crate::model::{Graph, Tokenizer};
 use crate::motion::MOTION_DIM;
 use crate::training::batch::Batch;
-use crate::training::drive::Losses;
 use crate::training::error::TrainingError;
+use crate::training::learner::Losses;
 use crate::training::sampling::motion_view;
 
 /// Where the smooth L1 turns from squared to linear, in spreads of a channel; PyTorch's, since the paper says nothing.
@@ -39,6 +39,19 @@ impl Latents {
                 self.tokens.push(token as usize);
             }
         }
+    }
+
+    /// Returns them as numbers, to give them to other processes.
+    pub fn numbers(&self) -> Vec<f64> {
+        let tokens = self.tokens.iter().map(|&token| token as f64);
+        tokens.chain(self.values.iter().map(|&h| f64::from(h))).collect()
+    }
+
+    /// Takes up what [`Latents::numbers`] gave, of latents of d numbers.
+    pub fn of_numbers(numbers: &[f64], d: usize) -> Self {
+        let (tokens, values) = numbers.split_at(numbers.len() / (1 + d));
+        let tokens = tokens.iter().map(|&token| token as usize).collect();
+        Self { values: values.iter().map(|&h| h as f32).collect(), tokens }
     }
 
     /// Adds those of another part of a batch.

@@ -6,11 +6,9 @@ mod config;
 mod inputs;
 mod planner;
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
-use crate::autodiff::{
-    Arena, Eager, Gradients, Interpreter as _, Parameters, Stream, Tape, Threads,
-};
+use crate::autodiff::{Eager, Interpreter as _, Parameters, Stream, Tape, Threads};
 use crate::diffusion::Schedule;
 use crate::model::{Tokenizer, TokensConfig};
 use crate::motion::MOTION_DIM;
@@ -20,8 +18,10 @@ use super::averaged::NetworkState;
 use super::batch::Batch;
 use super::checkpoint::Progress;
 use super::diffusion::tape_seed;
-use super::drive::{Learner, Losses, NoReduction, Reducer, StepResult, Validation};
 use super::error::TrainingError;
+use super::learner::{Learner, Losses, StepResult, Validation};
+use super::parts::Parts;
+use super::ranks::Ranks;
 use super::window::Windows;
 pub use codebook::{Codebook, CodebookConfig, perplexity};
 use codebook::{candidates, counts};
@@ -50,16 +50,12 @@ pub struct TokensLearner {
     tokenizer: Arc<Tokenizer>,
     network: NetworkState,
     codebook: Codebook<f32>,
-    /// Of the parts that are done side by side; the first gathers all.
-    gradients: Vec<Gradients<f32>>,
-    arenas: Vec<Arena<f32>>,
-    threads: Arc<Threads>,
+    parts: Parts,
     schedule: Schedule,
     sizes: TokensConfig,
     config: TokensTraining,
     seed: u64,
     windows: Arc<Windows>,
-    reducer: Box<dyn Reducer>,
 }
 
 impl TokensLearner {
@@ -77,27 +73,33 @@ impl TokensLearner {
         let sizes = network.tokens.clone();
         let (tokenizer, list) = Tokenizer::new(&sizes);
         let parameters = Parameters::new(list, seed);
-        let n_parts = config.side_by_side.max(1);
         Ok(Self {
             tokenizer: Arc::new(tokenizer),
-            gradients: (0..n_parts).map(|_| Gradients::new(&parameters)).collect(),
+            parts: Parts::new(&parameters, config.accumulate, config.side_by_side),
             network: NetworkState::new(TOKENS, parameters, &config.optimizer, config.ema),
             codebook: Codebook::new(&config.codebook, sizes.codes, sizes.width),
-            arenas: (0..n_parts).map(|_| Arena::default()).collect(),
-            threads: Arc::new(Threads::of_process()),
             schedule: Schedule::new(&network.diffusion)?,
             sizes,
             config: config.clone(),
             seed,
             windows: Arc::clone(windows),
-            reducer: Box::new(NoReduction),
         })
     }
 
     /// Has steps run on threads; the results are the same on any.
     pub fn on(mut self, threads: &Arc<Threads>) -> Self {
-        self.threads = Arc::clone(threads);
+        self.parts.on(threads);
         self
+    }
+
+    /// Trains together with other processes.
+    ///
+    /// # Errors
+    /// When the parts of a batch cannot be shared out evenly.
+    pub fn among(mut self, ranks: &Arc<Ranks>) -> Result<Self, TrainingError> {
+        self.parts.among(ranks)?;
+        self.network.among(ranks);
+        Ok(self)
     }
 
     /// Computes the gradients of a batch, part by part; returns its losses and its latents.
@@ -106,49 +108,42 @@ impl TokensLearner {
         batch: &Batch,
         step: u64,
     ) -> Result<(Losses, Latents), TrainingError> {
-        let side_by_side = self.gradients.len();
-        let n_parts = (self.config.accumulate * side_by_side).clamp(1, batch.n_windows);
-        let all = batch.weight();
+        let Self { parts, network, tokenizer, schedule, sizes, config, seed, .. } = &mut *self;
+        let n_parts = parts.number(batch.n_windows);
         let at = |part: usize| part * batch.n_windows / n_parts;
-        let seed = self.seed;
-        let Self {
-            gradients, arenas, network, tokenizer, schedule, sizes, config, threads, ..
-        } = &mut *self;
+        let all = batch.weight();
+        let share = |part: usize| batch.windows(at(part)..at(part + 1)).weight() / all.max(1.0);
         let parameters = network.live();
-        gradients.iter_mut().for_each(Gradients::clear);
-        let (mut losses, mut latents) = (Losses::default(), Latents::default());
-        for first in (0..n_parts).step_by(side_by_side) {
-            let numbers = first..(first + side_by_side).min(n_parts);
-            let parts: Vec<_> = numbers.zip(gradients.iter_mut().zip(arenas.iter())).collect();
-            let found = threads.side_by_side(parts, |(part, (gradients, arena))| {
-                let batch = batch.windows(at(part)..at(part + 1));
-                let share = batch.weight() / all.max(1.0);
-                let seed = tape_seed(seed, step * n_parts as u64 + part as u64);
-                let mut tape = Tape::new(parameters, arena, Some(seed));
-                let given = TokensBatch::of(&batch, schedule, sizes.frames_per_token);
-                let (loss, parts, latents) = given.loss(&mut tape, tokenizer, config.commitment)?;
-                let weight = tape.constant(&[], &[share as f32]);
-                tape.backward_from(loss, weight, gradients)?;
-                Ok::<_, TrainingError>((parts, share, latents))
-            });
-            for part in found {
-                let (part, share, of_part) = part?;
-                losses.add(&part, share);
-                latents.extend(of_part);
-            }
+        let names = Mutex::new(Vec::new());
+        let found = parts.differentiate(n_parts, |part| {
+            let number = part.number;
+            let batch = batch.windows(at(number)..at(number + 1));
+            let seed = tape_seed(*seed, step * n_parts as u64 + number as u64);
+            let mut tape = Tape::new(parameters, part.arena, Some(seed));
+            let given = TokensBatch::of(&batch, schedule, sizes.frames_per_token);
+            let (loss, losses, latents) = given.loss(&mut tape, tokenizer, config.commitment)?;
+            part.backward(tape, loss, share(number))?;
+            Ok((losses.numbers(&names), latents.numbers()))
+        })?;
+        let names = names.into_inner().unwrap_or_else(PoisonError::into_inner);
+        let (of_parts, of_latents): (Vec<_>, Vec<_>) = found.into_iter().unzip();
+        let mut losses = Losses::default();
+        for (number, part) in parts.of_all(n_parts, of_parts)?.iter().enumerate() {
+            losses.add(&Losses::of_numbers(part, &names), share(number));
         }
-        let (whole, others) = gradients.split_first_mut().expect("at least one");
-        threads.run(|| others.iter_mut().for_each(|other| whole.add_all(other)));
-        self.reducer.reduce(&mut self.gradients[0]);
+        let mut latents = Latents::default();
+        for part in parts.of_all(n_parts, of_latents)? {
+            latents.extend(Latents::of_numbers(&part, sizes.width));
+        }
         losses.parts.push(("perplexity", perplexity(&counts(&latents.tokens, self.sizes.codes))));
         Ok((losses, latents))
     }
 
     /// Puts the rows of the codebook where latents of a batch are.
     fn begin_codebook(&mut self, batch: &Batch, step: u64) -> Result<(), TrainingError> {
-        let Self { network, tokenizer, arenas, threads, sizes, .. } = &*self;
-        let latents = threads.run(|| {
-            let mut g = Eager::new(network.live(), &arenas[0]);
+        let Self { network, tokenizer, parts, sizes, .. } = &*self;
+        let latents = parts.threads().run(|| {
+            let mut g = Eager::new(network.live(), parts.arena());
             let shape = [batch.n_windows, batch.n_frames, MOTION_DIM];
             let motion = g.constant(&shape, &batch.motion);
             let found = tokenizer.quantize(&mut g, &motion)?;
@@ -177,8 +172,8 @@ impl TokensLearner {
             let range = first..(first + VALIDATION_BATCH).min(n_wanted);
             let batch = self.windows.validation(range)?;
             let given = TokensBatch::of(&batch, &self.schedule, self.sizes.frames_per_token);
-            let (_, found, latents) = self.threads.run(|| {
-                let mut g = Eager::new(parameters, &self.arenas[0]);
+            let (_, found, latents) = self.parts.threads().run(|| {
+                let mut g = Eager::new(parameters, self.parts.arena());
                 given.loss(&mut g, &self.tokenizer, self.config.commitment)
             })?;
             losses.add(&found, batch.weight());
@@ -212,9 +207,10 @@ impl Learner for TokensLearner {
         }
         let (losses, latents) = self.differentiate(batch, step)?;
         let learning_rate = self.config.learning_rate.at(step, n_steps);
-        let Self { network, gradients, threads, .. } = self;
+        let Self { network, parts, .. } = self;
+        let threads = Arc::clone(parts.threads());
         let gradient_norm =
-            threads.run(|| network.step(&mut gradients[0], losses.total, learning_rate, step));
+            threads.run(|| network.step(parts.gradients(), losses.total, learning_rate, step))?;
         if gradient_norm.is_finite() {
             // The draw of the first step was for the first places.
             let candidates = self.candidates(&latents, step + 1);
@@ -233,6 +229,18 @@ impl Learner for TokensLearner {
         let losses = self.validation_losses(self.network.average())?;
         let live = self.validation_losses(self.network.live())?;
         Ok(Validation { losses, live: Some(live.total), distance: None })
+    }
+
+    fn collect_average(&mut self) -> Result<(), TrainingError> {
+        self.network.collect_average()
+    }
+
+    fn collect(&mut self) -> Result<(), TrainingError> {
+        self.network.collect()
+    }
+
+    fn release(&mut self) {
+        self.network.release();
     }
 
     fn sections(&self) -> Vec<Section<'_, f32>> {

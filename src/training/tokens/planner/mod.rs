@@ -9,15 +9,17 @@ mod inputs;
 
 use std::sync::Arc;
 
-use crate::autodiff::{Arena, Eager, Gradients, Interpreter as _, Parameters, Tape, Threads};
+use crate::autodiff::{Arena, Eager, Interpreter as _, Parameters, Tape, Threads};
 use crate::model::{Planner, PlannerConfig, Tokenizer, TokensConfig};
 use crate::motion::MOTION_DIM;
 use crate::training::averaged::NetworkState;
 use crate::training::batch::Batch;
 use crate::training::checkpoint::Progress;
 use crate::training::diffusion::tape_seed;
-use crate::training::drive::{Learner, Losses, NoReduction, Reducer, StepResult, Validation};
 use crate::training::error::TrainingError;
+use crate::training::learner::{Learner, Losses, Ownership, StepResult, Validation};
+use crate::training::parts::Parts;
+use crate::training::ranks::Ranks;
 use crate::training::window::Windows;
 use crate::weights::{Archive, Section};
 
@@ -64,15 +66,11 @@ pub struct PlannerLearner {
     planner: Arc<Planner>,
     network: NetworkState,
     tokenizer: FrozenTokenizer,
-    /// Of the parts that are done side by side; the first gathers all.
-    gradients: Vec<Gradients<f32>>,
-    arenas: Vec<Arena<f32>>,
-    threads: Arc<Threads>,
+    parts: Parts,
     sizes: PlannerConfig,
     config: PlannerTraining,
     seed: u64,
     windows: Arc<Windows>,
-    reducer: Box<dyn Reducer>,
 }
 
 impl PlannerLearner {
@@ -91,67 +89,60 @@ impl PlannerLearner {
         let sizes = network.planner.clone();
         let (planner, list) = Planner::new(&sizes);
         let parameters = Parameters::new(list, seed);
-        let n_parts = config.side_by_side.max(1);
         Ok(Self {
             planner: Arc::new(planner),
-            gradients: (0..n_parts).map(|_| Gradients::new(&parameters)).collect(),
+            parts: Parts::new(&parameters, config.accumulate, config.side_by_side),
             network: NetworkState::new(PLANNER, parameters, &config.optimizer, config.ema),
             tokenizer,
-            arenas: (0..n_parts).map(|_| Arena::default()).collect(),
-            threads: Arc::new(Threads::of_process()),
             sizes,
             config: config.clone(),
             seed,
             windows: Arc::clone(windows),
-            reducer: Box::new(NoReduction),
         })
     }
 
     /// Has steps run on threads; the results are the same on any.
     pub fn on(mut self, threads: &Arc<Threads>) -> Self {
-        self.threads = Arc::clone(threads);
+        self.parts.on(threads);
         self
+    }
+
+    /// Trains together with other processes.
+    ///
+    /// # Errors
+    /// When the parts of a batch cannot be shared out evenly.
+    pub fn among(mut self, ranks: &Arc<Ranks>) -> Result<Self, TrainingError> {
+        self.parts.among(ranks)?;
+        self.network.among(ranks);
+        Ok(self)
     }
 
     /// Computes the gradients of a batch, part by part; returns its loss.
     fn differentiate(&mut self, batch: &Batch, step: u64) -> Result<f64, TrainingError> {
-        let side_by_side = self.gradients.len();
-        let n_parts = (self.config.accumulate * side_by_side).clamp(1, batch.n_windows);
-        let at = |part: usize| part * batch.n_windows / n_parts;
-        let (seed, windows) = (self.seed, Arc::clone(&self.windows));
-        let Self { gradients, arenas, network, planner, tokenizer, sizes, config, threads, .. } =
+        let Self { parts, network, planner, tokenizer, sizes, config, seed, windows, .. } =
             &mut *self;
-        let sizes = (&*sizes, windows.normalizer());
+        let n_parts = parts.number(batch.n_windows);
+        let at = |part: usize| part * batch.n_windows / n_parts;
+        let windows = Arc::clone(windows);
+        let (seed, sizes) = (*seed, (&*sizes, windows.normalizer()));
         let parameters = network.live();
-        gradients.iter_mut().for_each(Gradients::clear);
-        let tokens = threads.run(|| tokenizer.tokens(batch, &arenas[0]))?;
+        let tokens = parts.threads().run(|| tokenizer.tokens(batch, parts.arena()))?;
         // Of the whole batch, so that masks do not depend on how it is parted.
         let masks = tape_seed(seed, MASKS + step);
         let given = PlannerBatch::of(batch, &tokens, sizes, (&*config).into(), masks);
-        let all = given.weight(0..batch.n_windows);
-        let mut loss = 0.0;
-        for first in (0..n_parts).step_by(side_by_side) {
-            let numbers = first..(first + side_by_side).min(n_parts);
-            let parts: Vec<_> = numbers.zip(gradients.iter_mut().zip(arenas.iter())).collect();
-            let found = threads.side_by_side(parts, |(part, (gradients, arena))| {
-                let windows = at(part)..at(part + 1);
-                let share = given.weight(windows.clone()) / all.max(1.0);
-                let seed = tape_seed(seed, step * n_parts as u64 + part as u64);
-                let mut tape = Tape::new(parameters, arena, Some(seed));
-                let loss = given.loss(&mut tape, planner, windows)?;
-                let value = f64::from(loss.scalar());
-                let weight = tape.constant(&[], &[share as f32]);
-                tape.backward_from(loss, weight, gradients)?;
-                Ok::<_, TrainingError>(share * value)
-            });
-            for part in found {
-                loss += part?;
-            }
-        }
-        let (whole, others) = gradients.split_first_mut().expect("at least one");
-        threads.run(|| others.iter_mut().for_each(|other| whole.add_all(other)));
-        self.reducer.reduce(&mut self.gradients[0]);
-        Ok(loss)
+        let weights = parts.weights(n_parts, |part| given.weight(at(part)..at(part + 1)))?;
+        let all: f64 = weights.iter().sum();
+        let losses = parts.differentiate(n_parts, |part| {
+            let number = part.number;
+            let share = weights[number] / all.max(1.0);
+            let seed = tape_seed(seed, step * n_parts as u64 + number as u64);
+            let mut tape = Tape::new(parameters, part.arena, Some(seed));
+            let loss = given.loss(&mut tape, planner, at(number)..at(number + 1))?;
+            let value = f64::from(loss.scalar());
+            part.backward(tape, loss, share)?;
+            Ok(vec![share * value])
+        })?;
+        Ok(parts.of_all(n_parts, losses)?.into_iter().flatten().sum())
     }
 
     /// Returns the mean loss of the validation windows with some weights.
@@ -166,10 +157,10 @@ impl PlannerLearner {
             let batch = self.windows.validation(range)?;
             let (sizes, chances) =
                 ((&self.sizes, self.windows.normalizer()), PlannerChances::VALIDATION);
-            let of_batch = self.threads.run(|| {
-                let tokens = self.tokenizer.tokens(&batch, &self.arenas[0])?;
+            let of_batch = self.parts.threads().run(|| {
+                let tokens = self.tokenizer.tokens(&batch, self.parts.arena())?;
                 let given = PlannerBatch::of(&batch, &tokens, sizes, chances, first as u64);
-                let mut g = Eager::new(parameters, &self.arenas[0]);
+                let mut g = Eager::new(parameters, self.parts.arena());
                 let windows = 0..batch.n_windows;
                 let loss = given.loss(&mut g, &self.planner, windows.clone())?;
                 Ok::<_, TrainingError>((f64::from(loss.scalar()), given.weight(windows)))
@@ -197,9 +188,10 @@ impl Learner for PlannerLearner {
     ) -> Result<StepResult, TrainingError> {
         let loss = self.differentiate(batch, step)?;
         let learning_rate = self.config.learning_rate.at(step, n_steps);
-        let Self { network, gradients, threads, .. } = self;
+        let Self { network, parts, .. } = self;
+        let threads = Arc::clone(parts.threads());
         let gradient_norm =
-            threads.run(|| network.step(&mut gradients[0], loss, learning_rate, step));
+            threads.run(|| network.step(parts.gradients(), loss, learning_rate, step))?;
         Ok(StepResult { losses: whole(loss), gradient_norm, learning_rate, lr_decoder: None })
     }
 
@@ -211,6 +203,22 @@ impl Learner for PlannerLearner {
         let loss = self.validation_loss(self.network.average())?;
         let live = self.validation_loss(self.network.live())?;
         Ok(Validation { losses: whole(loss), live: Some(live), distance: None })
+    }
+
+    fn ownership(&self) -> Ownership {
+        self.parts.ownership(1)
+    }
+
+    fn collect_average(&mut self) -> Result<(), TrainingError> {
+        self.network.collect_average()
+    }
+
+    fn collect(&mut self) -> Result<(), TrainingError> {
+        self.network.collect()
+    }
+
+    fn release(&mut self) {
+        self.network.release();
     }
 
     fn sections(&self) -> Vec<Section<'_, f32>> {

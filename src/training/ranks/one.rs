@@ -1,0 +1,93 @@
+//! A network that is too small to be shared out: the first process trains it, the others hear how it goes.
+
+use std::sync::Arc;
+
+use crate::training::TrainingError;
+use crate::training::batch::Batch;
+use crate::training::checkpoint::Progress;
+use crate::training::learner::{Learner, Losses, Ownership, StepResult, Validation};
+use crate::weights::{Archive, Section};
+
+use super::Ranks;
+
+/// A learner that the first process has, and no other.
+pub struct ByOne<L> {
+    ranks: Arc<Ranks>,
+    learner: Option<L>,
+}
+
+impl<L> ByOne<L> {
+    /// Has the first process learn, the only one that has what a learner is made of.
+    ///
+    /// # Errors
+    /// What making the learner says.
+    pub fn new<T, E>(
+        ranks: &Arc<Ranks>,
+        of: Option<T>,
+        learner: impl FnOnce(T) -> Result<L, E>,
+    ) -> Result<Self, E> {
+        let learner = of.map(learner).transpose()?;
+        Ok(Self { ranks: Arc::clone(ranks), learner })
+    }
+}
+
+impl<L: Learner> Learner for ByOne<L> {
+    const STAGE: &'static str = L::STAGE;
+
+    fn step(
+        &mut self,
+        batch: &Batch,
+        step: u64,
+        n_steps: u64,
+    ) -> Result<StepResult, TrainingError> {
+        let Some(learner) = &mut self.learner else {
+            let found = self.ranks.of_first(&[])?;
+            let at = |i: usize| found.get(i).copied().unwrap_or(f64::NAN);
+            let losses = Losses { total: at(0), parts: Vec::new() };
+            let (gradient_norm, learning_rate) = (at(1), at(2));
+            return Ok(StepResult { losses, gradient_norm, learning_rate, lr_decoder: None });
+        };
+        let taken = learner.step(batch, step, n_steps)?;
+        self.ranks.of_first(&[taken.losses.total, taken.gradient_norm, taken.learning_rate])?;
+        Ok(taken)
+    }
+
+    fn rehearse(&mut self, batch: &Batch) -> Result<(), TrainingError> {
+        self.learner.as_mut().map_or(Ok(()), |learner| learner.rehearse(batch))
+    }
+
+    fn steps_of_rehearsal(&self) -> u64 {
+        self.learner.as_ref().map_or(1, L::steps_of_rehearsal)
+    }
+
+    fn validate(&mut self) -> Result<Validation, TrainingError> {
+        let nothing = Validation { losses: Losses::default(), live: None, distance: None };
+        self.learner.as_mut().map_or(Ok(nothing), L::validate)
+    }
+
+    fn ownership(&self) -> Ownership {
+        let is_first = self.ranks.is_first();
+        Arc::new(move |n_dancers| vec![is_first; n_dancers.len()])
+    }
+
+    fn sections(&self) -> Vec<Section<'_, f32>> {
+        self.learner.as_ref().map_or_else(Vec::new, L::sections)
+    }
+
+    fn best(&self) -> Vec<Section<'_, f32>> {
+        self.learner.as_ref().map_or_else(Vec::new, L::best)
+    }
+
+    fn n_updates(&self) -> (u64, u64) {
+        self.learner.as_ref().map_or((0, 0), L::n_updates)
+    }
+
+    fn restore(
+        &mut self,
+        archive: &Archive,
+        place: &str,
+        at: &Progress,
+    ) -> Result<(), TrainingError> {
+        self.learner.as_mut().map_or(Ok(()), |learner| learner.restore(archive, place, at))
+    }
+}
