@@ -352,10 +352,12 @@ impl Reader {
     /// `A>B`: A is half as long again, B half as long; `>>` and `>>>` go on in that way.
     fn broken_rhythm(&mut self, at: &mut Cursor<'_>) {
         let Some(sign) = at.take() else { return };
-        let mut n = 1;
-        while n < 3 && at.take_if(|c| c == sign).is_some() {
-            n += 1;
+        let n_more = std::iter::from_fn(|| at.take_if(|c| c == sign)).count();
+        // A second sign before the second note says nothing: it would lengthen the first without end.
+        if self.broken.is_some() {
+            return;
         }
+        let n = 1 + n_more.min(2);
         let short = (1, 1 << n);
         let long = ((1 << (n + 1)) - 1, 1 << n);
         let (first, second) = if sign == '>' { (long, short) } else { (short, long) };

@@ -53,6 +53,20 @@ fn played(body: &str) -> String {
 }
 
 #[test]
+fn a_rhythm_is_broken_once_between_two_notes() {
+    let lengths = |body: &str| -> Vec<u32> {
+        tune_of(body).expect("a tune").notes.iter().map(|note| note.duration as u32).collect()
+    };
+    let quarter = TICKS_PER_WHOLE as u32 / 4;
+    assert_eq!(lengths("C>D E F"), [quarter * 3 / 2, quarter / 2, quarter, quarter]);
+    // Found by fuzzing: each further sign lengthened the first note again, until its ticks overflowed.
+    let long = lengths("C>>>D E F");
+    assert_eq!(long, [quarter * 15 / 8, quarter / 8, quarter, quarter]);
+    assert_eq!(lengths(&format!("C{}D E F", ">".repeat(300))), long);
+    assert_eq!(lengths(&format!("C>>>{}D E F", " > < >".repeat(50))), long);
+}
+
+#[test]
 fn repeats_are_written_out() {
     for (body, expected) in [
         ("C4|D4|", "CD"),
