@@ -372,6 +372,14 @@ fn a_motion_is_continued_and_a_broken_one_refused() {
         let z: f64 = line.rsplit(',').next().expect("a number").parse().expect("a number");
         assert!((z - 3.19).abs() < 1e-4, "{line}");
     }
+    let more = dir.write("more.toml", "continue_from = { file = \"before.npy\", frames = 21 }\n");
+    let more = more.display().to_string();
+    let output = finish(&mut command(&store, &["--constraints", &more]));
+    assert_eq!(output.code, 2, "{output:?}");
+    let expected = format!(
+        "error: {more}: continue_from asks for 21 frames of before.npy, which has 20; ask for 20 or fewer\n"
+    );
+    assert_eq!(output.stderr, expected);
     write(&dir.at("before.npy"), b"no array");
     let output = finish(&mut command(&store, &["--constraints", &asked]));
     assert_eq!(output.code, 2, "{output:?}");

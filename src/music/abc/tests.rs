@@ -55,9 +55,9 @@ fn played(body: &str) -> String {
 #[test]
 fn a_rhythm_is_broken_once_between_two_notes() {
     let lengths = |body: &str| -> Vec<u32> {
-        tune_of(body).expect("a tune").notes.iter().map(|note| note.duration as u32).collect()
+        tune_of(body).expect("a tune").notes.iter().map(|note| note.duration).collect()
     };
-    let quarter = TICKS_PER_WHOLE as u32 / 4;
+    let quarter = TICKS_PER_WHOLE / 4;
     assert_eq!(lengths("C>D E F"), [quarter * 3 / 2, quarter / 2, quarter, quarter]);
     // Found by fuzzing: each further sign lengthened the first note again, until its ticks overflowed.
     let long = lengths("C>>>D E F");

@@ -127,7 +127,16 @@ impl ConstraintsRequest {
                 let frames = continued.frames.unwrap_or(CONTINUED_FRAMES);
                 ensure!(frames > 0, "{name}: continue_from takes 0 frames; take 1 or more");
                 let beside = path.parent().unwrap_or(Path::new(".")).join(&continued.file);
-                Some((motion(&beside)?, frames))
+                let before = motion(&beside)?;
+                let n_there = before.nrows();
+                // Who names no number takes what there is.
+                ensure!(
+                    continued.frames.is_none() || frames <= n_there,
+                    "{name}: continue_from asks for {frames} frames of {}, which has {n_there}; ask for {n_there} or \
+                     fewer",
+                    continued.file.display()
+                );
+                Some((before, frames))
             }
             None => None,
         };
