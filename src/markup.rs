@@ -81,6 +81,7 @@ mod tests {
             "page.html: audio.base64|safe",
             // JSON without any sign of markup.
             "page.html: data|safe",
+            "page.html: dial|safe",
             "page.html: metrics|safe",
             "page.html: sanity|safe",
             // Files of this program.

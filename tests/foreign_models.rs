@@ -94,7 +94,7 @@ fn a_card_in_a_bucket_names_no_file_outside_the_cache() {
     let start = format!(
         "error: {}: is no description of a model (a model has no file {absolute:?}, only unet.onnx, \
          unet.weights.bin, decoder.onnx, decoder.weights.bin, denoiser.onnx, score.onnx, encoder.onnx, signal.onnx, \
-         planner.onnx at line 1 column ",
+         planner.onnx, planner_music.onnx, planner_step.onnx at line 1 column ",
         stores.url(&bucket, "st/models/m/model.json")
     );
     assert!(output.stderr.starts_with(&start), "{}", output.stderr);

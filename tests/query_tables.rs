@@ -340,7 +340,7 @@ beats                       0              0       0        2
 failures                    0              0       0        1
 training_log                0              0       0        3
 onnx_checks                 0              0       0        1
-generations                 0              0       0        4
+generations                 0              0       0        5
 generated                   0              0       0        2
 decoded                     0              0       0        2
 tokens                      0              0       0        1

@@ -170,7 +170,7 @@ fn the_documented_python_plans_what_the_whole_planner_says() {
          for name in ('planner', 'planner_music', 'planner_step'):\n    \
          onnx.checker.check_model(f'models/plan/{{name}}.onnx', full_check=True)\n\
          whole = ort.InferenceSession('models/plan/planner.onnx')\n\
-         given = {{'tokens': np.array([tokens]), 'audio': audio, 'clock': clock}}\n\
+         given = {{'tokens': np.array([tokens]), **heard}}\n\
          said = whole.run(None, given)[0]\n\
          assert abs(said[0, -1] - logits[0, -1]).max() < 1e-4, (said[0, -1], logits)\n\
          assert said[0].argmax(-1).tolist() == tokens, (said[0].argmax(-1), tokens)\n"

@@ -9,6 +9,9 @@ use ort::value::{DynValue, Outlet, TensorRef};
 use super::error::OnnxError;
 use super::runtime::{Device, Runtime};
 
+/// The sizes of an output and its numbers in order.
+pub type ShapedNumbers = (Vec<usize>, Vec<f32>);
+
 /// Name of the weights beside an optimised model.
 const OPTIMIZED_WEIGHTS: &str = "weights.bin";
 /// Tensors of fewer bytes stay within an optimised model.
@@ -150,7 +153,7 @@ impl Session {
         &mut self,
         inputs: &[NamedTensor],
         output: &str,
-    ) -> Result<(Vec<usize>, Vec<f32>), OnnxError> {
+    ) -> Result<ShapedNumbers, OnnxError> {
         let [found] = self.run_for(inputs, [output])?;
         Ok(found)
     }
@@ -163,9 +166,9 @@ impl Session {
         &mut self,
         inputs: &[NamedTensor],
         outputs: [&str; N],
-    ) -> Result<[(Vec<usize>, Vec<f32>); N], OnnxError> {
+    ) -> Result<[ShapedNumbers; N], OnnxError> {
         let Self { session, place } = self;
-        let mut run = || -> ort::Result<[(Vec<usize>, Vec<f32>); N]> {
+        let mut run = || -> ort::Result<[ShapedNumbers; N]> {
             let mut values: Vec<(&str, ort::session::SessionInputValue)> = Vec::new();
             for input in inputs {
                 let shape = input.shape.clone();
@@ -192,7 +195,7 @@ impl Session {
 }
 
 /// Returns the sizes and the numbers of a value; whole numbers that networks return are indices, which f32 holds.
-fn numbers_of(value: &DynValue) -> ort::Result<(Vec<usize>, Vec<f32>)> {
+fn numbers_of(value: &DynValue) -> ort::Result<ShapedNumbers> {
     let sizes = |shape: &[i64]| shape.iter().map(|&n| n.max(0) as usize).collect();
     if let Ok((shape, numbers)) = value.try_extract_tensor::<i64>() {
         return Ok((sizes(shape), numbers.iter().map(|&x| x as f32).collect()));

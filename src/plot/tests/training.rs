@@ -336,7 +336,8 @@ fn what_cannot_be_plotted_is_said() {
             800,
             "no panels to plot; ask for one of loss, diffusion, decoder_position, \
              velocity_coherence, acceleration_coherence, jerk, decoder_quaternion, \
-             quaternion_delta, phase_monotonic, position_smoothness, gradient_norm, learning_rate",
+             quaternion_delta, phase_monotonic, position_smoothness, markers, contrast, commitment, \
+             perplexity, gradient_norm, learning_rate",
         ),
         (&empty, 800, "no panels to plot"),
         (&many, 800, "plot is 1600 × 35272 px; ask for fewer panels or a smaller width"),
