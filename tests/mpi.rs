@@ -65,6 +65,7 @@ mod ranks {
     ];
 
     /// Returns whether tests with mpirun can run here, and says loudly when not.
+    #[expect(clippy::print_stderr, reason = "a test that is skipped says so")]
     fn has_mpirun() -> bool {
         let found = Command::new("mpirun").arg("--version").output().is_ok();
         if !found {
@@ -156,7 +157,7 @@ mod ranks {
         let alone = copy(&store, &dir.at("alone"));
         assert_eq!(train(&alone, "run", &RUN).code, 0);
         for n in [2, 4] {
-            let store = copy(&store, &dir.at(&format!("of {n}")));
+            let store = copy(&store, &dir.at(format!("of {n}")));
             let output = finish(&mut mpirun(&[(n, &train_command(&store, "run", &RUN))]));
             assert_eq!(output.code, 0, "{output:?}");
             // The first rank tells of it, and no other.
