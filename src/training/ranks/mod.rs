@@ -118,7 +118,7 @@ impl Exchange {
     /// Waits for the numbers of all, by rank.
     ///
     /// # Errors
-    /// As [`Exchange::wait`].
+    /// When a message of another process did not come.
     pub fn numbers(self) -> Result<Vec<Arc<Vec<f32>>>, RanksError> {
         self.wait()?.into_iter().enumerate().map(|(of, message)| message.numbers(of)).collect()
     }
@@ -210,7 +210,7 @@ impl Ranks {
     /// Gives all the same bytes, and returns those of all, by rank.
     ///
     /// # Errors
-    /// As [`Exchange::wait`].
+    /// When a message of another process did not come.
     pub fn share_bytes(&self, own: Vec<u8>) -> Result<Vec<Arc<Vec<u8>>>, RanksError> {
         let message = Message::Bytes(Arc::new(own));
         let found = self.begin(vec![message; self.size]).wait()?;
@@ -220,7 +220,7 @@ impl Ranks {
     /// Gives all a value, and returns those of all, by rank.
     ///
     /// # Errors
-    /// As [`Exchange::wait`].
+    /// When a message of another process did not come.
     pub fn share<T: Serialize + DeserializeOwned>(&self, own: &T) -> Result<Vec<T>, RanksError> {
         let text = serde_json::to_vec(own).map_err(|_| RanksError::Unreadable(self.rank))?;
         let read = |(of, text): (usize, Arc<Vec<u8>>)| {
@@ -232,7 +232,7 @@ impl Ranks {
     /// Gives all some numbers, and returns those of all, by rank, to the last bit.
     ///
     /// # Errors
-    /// As [`Exchange::wait`].
+    /// When a message of another process did not come.
     pub fn share_numbers(&self, own: &[f64]) -> Result<Vec<Vec<f64>>, RanksError> {
         if self.is_alone() {
             return Ok(vec![own.to_vec()]);
@@ -248,7 +248,7 @@ impl Ranks {
     /// Returns the numbers of the first process.
     ///
     /// # Errors
-    /// As [`Exchange::wait`].
+    /// When a message of another process did not come.
     pub fn of_first(&self, own: &[f64]) -> Result<Vec<f64>, RanksError> {
         let own = if self.is_first() { own } else { &[] };
         Ok(self.share_numbers(own)?.swap_remove(0))
@@ -257,7 +257,7 @@ impl Ranks {
     /// Puts the chunks that each process keeps into the numbers of all.
     ///
     /// # Errors
-    /// As [`Exchange::wait`].
+    /// When a message of another process did not come.
     pub fn spread(&self, values: &mut [f32]) -> Result<(), RanksError> {
         self.put_together(values, |_| true)
     }
@@ -265,7 +265,7 @@ impl Ranks {
     /// Puts the chunks that each process keeps into the numbers of the first; those of others stay as they are.
     ///
     /// # Errors
-    /// As [`Exchange::wait`].
+    /// When a message of another process did not come.
     pub fn collect(&self, values: &mut [f32]) -> Result<(), RanksError> {
         self.put_together(values, |rank| rank == 0)
     }
@@ -312,7 +312,7 @@ impl Ranks {
     /// Takes leave of the others, once all have come to this.
     ///
     /// # Errors
-    /// As [`Exchange::wait`].
+    /// When a message of another process did not come.
     pub fn finish(&self) -> Result<(), RanksError> {
         let Some(courier) = &self.courier else { return Ok(()) };
         self.share_bytes(Vec::new())?;
