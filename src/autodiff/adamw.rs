@@ -83,7 +83,7 @@ vectorized! {
 
 /// Returns Σ x² of each chunk of a process's share, in order, in f64.
 ///
-/// The norm of all is √Σ of the sums of all chunks in their order, see [`norm_of`], whoever computed them.
+/// The norm of all is √Σ of the sums of all chunks in their order, see [`norm_of`], and does not depend on which process computed them.
 pub fn squares<E: Element>(x: &[E], shard: Shard) -> Vec<f64> {
     let part = |x: &[E]| {
         // Lanes join the f64 sum every 1,024 numbers, so that their rounding stays small.

@@ -58,13 +58,13 @@ const STEP_AXIS: &str = "tokens - past";
 /// Tokens of the whole window.
 const WINDOW_AXIS: &str = "tokens of the window";
 
-/// What is asked of the motion, of a network that takes it.
-struct Asked {
+/// The inputs of constraints, of a network that takes them.
+struct ConstraintValues {
     constraints: Value,
     drop_constraints: Value,
 }
 
-impl Asked {
+impl ConstraintValues {
     fn inputs(g: &mut Builder<'_>, config: &PlannerConfig) -> Option<Self> {
         if config.constraint_dim == 0 {
             return None;
@@ -108,7 +108,7 @@ pub fn planner(
     g.name_axis(1, TOKENS_AXIS);
     let Music { audio, drop_audio, style } =
         Music::inputs(&mut g, config.condition(), config.style_dim, "windows", scale)?;
-    let asked = Asked::inputs(&mut g, config);
+    let asked = ConstraintValues::inputs(&mut g, config);
     let inputs = PlannerInputs {
         tokens: &tokens,
         audio: &audio,
@@ -138,7 +138,7 @@ pub fn planner_music(
     let mut g = Builder::new(&list, weights, Form::default(), storage);
     let Music { audio, drop_audio, style } =
         Music::inputs(&mut g, config.condition(), config.style_dim, "windows", scale)?;
-    let asked = Asked::inputs(&mut g, config);
+    let asked = ConstraintValues::inputs(&mut g, config);
     let inputs = ConditionInputs {
         audio: &audio,
         drop_audio: Some(&drop_audio),

@@ -94,7 +94,7 @@ impl NetworkState {
         Ok(norm)
     }
 
-    /// Returns Σ x² of every chunk of the gradient, whoever has it.
+    /// Returns Σ x² of every chunk of the gradient, those of other processes included.
     fn squares(&self, gradients: &mut Gradients<f32>) -> Result<Vec<f64>, TrainingError> {
         let values = gradients.all();
         let own = squares(values, self.ranks.shard());

@@ -136,8 +136,8 @@ fn motion_by_tokens_is_held_against_its_own_networks_and_loses_without_training(
     let store = make_store(&dir);
     for (tokenizer, run, steps) in [("tok", "plan", "--steps=60"), ("tok0", "plan0", "--steps=1")] {
         assert_eq!(train(&store, tokenizer, &[steps]).code, 0);
-        let of = format!("--tokenizer={tokenizer}");
-        assert_eq!(train(&store, run, &[&of, steps]).code, 0);
+        let tokenizer_flag = format!("--tokenizer={tokenizer}");
+        assert_eq!(train(&store, run, &[&tokenizer_flag, steps]).code, 0);
         assert_eq!(export(&store, run, run).code, 0);
         let output = bulk(&store, run, &["--split=validation"]);
         assert_eq!(output.code, 0, "{output:?}");

@@ -9,7 +9,7 @@ use anyhow::{Context as _, anyhow, bail, ensure};
 use ndarray::Array2;
 use serde::Deserialize;
 
-use super::path_file::{Asked, LAST_FRAME, frame_of, of_array, of_csv};
+use super::path_file::{FrameConstraints, LAST_FRAME, frame_of, of_array, of_csv};
 use crate::generation::{Constraints, WantedValue, continuing, facing};
 use crate::motion::{CHANNEL_NAMES, Channel, ChannelLimits, MOTION_DIM, npy};
 
@@ -83,7 +83,7 @@ pub struct ConstraintsRequest {
     file: ConstraintsFile,
     before: Option<(Array2<f32>, usize)>,
     /// What a table asks for.
-    path: Asked,
+    path: FrameConstraints,
 }
 
 impl fmt::Debug for ConstraintsRequest {

@@ -9,7 +9,7 @@ use crate::motion::{CHANNEL_NAMES, Channel, MOTION_DIM};
 use crate::units::{frames_to_s, s_to_frames};
 
 /// What is asked of frames, in the order in which it is said.
-pub type Asked = Vec<(usize, WantedValue)>;
+pub type FrameConstraints = Vec<(usize, WantedValue)>;
 
 /// A frame behind the end of every track, after which there is another number.
 pub const LAST_FRAME: usize = usize::MAX / 2;
@@ -55,7 +55,7 @@ impl Column {
 ///
 /// # Errors
 /// One sentence with the line, counted from 1.
-pub fn of_csv(text: &str) -> anyhow::Result<Asked> {
+pub fn of_csv(text: &str) -> anyhow::Result<FrameConstraints> {
     let text = text.strip_prefix('\u{feff}').unwrap_or(text);
     let lines = (1..).zip(text.lines()).filter(|(_, line)| !line.trim().is_empty());
     let mut lines = lines.map(|(number, line): (usize, &str)| {
@@ -134,7 +134,7 @@ impl Default for Row {
 }
 
 impl Row {
-    fn ask(&self, asked: &mut Asked) -> anyhow::Result<()> {
+    fn ask(&self, asked: &mut FrameConstraints) -> anyhow::Result<()> {
         let frame = self.frame()?;
         if !self.heading_deg.is_nan() {
             let quaternion = Channel::Quaternion.range();
@@ -176,7 +176,11 @@ pub fn frame_of(time_s: f64) -> anyhow::Result<usize> {
 }
 
 /// Adds what the channels of a frame ask for; NaN asks for nothing.
-fn ask(frame: usize, channels: &[f64; MOTION_DIM], asked: &mut Asked) -> anyhow::Result<()> {
+fn ask(
+    frame: usize,
+    channels: &[f64; MOTION_DIM],
+    asked: &mut FrameConstraints,
+) -> anyhow::Result<()> {
     let first = Channel::Quaternion.range().start;
     let quaternion: [f64; N_QUATERNION] = std::array::from_fn(|i| channels[first + i]);
     match quaternion.iter().filter(|x| x.is_nan()).count() {
@@ -199,7 +203,7 @@ fn ask(frame: usize, channels: &[f64; MOTION_DIM], asked: &mut Asked) -> anyhow:
 ///
 /// # Errors
 /// One sentence for another shape, and for an orientation of which a part is given.
-pub fn of_array(array: &NpyArray<f64>) -> anyhow::Result<Asked> {
+pub fn of_array(array: &NpyArray<f64>) -> anyhow::Result<FrameConstraints> {
     let width = match array.shape[..] {
         [_, width @ (N_AXES | MOTION_DIM)] => width,
         _ => bail!(

@@ -100,7 +100,7 @@ fn refuse<T>(ranks: &Ranks, sentence: String) -> anyhow::Result<T> {
 /// Takes leave of the others where all end with an error at the same place: a launcher kills those that are left when one
 /// ends without, before the first has said why.
 fn take_leave(ranks: &Ranks) {
-    // Whoever is gone already has said why.
+    // A process that has ended has already reported its error.
     ranks.finish().ok();
 }
 

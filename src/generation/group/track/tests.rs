@@ -13,7 +13,7 @@ const N_STEPS: usize = 5;
 
 /// What an estimator was asked for: rows of motion, and numbers of them.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Asked {
+struct EstimatorCall {
     rows: usize,
     numbers: usize,
 }
@@ -22,7 +22,7 @@ struct Asked {
 /// frame is its number.
 struct ByHeart {
     normalizer: Normalizer,
-    asked: Mutex<Vec<Asked>>,
+    asked: Mutex<Vec<EstimatorCall>>,
     /// How far the estimate of a window lies above the dance, m, by the number of its first frame.
     offset_m: fn(usize) -> f32,
 }
@@ -54,7 +54,7 @@ impl GroupEstimator for ByHeart {
     }
 
     fn predict(&self, inputs: &GroupEngineInputs) -> Result<Array3<f32>, EngineError> {
-        let asked = Asked { rows: inputs.x.dim().0, numbers: inputs.x.len() };
+        let asked = EstimatorCall { rows: inputs.x.dim().0, numbers: inputs.x.len() };
         self.asked.lock().expect("no panic before").push(asked);
         let mut predicted = Array3::zeros(inputs.x.raw_dim());
         for (i, audio) in inputs.audio.outer_iter().enumerate() {
@@ -79,7 +79,7 @@ fn generated(
     n_dancers: usize,
     n_frames: usize,
     offset_m: fn(usize) -> f32,
-) -> (Vec<Array3<f32>>, Vec<Asked>) {
+) -> (Vec<Array3<f32>>, Vec<EstimatorCall>) {
     let normalizer = Normalizer::identity();
     let engine = ByHeart { normalizer: normalizer.clone(), asked: Mutex::default(), offset_m };
     let schedule = Schedule::new(&DiffusionConfig {

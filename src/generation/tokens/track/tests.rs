@@ -243,8 +243,8 @@ fn keyframes_and_whole_paths_are_met_below_a_millimetre_without_spikes_whatever_
         let motion = finished(steered, Some(&constraints));
         let misses = constraints.errors(motion.view());
         let worst = |what: &str| {
-            let of = misses.iter().filter(|miss| miss.what.starts_with(what));
-            of.map(|miss| miss.error).fold(0.0, f64::max)
+            let misses = misses.iter().filter(|miss| miss.what.starts_with(what));
+            misses.map(|miss| miss.error).fold(0.0, f64::max)
         };
         let (mm, deg) = (1e3 * worst("position"), worst("quaternion").to_degrees());
         let ratio = jerk(&motion) / free;
