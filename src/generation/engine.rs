@@ -34,6 +34,8 @@ pub enum EngineError {
     Diffusion(#[from] DiffusionError),
     #[error("{what} is {found:?}, {expected:?} is needed")]
     Shape { what: &'static str, found: Vec<usize>, expected: Vec<usize> },
+    #[error("the tokenizer drafts no motion; it was trained by release 0.2 or with --no-draft")]
+    NoDraft,
 }
 
 /// Runs the two networks of a model.

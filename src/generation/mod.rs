@@ -38,10 +38,10 @@ pub use retrieval::Retrieval;
 pub use runtime::{OnnxEngine, SessionPlan};
 pub use sampling::{Sampling, sample};
 pub use tokens::{
-    Control, OnnxPlanner, OnnxTokenizer, PlanRequest, PlanWindow, PlannerEngine, PlannerNetworks,
-    Reconstruction, Steering, TokenEngine, TokenGenerator, TokenTrack, TokenizerNetworks,
-    TokensCard, TokensNetworks, TokensProvenance, WindowPlan, WithheldConditions, shuffle, steer,
-    tokens_parameters,
+    Control, Decoding, OnnxPlanner, OnnxTokenizer, PlanRequest, PlanWindow, PlannerEngine,
+    PlannerNetworks, Reconstruction, Steering, TokenEngine, TokenGenerator, TokenTrack,
+    TokenizerNetworks, TokensCard, TokensNetworks, TokensProvenance, WindowPlan,
+    WithheldConditions, shuffle, steer, tokens_parameters,
 };
 pub use track::{
     Generator, OVERLAP_FRAMES, PrimingMotion, RUN_WINDOWS, Track, WeightedConstraints,

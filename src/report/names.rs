@@ -15,7 +15,7 @@ pub(super) const HELD_OUT: &str = "held_out";
 
 /// Subjects in the order in which they are shown, with what they are.
 #[rustfmt::skip]
-pub(super) const SUBJECTS: [(&str, &str); 14] = [
+pub(super) const SUBJECTS: [(&str, &str); 15] = [
     (OWN, "the motions of this run"),
     ("shuffled", "the same motions with the music of other songs: what following its own music must beat"),
     ("shifted", "the same motions with the bars of their own music shifted by a beat: what knowing where the \
@@ -26,6 +26,7 @@ pub(super) const SUBJECTS: [(&str, &str); 14] = [
     ("shuffled_plan", "the plans of the trained model with their tokens in an order of chance: what is owed to which \
                        tokens there are, not to where they stand"),
     ("reconstructed", "real motion that was written as tokens and made again"),
+    ("draft", "the same without the diffusion decoder: what it adds is the difference"),
     ("retrieval", "the library’s phrase with the nearest music"),
     ("mean_motion", "the mean of the training motion, standing still: the best constant"),
     ("independent", "soloists who were sampled one by one, in the places of the dancers of a group: what belonging \

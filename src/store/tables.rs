@@ -136,7 +136,7 @@ rows! {
         loss: Option<f64>, "", "What is minimised; of a validation, with the weights that would be used (the average, in diffusion and decoder). None where it was not finite.";
         loss_live: Option<f64>, "", "Of a validation: the loss of the weights themselves rather than their average.";
         diffusion: Option<f64>, "", "Mean loss of the prediction of the UNet, or of another family's denoiser.";
-        reconstruction: Option<f64>, "", "Mean squared error of decoded motion over all channels, in units of their spread.";
+        reconstruction: Option<f64>, "", "Mean squared error of decoded motion over all channels, in units of their spread; of a tokenizer the loss of its draft.";
         decoder_position: Option<f64>, "m²", "Mean squared error of decoded positions.";
         decoder_quaternion: Option<f64>, "", "Mean squared error of decoded quaternions, of the nearer sign.";
         velocity_coherence: Option<f64>, "", "10 ⟨(v − 30 Δp)²⟩ / 5².";
@@ -290,7 +290,7 @@ rows! {
     {
         run: String, "", "The run of generate that was evaluated, or the name of motions of another program; evaluating it again replaces its rows.";
         model: String, "", "Name of the model; empty for motions of another program.";
-        subject: String, "", "Whose number it is: `generated`, or a baseline: `shuffled` (the same motions with the music of other songs), `shifted` (with the bars shifted by beats), `untrained` (motion of the same network with its first weights), `no_music` (of the trained network, its music withheld), `shuffled_plan` (of a model of tokens, the tokens of each window in an order of chance), `reconstructed` (real motion that a tokenizer made again of its tokens), `retrieval` (the library's phrase with the nearest features), `mean_motion`, `held_out_truth`, `training_truth`; of groups also `independent` (soloists who were sampled one by one, in the places of the dancers) and `copied` (one dancer in the places of all).";
+        subject: String, "", "Whose number it is: `generated`, or a baseline: `shuffled` (the same motions with the music of other songs), `shifted` (with the bars shifted by beats), `untrained` (motion of the same network with its first weights), `no_music` (of the trained network, its music withheld), `shuffled_plan` (of a model of tokens, the tokens of each window in an order of chance), `reconstructed` (real motion that a tokenizer made again of its tokens), `draft` (the same without the diffusion decoder), `retrieval` (the library's phrase with the nearest features), `mean_motion`, `held_out_truth`, `training_truth`; of groups also `independent` (soloists who were sampled one by one, in the places of the dancers) and `copied` (one dancer in the places of all).";
         split: String, "", "Which music: `held_out` (the model met none of it), `validation` (its checkpoints were chosen by it), `trained_on`, `unknown` (nobody knows), or `all` of these.";
         metric: String, "", "Name of the number: see docs/evaluate.md.";
         variant: String, "", "Which of several ways to measure it; empty where there is one. `raw` is of motion as it was decoded.";

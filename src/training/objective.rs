@@ -8,7 +8,7 @@ use crate::autodiff::op::loss::{Cost, Loss};
 use crate::autodiff::{Element, Interpreter, Tensor};
 use crate::diffusion::{LossType, Schedule, min_snr_weights};
 use crate::model::{Graph, Result};
-use crate::motion::{ColumnRole, Columns, Layout, Normalizer};
+use crate::motion::{BodyColumns, ColumnRole, Columns, Layout, Normalizer};
 
 use super::estimate::EstimateLosses;
 
@@ -36,15 +36,22 @@ pub struct ChannelWeights {
     pub style: f64,
     /// Of vertical position, velocity and acceleration, by which dancers follow the beat.
     pub vertical: f64,
+    /// Of position and orientation, times `vertical` where a channel is both.
+    #[serde(default = "ChannelWeights::one")]
+    pub pose: f64,
 }
 
 impl Default for ChannelWeights {
     fn default() -> Self {
-        Self { style: 1.0, vertical: 1.0 }
+        Self { style: 1.0, vertical: 1.0, pose: 1.0 }
     }
 }
 
 impl ChannelWeights {
+    const fn one() -> f64 {
+        1.0
+    }
+
     /// Returns the weight of each column of a layout; their mean is 1.
     pub fn weights(&self, layout: Layout) -> Vec<f64> {
         let mut weights = vec![1.0; layout.width()];
@@ -54,8 +61,33 @@ impl ChannelWeights {
         for columns in layout.with_role(ColumnRole::Free) {
             weights[columns.range()].fill(self.style);
         }
+        let BodyColumns { position, orientation, .. } = layout.body();
+        for weight in &mut weights[position.range()] {
+            *weight *= self.pose;
+        }
+        for weight in &mut weights[orientation.range()] {
+            *weight *= self.pose;
+        }
         let mean = weights.iter().sum::<f64>() / layout.width() as f64;
         weights.into_iter().map(|weight| weight / mean).collect()
+    }
+
+    /// Multiplies both by `factor` of their channels' weights; \[batch, frames, columns\] each.
+    pub(super) fn scaled<I: Interpreter>(
+        &self,
+        g: &mut I,
+        layout: Layout,
+        [prediction, target]: [&Tensor<I::Element>; 2],
+        factor: impl Fn(f64) -> f64,
+    ) -> Result<[Tensor<I::Element>; 2]> {
+        if *self == Self::default() {
+            return Ok([prediction.clone(), target.clone()]);
+        }
+        let weights = self.weights(layout).into_iter();
+        let factors: Vec<_> = weights.map(|w| I::Element::from_f64(factor(w))).collect();
+        let factors = g.constant(&[factors.len()], &factors);
+        let mut times = |x: &Tensor<_>| g.apply(Binary::new(Pair::Multiply), &[x, &factors]);
+        Ok([times(prediction)?, times(target)?])
     }
 }
 
@@ -79,19 +111,11 @@ impl Objective {
         layout: Layout,
         both: [&Tensor<I::Element>; 2],
     ) -> Result<[Tensor<I::Element>; 2]> {
-        let [prediction, target] = both;
-        if self.channels == ChannelWeights::default() {
-            return Ok([prediction.clone(), target.clone()]);
-        }
         let factor = |weight: f64| match self.loss {
             LossType::L1 => weight,
             LossType::Mse | LossType::Huber => weight.sqrt(),
         };
-        let weights = self.channels.weights(layout).into_iter();
-        let factors: Vec<_> = weights.map(|w| I::Element::from_f64(factor(w))).collect();
-        let factors = g.constant(&[factors.len()], &factors);
-        let mut times = |x: &Tensor<_>| g.apply(Binary::new(Pair::Multiply), &[x, &factors]);
-        Ok([times(prediction)?, times(target)?])
+        self.channels.scaled(g, layout, both, factor)
     }
 
     fn cost(&self) -> Cost {
@@ -251,7 +275,7 @@ mod tests {
 
     #[test]
     fn columns_weigh_by_their_roles() {
-        let weights = ChannelWeights { style: 0.5, vertical: 3.0 };
+        let weights = ChannelWeights { style: 0.5, vertical: 3.0, pose: 1.0 };
         let (root, body) = (weights.weights(ROOT), weights.weights(BODY));
         // Two of 13 weigh 3; three of 25 do, and eight a half.
         let (of_root, of_body) = (17.0 / 13.0, 27.0 / 25.0);
@@ -275,7 +299,7 @@ mod tests {
         let (parameters, arena) = (parameters(), Arena::default());
         let mut g = Eager::new(&parameters, &arena);
         let objective = Objective {
-            channels: ChannelWeights { style: 1.0, vertical: 2.0 },
+            channels: ChannelWeights { vertical: 2.0, ..ChannelWeights::default() },
             ..Objective::default()
         };
         let says: Vec<f64> = (0..26).map(|i| f64::from(i) / 8.0).collect();

@@ -21,6 +21,7 @@ struct Inputs<E: Element> {
 struct Found<E: Element> {
     quantized: Quantized<Tensor<E>>,
     signal: Tensor<E>,
+    draft: Option<Tensor<E>>,
     estimate: Tensor<E>,
 }
 
@@ -33,7 +34,8 @@ fn forward<E: Element, I: Interpreter<Element = E>>(
     let q = g.straight_through(&quantized.latents, &quantized.codes)?;
     let signal = tokenizer.signal(g, &q, &given.motion)?;
     let estimate = tokenizer.denoise(g, &given.x, &given.t, &signal)?;
-    Ok(Found { quantized, signal, estimate })
+    let draft = tokenizer.draft(g, &signal)?;
+    Ok(Found { quantized, signal, draft, estimate })
 }
 
 fn inputs<E: Element, I: Interpreter<Element = E>>(
@@ -78,7 +80,14 @@ fn check<E: Element>(name: &str, config: &TokensConfig, tolerance: f64) {
     assert_near("simple", simple.data(), golden.values("simple"), tolerance);
     assert_near("commitment", commitment.data(), golden.values("commitment"), tolerance);
     let commitment = tape.scale(&commitment, COMMITMENT).expect("fits");
-    let loss = tape.add(&simple, &commitment).expect("fits");
+    let mut loss = tape.add(&simple, &commitment).expect("fits");
+    if let Some(draft) = &found.draft {
+        assert_near("draft", draft.data(), golden.values("draft"), tolerance);
+        let of_frames = [draft, &given.motion, &mask];
+        let draft = tape.apply(Loss::new(Cost::SmoothL1 { beta: 1.0 }), &of_frames).expect("fits");
+        assert_near("loss of the draft", draft.data(), golden.values("draft_loss"), tolerance);
+        loss = tape.add(&loss, &draft).expect("fits");
+    }
     assert_near("loss", loss.data(), golden.values("loss"), tolerance);
 
     let mut gradients = Gradients::new(&parameters);
@@ -106,10 +115,14 @@ fn check<E: Element>(name: &str, config: &TokensConfig, tolerance: f64) {
 
 #[test]
 fn a_tokenizer_and_what_it_makes_small_are_pytorchs() {
-    let tiny = TokensConfig::of(Preset::Tiny).expect("a preset of the family");
+    let drafting = TokensConfig::of(Preset::Tiny).expect("a preset of the family");
+    let tiny = TokensConfig { draft: false, ..drafting.clone() };
     let halves = TokensConfig { frames_per_token: 2, taps: 7, ..tiny.clone() };
-    for (name, config) in [("tokens_tiny.safetensors", tiny), ("tokens_halves.safetensors", halves)]
-    {
+    for (name, config) in [
+        ("tokens_tiny.safetensors", tiny),
+        ("tokens_halves.safetensors", halves),
+        ("tokens_draft.safetensors", drafting),
+    ] {
         check::<f64>(name, &config, 1e-9);
         check::<f32>(name, &config, 1e-4);
     }

@@ -115,6 +115,13 @@ impl TokenizerNetworks for EagerTokenizer {
             Ok(array(&self.tokenizer.denoise(g, &x, &t, &s)?))
         })
     }
+
+    fn draft(&self, signal: ArrayView3<f32>) -> Result<Option<Array3<f32>>, EngineError> {
+        self.run(|g| {
+            let s = constant(g, signal);
+            Ok(self.tokenizer.draft(g, &s)?.as_ref().map(array))
+        })
+    }
 }
 
 /// A planner.

@@ -146,11 +146,34 @@ impl TokenEngine {
                 .normal(0, x.as_slice_mut().expect("new arrays lie in order"));
             let denoise = |x: ArrayView3<f32>, t: usize| self.networks.denoise(x, t, signal.view());
             let sampled = sample(sampler, schedule, x, denoise, noise, None)?;
-            for window in sampled.axis_iter(Axis(0)) {
-                let mut window = window.to_owned();
-                self.normalizer.denormalize(window.view_mut());
-                found.push(window);
-            }
+            found.extend(self.denormalized(&sampled));
+        }
+        Ok(found)
+    }
+
+    /// Reads motion from the signal of the tokens of windows of so many frames, without diffusion: \[n, 25\] each, over
+    /// the origin.
+    ///
+    /// This is the plain convolutional decoder that the paper holds its own against (section 4.4).
+    ///
+    /// # Errors
+    /// A token that the codebook does not have, and a network that drafts nothing.
+    ///
+    /// # Panics
+    /// When there are fewer tokens than the windows have.
+    pub fn draft(
+        &self,
+        tokens: &[u32],
+        n_frames: &[usize],
+    ) -> Result<Vec<Array2<f32>>, EngineError> {
+        let (mut found, mut first) = (Vec::new(), 0);
+        for group in runs(n_frames) {
+            let (n, frames) = (group.len(), group[0]);
+            let n_tokens = n * self.config.n_tokens(frames);
+            let signal = self.networks.signal(&tokens[first..][..n_tokens], (n, frames))?;
+            first += n_tokens;
+            let drafted = self.networks.draft(signal.view())?.ok_or(EngineError::NoDraft)?;
+            found.extend(self.denormalized(&drafted));
         }
         Ok(found)
     }
@@ -177,6 +200,16 @@ impl TokenEngine {
         let denoise = |x: ArrayView3<f32>, t: usize| self.networks.denoise(x, t, signal.view());
         let start = (x, schedule.len());
         sample_refined(sampler, schedule, start, denoise, noise, None, refine)
+    }
+
+    /// Returns windows in the units of motion, \[n, 25\] each.
+    fn denormalized(&self, windows: &Array3<f32>) -> Vec<Array2<f32>> {
+        let in_units = |window: ArrayView2<f32>| {
+            let mut window = window.to_owned();
+            self.normalizer.denormalize(window.view_mut());
+            window
+        };
+        windows.axis_iter(Axis(0)).map(in_units).collect()
     }
 
     /// Returns windows of as many frames in units of spread, \[windows, n, 25\].

@@ -21,7 +21,7 @@ pub use networks::{
     PlanWindow, PlannerNetworks, TokenizerNetworks, WindowPlan, WithheldConditions,
 };
 pub use planner::{PlanRequest, PlannerEngine, shuffle};
-pub use reconstruct::Reconstruction;
+pub use reconstruct::{Decoding, Reconstruction};
 pub use runtime::{OnnxPlanner, OnnxTokenizer};
 pub use track::{TokenGenerator, TokenTrack};
 pub use weights::tokens_parameters;

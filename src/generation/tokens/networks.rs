@@ -37,6 +37,14 @@ pub trait TokenizerNetworks: Sync {
         t: usize,
         signal: ArrayView3<f32>,
     ) -> Result<Array3<f32>, EngineError>;
+
+    /// Returns the motion that the signal alone gives, normalised, \[n, T, 25\]; none where no draft can be had.
+    ///
+    /// # Errors
+    /// Shapes that do not fit.
+    fn draft(&self, _signal: ArrayView3<f32>) -> Result<Option<Array3<f32>>, EngineError> {
+        Ok(None)
+    }
 }
 
 /// What a planner is told of a window before it is asked for tokens.

@@ -7,6 +7,15 @@ use crate::diffusion::{SamplerConfig, Schedule};
 use crate::generation::engine::EngineError;
 use crate::motion::{MOTION_DIM, Placement};
 
+/// What makes motion of tokens.
+#[derive(Clone, Copy, Debug)]
+pub enum Decoding<'a> {
+    /// The diffusion decoder.
+    Diffusion { sampler: &'a SamplerConfig, schedule: &'a Schedule },
+    /// The draft alone: one linear layer behind the convolutional decoder.
+    Draft,
+}
+
 /// A motion that was written as tokens and made again, where it was danced.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Reconstruction {
@@ -22,11 +31,11 @@ impl TokenEngine {
     /// `change` may put other tokens in the place of those of a window. Same motion and seed, same reconstruction.
     ///
     /// # Errors
-    /// A token that the codebook does not have, and what the sampler refuses.
+    /// A token that the codebook does not have, a draft of a network that makes none, and what the sampler refuses.
     pub fn reconstruct(
         &self,
         motion: ArrayView2<f32>,
-        how: (&SamplerConfig, &Schedule),
+        decoding: Decoding,
         seed: u64,
         change: impl Fn(&mut [u32]),
     ) -> Result<Reconstruction, EngineError> {
@@ -39,7 +48,12 @@ impl TokenEngine {
             change(&mut tokens[first..first + n_tokens]);
             first += n_tokens;
         }
-        let mut made = self.motion(&tokens, &n_frames, how, seed)?;
+        let mut made = match decoding {
+            Decoding::Diffusion { sampler, schedule } => {
+                self.motion(&tokens, &n_frames, (sampler, schedule), seed)?
+            }
+            Decoding::Draft => self.draft(&tokens, &n_frames)?,
+        };
         let places = motion.axis_chunks_iter(Axis(0), self.window_frames());
         for (window, was) in made.iter_mut().zip(places) {
             if let Some(placement) = Placement::of_first(was) {

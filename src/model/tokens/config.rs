@@ -29,6 +29,9 @@ pub struct TokensConfig {
     pub taps: usize,
     /// Steps of the diffusion.
     pub n_steps: usize,
+    /// Whether a linear layer drafts motion from the signal, to which the denoiser adds; networks of release 0.2 have none.
+    #[serde(default)]
+    pub draft: bool,
 }
 
 impl TokensConfig {
@@ -36,7 +39,7 @@ impl TokensConfig {
     pub fn of(preset: Preset) -> Option<Self> {
         let (width, conv_width, depth, codes, blocks) = match preset {
             Preset::Tiny => (48, 32, 2, 32, 2),
-            Preset::Small => (128, 128, 3, 256, 3),
+            Preset::Small => (128, 128, 3, 1024, 3),
             Preset::Base => (768, 512, 3, 1024, 4),
             Preset::Large => return None,
         };
@@ -51,6 +54,7 @@ impl TokensConfig {
             blocks,
             taps: Self::usual_taps(frames_per_token),
             n_steps: 1000,
+            draft: true,
         })
     }
 

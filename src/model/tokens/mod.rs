@@ -1,8 +1,8 @@
 //! A tokenizer of motion: frames to tokens, and tokens back to frames by diffusion (MoTok).
 //!
 //! Gu et al., arXiv 2603.19227, 2026, section 3.1. An encoder E makes a latent of every ρ frames; a codebook replaces it
-//! by the nearest of K rows, whose number is the token; a decoder D makes a signal for each frame of the rows; a
-//! denoiser f predicts clean motion from noisy motion and that signal. Tokens keep what is danced, and the diffusion
+//! by the nearest of K rows, whose number is the token; a decoder D makes a signal for each frame of the rows, of which
+//! a linear layer drafts motion; a denoiser f predicts what is missing to clean motion from noisy motion and that signal. Tokens keep what is danced, and the diffusion
 //! the fine detail. A [`Planner`] says which tokens go with a piece of music.
 
 mod coder;
@@ -18,6 +18,7 @@ pub use self::planner::{
     PlannerConfig, PlannerInputs, PlannerKind, PlannerStep, PlannerStepInputs,
 };
 use super::graph::{Graph, Result};
+use super::layers::Linear;
 use super::parameter::{Init, ParameterId, ParameterList, Role, Scope};
 
 /// The networks and the codebook; see the module.
@@ -26,6 +27,7 @@ pub struct Tokenizer {
     encoder: Encoder,
     codebook: ParameterId,
     decoder: SignalDecoder,
+    draft: Option<Linear>,
     denoiser: SignalDenoiser,
 }
 
@@ -55,6 +57,9 @@ impl Tokenizer {
                 Role::Code,
             ),
             decoder: SignalDecoder::within(&mut root.at("decoder"), config),
+            draft: config
+                .draft
+                .then(|| Linear::new(&mut root.at("draft"), config.width, config.motion_dim)),
             denoiser: SignalDenoiser::within(&mut root.at("denoiser"), config),
         };
         (tokenizer, list)
@@ -103,7 +108,18 @@ impl Tokenizer {
         self.decoder.whole(g, q)
     }
 
-    /// x̂0 = f(x_t, t, s); see `SignalDenoiser::forward`.
+    /// x̃ = W s + b, the motion that the signal alone gives; none of a network without the layer.
+    ///
+    /// Deviation: the paper's signal is seen by the denoiser alone. A channel that changes slowly, such as a place, shows
+    /// through noise of nearly every step, so that tokens learn little of it there; the draft must be made of tokens
+    /// alone. With its loss it is the plain convolutional decoder of the paper's ablation (section 4.4).
+    ///
+    /// \[batch, T, d\] → \[batch, T, motion_dim\]
+    pub fn draft<G: Graph>(&self, g: &mut G, s: &G::Tensor) -> Result<Option<G::Tensor>> {
+        self.draft.as_ref().map(|draft| draft.forward(g, s)).transpose()
+    }
+
+    /// x̂0 = x̃ + f(x_t, t, s), without a draft f alone; see `SignalDenoiser::forward`.
     pub fn denoise<G: Graph>(
         &self,
         g: &mut G,
@@ -111,7 +127,11 @@ impl Tokenizer {
         t: &G::Tensor,
         s: &G::Tensor,
     ) -> Result<G::Tensor> {
-        self.denoiser.forward(g, x, t, s)
+        let change = self.denoiser.forward(g, x, t, s)?;
+        match self.draft(g, s)? {
+            Some(draft) => g.add(&draft, &change),
+            None => Ok(change),
+        }
     }
 }
 

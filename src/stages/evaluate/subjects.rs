@@ -36,6 +36,8 @@ pub enum Subject {
     ShuffledPlan,
     /// Motion that a tokenizer made of the tokens of real motion.
     Reconstructed,
+    /// The same without the diffusion decoder: what the convolutional one drafts.
+    Draft,
     /// The library's phrase with the nearest features.
     Retrieval,
     MeanMotion,
@@ -59,6 +61,7 @@ impl Subject {
             Self::NoMusic => "no_music",
             Self::ShuffledPlan => "shuffled_plan",
             Self::Reconstructed => "reconstructed",
+            Self::Draft => "draft",
             Self::Retrieval => "retrieval",
             Self::MeanMotion => "mean_motion",
             Self::Independent => "independent",

@@ -24,7 +24,7 @@ use crate::evaluation::metrics::{
 };
 use crate::evaluation::reconstruction_error;
 use crate::evaluation::window::window_starts;
-use crate::generation::{Reconstruction, TokenEngine, shuffle};
+use crate::generation::{Decoding, Reconstruction, TokenEngine, shuffle};
 use crate::model::Tokenizer;
 use crate::motion::Channel;
 use crate::stages::generate::seed_of;
@@ -36,7 +36,7 @@ use crate::training::{Ensemble, perplexity};
 use crate::units::frames_to_s;
 
 /// Raised when this evaluation writes something else for the same weights and motion.
-const OUTPUT_VERSION: u32 = 1;
+const OUTPUT_VERSION: u32 = 2;
 /// Phrases of each split that are made again: those whose names have the smallest digests.
 const MAX_PHRASES: usize = 400;
 /// Seed of the noise that motion is made of again.
@@ -61,17 +61,20 @@ enum Maker {
     Trained,
     /// The trained one, the tokens of each window in an order of chance.
     Shuffled,
+    /// The trained one without its diffusion decoder.
+    Draft,
     /// The networks and the codebook with their first weights.
     Untrained,
 }
 
 impl Maker {
-    const ALL: [Self; 3] = [Self::Trained, Self::Shuffled, Self::Untrained];
+    const ALL: [Self; 4] = [Self::Trained, Self::Shuffled, Self::Draft, Self::Untrained];
 
     fn subject(self) -> Subject {
         match self {
             Self::Trained => Subject::Reconstructed,
             Self::Shuffled => Subject::ShuffledPlan,
+            Self::Draft => Subject::Draft,
             Self::Untrained => Subject::Untrained,
         }
     }
@@ -182,8 +185,12 @@ pub fn run(
     let job = TokenizerJob { params, truth: &truth, phrases: &phrases, schedule: &schedule };
     let mut findings = Vec::new();
     for maker in Maker::ALL {
+        if maker == Maker::Draft && !network.tokens.draft {
+            continue;
+        }
         let engine = if maker == Maker::Untrained { &untrained } else { &of_run };
-        let n = if maker == Maker::Trained { originals.len() } else { params.baseline_windows };
+        let is_compared = matches!(maker, Maker::Trained | Maker::Draft);
+        let n = if is_compared { originals.len() } else { params.baseline_windows };
         let chosen = &originals[..n.min(originals.len())];
         let made = job.made(maker, engine, chosen, progress)?;
         findings.extend(job.findings(maker, engine.sizes().codes, chosen, &made));
@@ -262,8 +269,12 @@ impl TokenizerJob<'_> {
                         shuffle(tokens, Stream::new(seed, u64::MAX));
                     }
                 };
-                let (motion, how) = (original.phrase.motion.view(), (&sampler, self.schedule));
-                let found = engine.reconstruct(motion, how, seed, change);
+                let decoding = match maker {
+                    Maker::Draft => Decoding::Draft,
+                    _ => Decoding::Diffusion { sampler: &sampler, schedule: self.schedule },
+                };
+                let motion = original.phrase.motion.view();
+                let found = engine.reconstruct(motion, decoding, seed, change);
                 let found = found.with_context(|| format!("while reconstructing phrase {id}"))?;
                 lock(&made).insert(i, found);
                 progress.advance(1);

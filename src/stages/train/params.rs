@@ -140,6 +140,9 @@ pub struct DiffusionParams {
     #[arg(long, value_name = "X", default_value_t = ChannelWeights::default().vertical,
           help_heading = "Diffusion", hide_short_help = RARE)]
     pub vertical_weight: f64,
+    /// Weight of position and orientation [default: 8 in a tokenizer, whose tokens must say where a body is, else 1]
+    #[arg(long, value_name = "X", help_heading = "Diffusion", hide_short_help = RARE)]
+    pub pose_weight: Option<f64>,
     /// Weight of velocities against differences of positions, of the estimate of clean motion.
     #[arg(long, value_name = "X", default_value_t = EstimateLosses::default().velocity,
           help_heading = "Diffusion", hide_short_help = RARE)]
@@ -220,7 +223,7 @@ pub struct OptimizerParams {
     /// for tiny and small]
     #[arg(long, value_name = "N", help_heading = "Optimizer", hide_short_help = RARE)]
     pub side_by_side: Option<NonZeroUsize>,
-    /// Highest learning rate of the UNet [default: 1e-4; 5e-4 for tiny and small]
+    /// Highest learning rate of the UNet [default: 1e-4; 5e-4 for tiny and small; of a tokenizer 2e-4 and 2e-3]
     #[arg(long, value_name = "X", help_heading = "Optimizer", hide_short_help = RARE)]
     pub learning_rate: Option<f64>,
     /// Course of the learning rate after the warm-up.
@@ -402,7 +405,11 @@ impl ConfigParams {
                     loss: d.loss,
                     huber_delta: d.huber_delta,
                     min_snr_gamma: d.min_snr_gamma,
-                    channels: ChannelWeights { style: d.style_weight, vertical: d.vertical_weight },
+                    channels: ChannelWeights {
+                        style: d.style_weight,
+                        vertical: d.vertical_weight,
+                        pose: d.pose_weight.unwrap_or(ChannelWeights::default().pose),
+                    },
                     estimate: EstimateLosses {
                         velocity: d.velocity_loss,
                         acceleration: d.acceleration_loss,

@@ -14,7 +14,8 @@ use crate::stages::trained::TrainedPlanner;
 use crate::stages::{Progress, Summary};
 use crate::store::Location;
 use crate::training::{
-    Augmentation, Learner as _, Ranks, TokensLearner, TokensTrainConfig, TrainingEnd, Windows,
+    Augmentation, ChannelWeights, Learner as _, Ranks, TokensLearner, TokensTrainConfig,
+    TrainingEnd, Windows,
 };
 
 /// Runs the stage.
@@ -66,11 +67,19 @@ fn check_numbers(config: &TokensTrainConfig) -> anyhow::Result<()> {
     {
         ensure!((0.0..1.0).contains(&x), "{flag} {x} is no share; give a number from 0 to below 1");
     }
-    let weight = training.commitment;
-    ensure!(
-        weight.is_finite() && weight >= 0.0,
-        "--commitment-loss {weight} is no weight; give 0 or more"
-    );
+    let ChannelWeights { style, vertical, pose } = training.channels;
+    for (flag, weight) in [
+        ("--commitment-loss", training.commitment),
+        ("--draft-loss", training.draft),
+        ("--style-weight", style),
+        ("--vertical-weight", vertical),
+        ("--pose-weight", pose),
+    ] {
+        ensure!(
+            weight.is_finite() && weight >= 0.0,
+            "{flag} {weight} is no weight; give 0 or more"
+        );
+    }
     for (flag, x) in
         [("--learning-rate", training.learning_rate.peak), ("--least-usage", codebook.least_usage)]
     {

@@ -17,8 +17,8 @@ use crate::stages::trained::best;
 use crate::stages::{Progress, Summary};
 use crate::store::Location;
 use crate::training::{
-    Augmentation, ByOne, Checkpoints, DecoderLearner, Denoiser, DiffusionLearner, Learner as _,
-    Ranks, TrainConfig, TrainingEnd, TrainingError, Windows,
+    Augmentation, ByOne, ChannelWeights, Checkpoints, DecoderLearner, Denoiser, DiffusionLearner,
+    Learner as _, Ranks, TrainConfig, TrainingEnd, TrainingError, Windows,
 };
 
 /// Runs the stage.
@@ -70,6 +70,7 @@ fn check_numbers(params: &Params, config: &TrainConfig) -> anyhow::Result<()> {
     let weights = [
         ("--style-weight", losses.style_weight),
         ("--vertical-weight", losses.vertical_weight),
+        ("--pose-weight", losses.pose_weight.unwrap_or(ChannelWeights::default().pose)),
         ("--velocity-loss", losses.velocity_loss),
         ("--acceleration-loss", losses.acceleration_loss),
     ];

@@ -30,6 +30,14 @@ impl Default for CodebookConfig {
     }
 }
 
+impl CodebookConfig {
+    /// Returns a tenth of the latents of a batch that each row would stand for, were all used alike; at most the 1 that
+    /// MoMask publishes, whose batches have 15 latents for each row and more.
+    pub fn usual_least_usage(n_latents: usize, rows: usize) -> f64 {
+        (0.1 * n_latents as f64 / rows as f64).min(Self::default().least_usage)
+    }
+}
+
 /// What a codebook has seen: for each row how many latents of a batch it stood for, and their sum, both as moving
 /// averages.
 ///
@@ -195,6 +203,14 @@ mod tests {
 
     fn streams(seed: u64) -> [Stream; 2] {
         [1, 2].map(|stream| Stream::new(seed, stream))
+    }
+
+    #[test]
+    fn a_row_must_be_used_a_tenth_as_often_as_the_mean_and_never_more_than_once() {
+        let least = CodebookConfig::usual_least_usage;
+        assert!((least(960, 1024) - 0.09375).abs() < 1e-15);
+        assert_eq!(least(960, 32), 1.0);
+        assert_eq!(least(15_360, 1024), 1.0);
     }
 
     #[test]

@@ -8,6 +8,7 @@ use crate::training::config::OptimizerConfig;
 use crate::training::ema::EmaConfig;
 use crate::training::error::TrainingError;
 use crate::training::learning_rate::LearningRate;
+use crate::training::objective::ChannelWeights;
 use crate::training::window::Augmentation;
 
 use super::codebook::CodebookConfig;
@@ -57,6 +58,12 @@ impl TokensNetworkConfig {
 pub struct TokensTraining {
     /// Weight of the distance of latents from their codes.
     pub commitment: f64,
+    /// Weight of the loss of the draft.
+    #[serde(default)]
+    pub draft: f64,
+    /// How channels are weighed, in the estimate and in the draft.
+    #[serde(default)]
+    pub channels: ChannelWeights,
     pub codebook: CodebookConfig,
     pub augmentation: Augmentation,
     pub batch_size: usize,
@@ -72,6 +79,10 @@ pub struct TokensTraining {
 impl TokensTraining {
     /// Weight of the distance of latents from their codes, where nothing is said (paper, section 4.1).
     pub const COMMITMENT: f64 = 0.02;
+    /// Weight of the loss of the draft, where nothing is said.
+    pub const DRAFT: f64 = 1.0;
+    /// Weight of position and orientation, where nothing is said: what the other channels follow from.
+    pub const POSE: f64 = 8.0;
 }
 
 /// A training run of the family `tokens`.

@@ -4,11 +4,13 @@ use crate::autodiff::op::loss::{Cost, Loss};
 use crate::autodiff::{Interpreter, Tensor};
 use crate::diffusion::Schedule;
 use crate::model::{Graph, Tokenizer};
-use crate::motion::MOTION_DIM;
+use crate::motion::{BODY, MOTION_DIM};
 use crate::training::batch::Batch;
 use crate::training::error::TrainingError;
 use crate::training::learner::Losses;
 use crate::training::sampling::motion_view;
+
+use super::config::TokensTraining;
 
 /// Where the smooth L1 turns from squared to linear, in spreads of a channel; PyTorch's, since the paper says nothing.
 const BETA: f64 = 1.0;
@@ -61,6 +63,18 @@ impl Latents {
     }
 }
 
+/// Smooth L1 of √w_c (x − x0) over frames that count.
+fn of_motion<I: Interpreter<Element = f32>>(
+    g: &mut I,
+    x: &Tensor<f32>,
+    x0: &Tensor<f32>,
+    mask: &Tensor<f32>,
+    training: &TokensTraining,
+) -> Result<Tensor<f32>, TrainingError> {
+    let [x, x0] = training.channels.scaled(g, BODY, [x, x0], f64::sqrt)?;
+    Ok(g.apply(Loss::new(Cost::SmoothL1 { beta: BETA }), &[&x, &x0, mask])?)
+}
+
 /// Inputs of the networks for a batch of B windows of T frames, with its target.
 pub struct TokensBatch<'a> {
     batch: &'a Batch,
@@ -84,7 +98,9 @@ impl<'a> TokensBatch<'a> {
         Self { batch, t, x_t, frames_per_token }
     }
 
-    /// L = smooth L1 of x̂0 + λ ⟨(h − sg(q))²⟩ over frames, and tokens, that count.
+    /// L = l(x̂0) + λ_d l(x̃) + λ ⟨(h − sg(q))²⟩ over frames, and tokens, that count.
+    ///
+    /// l is smooth L1 of √w_c (x̂0 − x0), w_c the weights of channels.
     ///
     /// Returns the loss, its parts, and the latents.
     ///
@@ -94,7 +110,7 @@ impl<'a> TokensBatch<'a> {
         &self,
         g: &mut I,
         tokenizer: &Tokenizer,
-        commitment_weight: f64,
+        training: &TokensTraining,
     ) -> Result<(Tensor<f32>, Losses, Latents), TrainingError> {
         let Batch { n_windows: n, n_frames: frames, .. } = *self.batch;
         let motion = g.constant(&[n, frames, MOTION_DIM], &self.batch.motion);
@@ -106,8 +122,10 @@ impl<'a> TokensBatch<'a> {
         let q = g.straight_through(&found.latents, &found.codes)?;
         let s = tokenizer.signal(g, &q, &x_t)?;
         let x0 = tokenizer.denoise(g, &x_t, &t, &s)?;
-        let of_motion = Loss::new(Cost::SmoothL1 { beta: BETA });
-        let simple = g.apply(of_motion, &[&x0, &motion, &mask])?;
+        let simple = of_motion(g, &x0, &motion, &mask, training)?;
+        let draft = tokenizer.draft(g, &s)?;
+        let draft =
+            draft.map(|draft| of_motion(g, &draft, &motion, &mask, training)).transpose()?;
 
         // A constant: codes are drawn to latents by averages, and latents to codes by this.
         let codes = g.constant(found.codes.shape(), found.codes.data());
@@ -118,8 +136,13 @@ impl<'a> TokensBatch<'a> {
         let mut losses = Losses { total: 0.0, parts: Vec::new() };
         losses.parts.push(("diffusion", simple.scalar().into()));
         losses.parts.push(("commitment", commitment.scalar().into()));
-        let commitment = g.scale(&commitment, commitment_weight)?;
-        let loss = g.add(&simple, &commitment)?;
+        let commitment = g.scale(&commitment, training.commitment)?;
+        let mut loss = g.add(&simple, &commitment)?;
+        if let Some(draft) = draft {
+            losses.parts.push(("reconstruction", draft.scalar().into()));
+            let draft = g.scale(&draft, training.draft)?;
+            loss = g.add(&loss, &draft)?;
+        }
         losses.total = loss.scalar().into();
         let mut latents = Latents::default();
         latents.add(&found.latents, &found.tokens, self.batch, self.frames_per_token);

@@ -121,7 +121,7 @@ impl TokensLearner {
             let seed = tape_seed(*seed, step * n_parts as u64 + number as u64);
             let mut tape = Tape::new(parameters, part.arena, Some(seed));
             let given = TokensBatch::of(&batch, schedule, sizes.frames_per_token);
-            let (loss, losses, latents) = given.loss(&mut tape, tokenizer, config.commitment)?;
+            let (loss, losses, latents) = given.loss(&mut tape, tokenizer, config)?;
             part.backward(tape, loss, share(number))?;
             Ok((losses.numbers(&names), latents.numbers()))
         })?;
@@ -174,7 +174,7 @@ impl TokensLearner {
             let given = TokensBatch::of(&batch, &self.schedule, self.sizes.frames_per_token);
             let (_, found, latents) = self.parts.threads().run(|| {
                 let mut g = Eager::new(parameters, self.parts.arena());
-                given.loss(&mut g, &self.tokenizer, self.config.commitment)
+                given.loss(&mut g, &self.tokenizer, &self.config)
             })?;
             losses.add(&found, batch.weight());
             weight += batch.weight();

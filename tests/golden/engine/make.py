@@ -123,14 +123,14 @@ class TokensCase(Case):
     """A tokenizer with what training makes small; at a fixed step no gradient of the target is looked at."""
 
     def loss(self) -> tuple[Tensor, Tensor]:
-        """Returns the estimate, and smooth L1 + 0.02 commitment."""
+        """Returns the estimate, and smooth L1 (of the draft too, where there is one) + 0.02 commitment."""
         found = self.network(*self.inputs.values())
-        self.more = {key: found[key] for key in ("latents", "tokens", "signal", "simple", "commitment")}
+        self.more = {key: value for key, value in found.items() if key not in ("estimate", "loss")}
         return found["estimate"], found["loss"]
 
 
-def tokens_case(frames_per_token: int, taps: int) -> TokensCase:
-    config = tokens.TokensConfig(frames_per_token=frames_per_token, taps=taps)
+def tokens_case(frames_per_token: int, taps: int, *, draft: bool = False) -> TokensCase:
+    config = tokens.TokensConfig(frames_per_token=frames_per_token, taps=taps, draft=draft)
     made = tokens.Tokenizer(config).double().eval()
     weights.fill(made)
     batch, frames = 3, 22
@@ -324,6 +324,7 @@ def main() -> None:
         "group_tiny": group_case,
         "tokens_tiny": lambda: tokens_case(4, 5),
         "tokens_halves": lambda: tokens_case(2, 7),
+        "tokens_draft": lambda: tokens_case(4, 5, draft=True),
         "planner_masked": lambda: planner_case(is_causal=False),
         "planner_autoregressive": lambda: planner_case(is_causal=True),
         "constrained_masked": lambda: planner_case(is_causal=False, constraint_dim=12),

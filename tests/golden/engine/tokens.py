@@ -29,6 +29,7 @@ class TokensConfig:
     taps: int = 5
     motion_dim: int = 25
     n_steps: int = 1000
+    draft: bool = False
 
     @property
     def n_levels(self) -> int:
@@ -151,6 +152,7 @@ class Tokenizer(nn.Module):
         self.encoder = Encoder(config)
         self.codebook = nn.Parameter(torch.empty(config.codes, config.width))
         self.decoder = Decoder(config)
+        self.draft = nn.Linear(config.width, config.motion_dim) if config.draft else None
         self.denoiser = Denoiser(config)
         # Tokens, rows and their distance from the latents, where gradients are taken: straight through is the
         # derivative of what these are held fixed in, which central differences can be held against.
@@ -174,8 +176,17 @@ class Tokenizer(nn.Module):
         z, q, step = self.fixed
         s = self.decoder(h + step, motion.shape[1])
         x0 = self.denoiser(x, t, s)
-        simple = F.smooth_l1_loss(x0, motion, reduction="none").mean(-1)
-        simple = (mask * simple).sum() / mask.sum()
+
+        def of_frames(x0: Tensor) -> Tensor:
+            loss = F.smooth_l1_loss(x0, motion, reduction="none").mean(-1)
+            return (mask * loss).sum() / mask.sum()
+
+        drafted = {}
+        if self.draft is not None:
+            draft = self.draft(s)
+            x0 = draft + x0
+            drafted = {"draft": draft, "draft_loss": of_frames(draft)}
+        simple = of_frames(x0)
         # A token counts where its first frame does.
         counts = mask[:, :: self.rate]
         commitment = (h - q).square().mean(-1)
@@ -187,5 +198,6 @@ class Tokenizer(nn.Module):
             "estimate": x0,
             "simple": simple,
             "commitment": commitment,
-            "loss": simple + COMMITMENT * commitment,
+            **drafted,
+            "loss": simple + drafted.get("draft_loss", 0.0) + COMMITMENT * commitment,
         }

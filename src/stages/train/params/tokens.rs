@@ -1,12 +1,13 @@
 //! The flags of the family tokens, and the configuration that they make.
 
 use super::ConfigParams;
-use crate::model::{PlannerConfig, PlannerKind, TokensConfig};
+use crate::model::{PlannerConfig, PlannerKind, Preset, TokensConfig};
 use crate::motion::style::STYLE_DIM;
 use crate::stages::RARE;
 use crate::training::{
-    Augmentation, CodebookConfig, PlannerNetworkConfig, PlannerTrainConfig, PlannerTraining,
-    TokenizerSource, TokensNetworkConfig, TokensTrainConfig, TokensTraining, TrainConfig,
+    Augmentation, ChannelWeights, CodebookConfig, LearningRate, PlannerNetworkConfig,
+    PlannerTrainConfig, PlannerTraining, TokenizerSource, TokensNetworkConfig, TokensTrainConfig,
+    TokensTraining, TrainConfig,
 };
 
 /// The tokens of a tokenizer, how its codebook is learned, and how its tokens are planned.
@@ -34,6 +35,12 @@ pub struct TokensParams {
     /// Rows of the codebook, so many tokens there are [default: the preset's]
     #[arg(long, value_name = "K", help_heading = "Tokens", hide_short_help = RARE)]
     pub codes: Option<usize>,
+    /// Weight of the draft, motion that a linear layer reads from the tokens' signal and the denoiser adds to.
+    #[arg(long, value_name = "X", default_value_t = TokensTraining::DRAFT, help_heading = "Tokens", hide_short_help = RARE)]
+    pub draft_loss: f64,
+    /// Let the denoiser alone read tokens, as the paper has it: they keep little of what changes slowly.
+    #[arg(long, help_heading = "Tokens", hide_short_help = RARE)]
+    pub no_draft: bool,
     /// Weight of the distance of latents from their codes.
     #[arg(long, value_name = "X", default_value_t = TokensTraining::COMMITMENT, help_heading = "Tokens", hide_short_help = RARE)]
     pub commitment_loss: f64,
@@ -42,10 +49,19 @@ pub struct TokensParams {
           help_heading = "Tokens", hide_short_help = RARE)]
     pub codebook_decay: f64,
     /// Latents of a batch that a code has to stand for, on average, or it is put in the place of another latent; a
-    /// batch has --batch-size × --window-frames / --frames-per-token of them.
-    #[arg(long, value_name = "X", default_value_t = CodebookConfig::default().least_usage,
-          help_heading = "Tokens", hide_short_help = RARE)]
-    pub least_usage: f64,
+    /// batch has --batch-size × --window-frames / --frames-per-token of them [default: a tenth of what a code would have,
+    /// were all used alike; at most 1]
+    #[arg(long, value_name = "X", help_heading = "Tokens", hide_short_help = RARE)]
+    pub least_usage: Option<f64>,
+}
+
+/// Returns the learning rate that suits a tokenizer, whose encoder learns faster than a denoiser.
+fn tokenizer_learning_rate(preset: Preset) -> f64 {
+    match preset {
+        Preset::Tiny | Preset::Small => 2e-3,
+        // The paper's.
+        Preset::Base | Preset::Large => 2e-4,
+    }
 }
 
 impl ConfigParams {
@@ -56,19 +72,35 @@ impl ConfigParams {
         let TokensParams {
             frames_per_token,
             codes,
+            draft_loss,
+            no_draft,
             commitment_loss,
             codebook_decay,
             least_usage,
             ..
         } = self.tokens;
+        let codes = codes.unwrap_or(sizes.codes);
+        // Where a batch has few latents for each code, MoMask's 1 would replace codes that are in use.
+        let n_latents = diffusion.batch_size * network.window_frames / frames_per_token.max(1);
+        let of_usual = CodebookConfig::usual_least_usage(n_latents, codes);
+        let codebook =
+            CodebookConfig { decay: codebook_decay, least_usage: least_usage.unwrap_or(of_usual) };
+        let learning_rate = LearningRate {
+            peak: self
+                .optimizer
+                .learning_rate
+                .unwrap_or(tokenizer_learning_rate(self.network.preset)),
+            ..diffusion.learning_rate
+        };
         Some(TokensTrainConfig {
             seed,
             network: TokensNetworkConfig {
                 tokens: TokensConfig {
-                    codes: codes.unwrap_or(sizes.codes),
+                    codes,
                     frames_per_token,
                     taps: TokensConfig::usual_taps(frames_per_token),
                     n_steps: network.diffusion.n_steps,
+                    draft: !no_draft,
                     ..sizes
                 },
                 diffusion: network.diffusion,
@@ -76,13 +108,18 @@ impl ConfigParams {
             },
             tokens: TokensTraining {
                 commitment: commitment_loss,
-                codebook: CodebookConfig { decay: codebook_decay, least_usage },
+                draft: draft_loss,
+                channels: ChannelWeights {
+                    pose: self.diffusion.pose_weight.unwrap_or(TokensTraining::POSE),
+                    ..diffusion.objective.channels
+                },
+                codebook,
                 // No music is heard, so that none is made noisy.
                 augmentation: Augmentation { condition_noise: 0.0, ..diffusion.augmentation },
                 batch_size: diffusion.batch_size,
                 accumulate: diffusion.accumulate,
                 side_by_side: diffusion.side_by_side,
-                learning_rate: diffusion.learning_rate,
+                learning_rate,
                 optimizer: diffusion.optimizer,
                 ema: diffusion.ema,
             },
