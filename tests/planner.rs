@@ -109,6 +109,26 @@ fn planners_of_both_kinds_are_trained_exported_and_danced_in_files() {
             assert_eq!(output.code, 0, "{output:?}");
             assert!(std::fs::read(into.join("song.npy")).expect("a file") == bytes, "{same:?}");
         }
+        if run == "next" {
+            // A name stands for the mean of its phrases, and gives the motion that these eight values give.
+            let named: BTreeMap<String, [f32; 8]> = styles_of_card(&store, run);
+            let names: Vec<&String> = named.keys().collect();
+            assert_eq!(names, ["break", "middle hip-hop"]);
+            assert_ne!(named["break"], named["middle hip-hop"]);
+            let values = named["break"].map(|x| x.to_string()).join(",");
+            let [by_name, by_values] = ["break", values.as_str()].map(|style| {
+                let flags =
+                    [format!("--style={style}"), "--format=npy".to_owned(), "--force".to_owned()];
+                let flags: Vec<&str> = flags.iter().map(String::as_str).collect();
+                let output = generate(&store, run, &audio, &into, &flags);
+                assert_eq!(output.code, 0, "{output:?}");
+                std::fs::read(into.join("song.npy")).expect("a file")
+            });
+            assert!(by_name == by_values, "a name and its values give other motion");
+            let output = generate(&store, run, &audio, &into, &["--style=polka"]);
+            let expected = "error: model next has no style \"polka\"; it has break, middle hip-hop";
+            assert!(output.code == 2 && output.stderr.starts_with(expected), "{output:?}");
+        }
         let of_style = "--style=1,0,0,0,-1,0,0.5,0";
         for other in [
             "--seed=5",
@@ -129,6 +149,13 @@ fn planners_of_both_kinds_are_trained_exported_and_danced_in_files() {
             assert!(found != bytes || may_be_same, "{other}: the same bytes");
         }
     }
+}
+
+/// Returns the named styles of a model of a store.
+fn styles_of_card(store: &Path, model: &str) -> BTreeMap<String, [f32; 8]> {
+    let text = std::fs::read(store.join(format!("models/{model}/model.json"))).expect("a card");
+    let card: serde_json::Value = serde_json::from_slice(&text).expect("JSON");
+    serde_json::from_value(card["styles"].clone()).expect("styles by name")
 }
 
 #[test]

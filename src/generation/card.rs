@@ -11,6 +11,7 @@ use crate::audio::{FEATURE_DIM, FeatureScale};
 use crate::diffusion::DiffusionConfig;
 use crate::model::{DecoderConfig, Family, MotionDecoder, UNet1D, UNetConfig};
 use crate::motion::rates::MotionRange;
+use crate::motion::style_name::NamedStyles;
 use crate::motion::{MOTION_DIM, Normalizer};
 use crate::onnx::Storage;
 use shared::MAX_NAME_BYTES;
@@ -152,6 +153,9 @@ pub struct ModelCard {
     /// How fast the motion is that it was trained on; generated motion is held to it.
     #[serde(default)]
     pub motion_range: Option<MotionRange>,
+    /// Mean style of the phrases of each name; of a model that takes none, and of earlier releases, empty.
+    #[serde(default, skip_serializing_if = "NamedStyles::is_empty")]
+    pub styles: NamedStyles,
     /// How it is best sampled; cards of release 0.1 do not tell.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sampling: Option<SamplingDefaults>,

@@ -41,6 +41,7 @@ pub mod quaternion;
 pub mod rates;
 pub mod spline;
 pub mod style;
+pub mod style_name;
 pub mod text;
 pub mod trajectory;
 pub mod vector;

@@ -52,7 +52,7 @@ rows! {
         n_dancers: Option<i32>, "dancers", "Dancers in the motion, 1 of a soloist. None without motion, and in rows of versions before 5, where motion is a soloist's.";
         formation: Option<String>, "", "Of a constructed group: the shape that its dancers stand in: `line`, `v`, `circle`, `rows` or `scatter`; none where no shape holds three quarters of the phrase, and otherwise.";
         unison: Option<String>, "", "Of a constructed group: how its dancers' steps are related: `same`, `mirrored`, `canon`, `call_and_response` or `free`; none where no kind holds three quarters of the phrase, and otherwise.";
-        style_name: Option<String>, "", "Name of the style of the motion, such as a dance genre; none where nobody named one.";
+        style_name: Option<String>, "", "Name of the style of the motion, such as a dance genre: what `motion/ID/style.txt` says, else the genre in the name of a recording of AIST++ (`gHO_sBM_…`); none where there is neither, and in rows of releases before 0.3.";
     }
 }
 

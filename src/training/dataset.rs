@@ -60,6 +60,8 @@ pub struct Phrase {
     pub beats_per_bar: u32,
     /// Identity of the music, where the table of phrases tells it.
     pub song_hash: Option<Arc<str>>,
+    /// Name of the style of the motion, where somebody named one.
+    pub style_name: Option<Arc<str>>,
     /// Digest of the phrase's files, or of its motion and features.
     pub content_hash: Arc<str>,
     /// Digest of the features: phrases to the same stretch of music have the same.
@@ -294,6 +296,7 @@ impl Dataset {
                 n_frames: motion.n_frames.min(features.n_frames),
                 beats_per_bar: beats_per_bar(&row),
                 song_hash: row.song_hash.map(Into::into),
+                style_name: row.style_name.map(Into::into),
                 content_hash: row.content_hash.into(),
                 music: features.digest.into(),
                 motion_frames: motion.n_frames,
@@ -370,6 +373,7 @@ impl Dataset {
                 n_frames: motion_frames.min(of_features.nrows()),
                 beats_per_bar: DEFAULT_BEATS_PER_BAR,
                 song_hash: None,
+                style_name: None,
                 content_hash: content_hash.into(),
                 music: b.into(),
                 motion_frames,

@@ -86,9 +86,13 @@ fn a_tokenizer_is_held_against_motion_that_it_did_not_learn_from() {
     );
     let off = |of: &BTreeMap<_, _>, subject| number(of, [subject, "reconstruction_position", ""]);
     let found = off(&own, "reconstructed");
-    // 150 steps teach little of where a body is; what untrained networks make is other motion all the same, and motion
-    // as it is is compared with nothing.
-    assert!(found > 0.0 && found != off(&own, "untrained"), "{found}");
+    // Tokens say where a body is: their order counts, and so do the weights. Motion as it is is compared with nothing.
+    for subject in ["untrained", "shuffled_plan"] {
+        let other = off(&own, subject);
+        assert!(found < 0.9 * other, "{found} cm, {subject} {other} cm");
+    }
+    let drafted = off(&own, "draft");
+    assert!(drafted > 0.0 && drafted != found, "{drafted} cm without the diffusion decoder");
     assert!(
         !own.contains_key(&["held_out_truth", "reconstruction_position", ""].map(str::to_owned))
     );
@@ -104,7 +108,7 @@ fn a_tokenizer_is_held_against_motion_that_it_did_not_learn_from() {
     let output = evaluate(&store, &["--tokenizer=tok"]);
     assert!(output.stdout.contains(" evaluated;"), "weights have changed: {output:?}");
     let mixed = off(&numbers(&store, "tok"), "reconstructed");
-    assert!(mixed != found, "{mixed} cm by the codes of another run, as by its own");
+    assert!(mixed > 1.1 * found, "{mixed} cm by the codes of another run, {found} cm by its own");
 }
 
 #[test]

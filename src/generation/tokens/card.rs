@@ -12,6 +12,7 @@ use crate::generation::learned::LearnedFrom;
 use crate::model::{CONSTRAINT_DIM, Family, Planner, PlannerConfig, Tokenizer, TokensConfig};
 use crate::motion::rates::MotionRange;
 use crate::motion::style::STYLE_DIM;
+use crate::motion::style_name::NamedStyles;
 use crate::motion::{MOTION_DIM, Normalizer};
 use crate::onnx::Storage;
 
@@ -47,6 +48,9 @@ pub struct TokensCard {
     pub feature_scale: FeatureScale,
     /// How fast the motion is that it was trained on; generated motion is held to it.
     pub motion_range: Option<MotionRange>,
+    /// Mean style of the phrases of each name; of a model that takes none, and of earlier releases, empty.
+    #[serde(default, skip_serializing_if = "NamedStyles::is_empty")]
+    pub styles: NamedStyles,
     /// How it is best sampled; none where it was not measured. The guidance is that of the planner.
     pub sampling: Option<SamplingDefaults>,
     pub licence: String,

@@ -14,6 +14,7 @@ use crate::generation::{
 };
 use crate::model::{Family, ParameterId};
 use crate::motion::rates::MotionRange;
+use crate::motion::style_name::NamedStyles;
 use crate::onnx::{EncodedModel, Form, Graph, Model, ModelFile, OnnxError, check, decoder, unet};
 use crate::stages::model_files::{sha256, sha256_of};
 use crate::stages::trained::TrainedRun;
@@ -109,7 +110,7 @@ impl ExportedFiles {
     pub fn make(
         trained: &TrainedRun,
         params: &Params,
-        (range, sampling): (Option<MotionRange>, Option<SamplingDefaults>),
+        (range, styles, sampling): (Option<MotionRange>, NamedStyles, Option<SamplingDefaults>),
         learned_from: Option<LearnedFrom>,
     ) -> anyhow::Result<Self> {
         let config = &trained.state.config.network;
@@ -152,6 +153,7 @@ impl ExportedFiles {
             normalizer: scales.motion.clone(),
             feature_scale: scales.features.clone(),
             motion_range: range,
+            styles,
             sampling,
             licence: params.licence.clone(),
             files: Vec::new(),

@@ -24,6 +24,7 @@ use super::{ClientParams, Contract, Progress, RARE, Stage, Summary, lease};
 use crate::generation::{ModelFileName, file_names};
 use crate::model::Family;
 use crate::motion::rates::MotionRange;
+use crate::motion::style_name::{NamedStyles, StyleMeans};
 use crate::onnx::{Runtime, Storage};
 use crate::store::tables::OnnxCheckRow;
 use crate::store::{
@@ -133,12 +134,13 @@ impl Stage for Export {
         let engine = eager(&trained, (unet.clone(), decoder.clone()), machine.threads)?;
         let sampling = tuning::sampling_defaults(&engine, network, &phrases.dataset, progress)?;
         drop(engine);
+        let styles = named_styles(&phrases.dataset, network.unet.style_dim)?;
         // In training its heads speak for themselves, and by what they were measured to leave they are fused.
         trained.state.config.network.decoder.fusion = sampling
             .as_ref()
             .filter(|_| !params.no_fusion)
             .map(|sampling| sampling.fusion_variances);
-        let measured = (motion_range(&phrases.dataset)?, sampling);
+        let measured = (motion_range(&phrases.dataset)?, styles, sampling);
         let files = ExportedFiles::make(&trained, &params, measured, learned_from)?;
         if params.dry_run {
             return Ok(Box::new(ExportDryRun::new(&params, &files, &store)));
@@ -201,6 +203,21 @@ fn motion_range(dataset: &Dataset) -> Result<Option<MotionRange>, StoreError> {
     let motions: Vec<_> =
         train.map(|phrase| dataset.motion(phrase, 0, phrase.n_frames)).collect::<Result<_, _>>()?;
     Ok(MotionRange::fit(motions.iter().map(|frames| frames.view())).filter(MotionRange::is_sound))
+}
+
+/// Returns the mean style of the phrases that were trained on by the name of their style; none of a network that takes
+/// no style.
+fn named_styles(dataset: &Dataset, style_dim: usize) -> Result<NamedStyles, StoreError> {
+    let mut styles = StyleMeans::default();
+    if style_dim == 0 {
+        return Ok(styles.means());
+    }
+    for phrase in dataset.phrases().iter().filter(|phrase| phrase.split == Split::Train) {
+        if let Some(name) = &phrase.style_name {
+            styles.add(name, dataset.motion(phrase, 0, phrase.n_frames)?.view());
+        }
+    }
+    Ok(styles.means())
 }
 
 fn check_model_name(model: &str) -> anyhow::Result<()> {

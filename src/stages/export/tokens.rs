@@ -13,7 +13,7 @@ use bytes::Bytes;
 use super::files::{
     ExportedFiles, NetworkFile, alphas_cumprod, encode, entries, program, weights_sha256,
 };
-use super::{Export, MAX_TRAIN_PHRASES, Params, motion_range, put_in_place};
+use super::{Export, MAX_TRAIN_PHRASES, Params, motion_range, named_styles, put_in_place};
 use crate::generation::{
     FamilyCard as _, MODEL_FORMAT, ModelFileName, PlannerEngine, TokenEngine, TokensCard,
     TokensNetworks, TokensProvenance, own_channels, own_features,
@@ -130,6 +130,7 @@ pub fn run(
         normalizer: scales.motion.clone(),
         feature_scale: scales.features.clone(),
         motion_range: motion_range(dataset)?,
+        styles: named_styles(dataset, config.network.planner.style_dim)?,
         sampling,
         licence: params.licence.clone(),
         files: Vec::new(),

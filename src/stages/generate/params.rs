@@ -5,7 +5,7 @@ mod postprocess;
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
-use anyhow::{bail, ensure};
+use anyhow::{Context as _, anyhow, ensure};
 use serde::{Deserialize, Serialize};
 
 use super::constraints_file::ConstraintsRequest;
@@ -15,6 +15,7 @@ use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing, TokenSampling}
 use crate::generation::{ConsistencyForm, Control, FamilyCard, ModelCard, OVERLAP_FRAMES};
 use crate::motion::postprocess::PostProcessConfig;
 use crate::motion::style::STYLE_DIM;
+use crate::motion::style_name::{NamedStyles, is_style_name};
 use crate::motion::{Channel, Normalizer};
 use crate::stages::model_files::EngineParams;
 use crate::stages::motion_source::read_motion;
@@ -145,10 +146,10 @@ pub struct Params {
     /// Seed of all noise.
     #[arg(long, value_name = "N", default_value_t = 0, help_heading = "Sampling")]
     pub seed: u64,
-    /// Eight style values from -1 to 1, for a model that takes a style.
-    #[arg(long, value_name = "S0,…,S7", value_delimiter = ',', num_args = 1.., allow_hyphen_values = true,
+    /// Style, of a model that takes one: a name that `motiongen model` lists, or eight values from -1 to 1.
+    #[arg(long, value_name = "NAME|S0,…,S7", value_delimiter = ',', num_args = 1.., allow_hyphen_values = true,
           help_heading = "Sampling", hide_short_help = RARE)]
-    pub style: Vec<f32>,
+    pub style: Vec<String>,
     /// Begin from the motion of the library's phrases whose music is nearest, made noisy, instead of from noise
     /// alone: the share of it that is kept, 0 to 1; needs --store with a library.
     #[arg(long, value_name = "X", help_heading = "Sampling", hide_short_help = RARE)]
@@ -340,7 +341,11 @@ impl Settings {
             guidance,
             seed: params.seed,
             best_of: params.best_of.get(),
-            style: style(&params.style, (&card.name, card.unet.style_dim > 0), &card.normalizer)?,
+            style: style(
+                &params.style,
+                (&card.name, card.unet.style_dim > 0, &card.styles),
+                &card.normalizer,
+            )?,
             overlap_frames,
             prime: None,
             postprocess: params.postprocess.config((card.motion_range, card.fusion_variances()))?,
@@ -422,21 +427,44 @@ impl Settings {
     }
 }
 
-/// Returns a style in the model's units.
+/// Reads the values of the style channels.
+fn values_of(given: &[String]) -> anyhow::Result<[f32; STYLE_DIM]> {
+    let read = |text: &String| -> anyhow::Result<f32> {
+        text.trim().parse().with_context(|| {
+            format!("--style has {text:?}; give one name, or {STYLE_DIM} values from -1 to 1")
+        })
+    };
+    let values: Vec<f32> = given.iter().map(read).collect::<Result<_, _>>()?;
+    let n = values.len();
+    <[f32; STYLE_DIM]>::try_from(values)
+        .map_err(|_| anyhow!("--style has {n} values; give {STYLE_DIM}, from -1 to 1"))
+}
+
+/// Returns a style in the model's units: that of a name, or eight values.
 pub fn style(
-    values: &[f32],
-    (model, takes_style): (&str, bool),
+    given: &[String],
+    (model, takes_style, named): (&str, bool, &NamedStyles),
     normalizer: &Normalizer,
 ) -> anyhow::Result<Option<[f32; STYLE_DIM]>> {
-    if values.is_empty() {
+    if given.is_empty() {
         return Ok(None);
     }
     ensure!(
         takes_style,
         "model {model} takes no style; leave --style out, or train one with --style"
     );
-    let Ok(mut style) = <[f32; STYLE_DIM]>::try_from(values) else {
-        bail!("--style has {} values; give {STYLE_DIM}, from -1 to 1", values.len());
+    let mut style = match given {
+        [name] if is_style_name(name) => {
+            let names: Vec<&str> = named.keys().map(String::as_str).collect();
+            *named.get(name).with_context(|| match names.as_slice() {
+                [] => format!(
+                    "model {model} has no style \"{name}\": no phrase that it was trained on has the name of a style; give \
+                     {STYLE_DIM} values, from -1 to 1"
+                ),
+                names => format!("model {model} has no style \"{name}\"; it has {}", names.join(", ")),
+            })?
+        }
+        _ => values_of(given)?,
     };
     for (i, x) in Channel::Style.range().zip(&mut style) {
         ensure!((-1.0..=1.0).contains(x), "--style has {x}; give values from -1 to 1");

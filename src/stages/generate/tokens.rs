@@ -125,7 +125,7 @@ impl TokensSettings {
             guidance,
             style: style(
                 &params.style,
-                (&card.name, card.planner.style_dim > 0),
+                (&card.name, card.planner.style_dim > 0, &card.styles),
                 &card.normalizer,
             )?,
             window_frames: params.window.filter(|&n| n < card.window_frames),

@@ -10,6 +10,7 @@ use std::sync::{Mutex, PoisonError};
 use super::layout::{PlannedPhrase, Role};
 use super::phrase::{CheckedPhrase, IngestRules, PhraseFiles};
 use super::{BEATS_VERSION, CAPTURE_VERSION, FailedPhrase, IngestTally, notes_of};
+use crate::motion::style_name::style_of_name;
 use crate::stages::Progress;
 use crate::stages::batch::{BatchCommit, BatchJob, n_batches};
 use crate::stages::beats::{self, BeatSource};
@@ -337,7 +338,7 @@ impl IngestJob<'_> {
             n_dancers: phrase.motion.as_ref().map(|dancers| dancers.n_dancers() as i32),
             formation: None,
             unison: None,
-            style_name: None,
+            style_name: phrase.style_name.or_else(|| style_of_name(&planned.id).map(str::to_owned)),
         }
     }
 }

@@ -13,6 +13,8 @@ use super::motion::CAPTURE_EXTENSIONS;
 use crate::stages::failure::{Failure, FailureKind};
 
 const BEATS_SUFFIX: &str = ".beats.txt";
+/// File that names the style of a phrase's motion.
+const STYLE_FILE: &str = "style.txt";
 /// How the files of a group's dancers are called, before their number.
 const DANCER_PREFIX: &str = "dancer_";
 /// Endings of such names.
@@ -25,7 +27,7 @@ pub enum Layout {
     /// `beats/`; else a music library.
     Auto,
     /// `motion/ID/trajectory.npy` or `motion.bvh` (or `.npz`, `.npy`, `.vmd`), of a group also `dancer_0.npy` (or
-    /// `.bvh`), `dancer_1.npy` and so on; `audio_features/ID/features.npz`, `audio/ID.wav`, `beats/ID.beats.txt`.
+    /// `.bvh`), `dancer_1.npy` and so on, and `style.txt`, the name of its style; `audio_features/ID/features.npz`, `audio/ID.wav`, `beats/ID.beats.txt`.
     Phrases,
     /// Any tree of audio files; a phrase's id is its relative path, extension included.
     Library,
@@ -41,6 +43,8 @@ pub enum Role {
     MotionNpy,
     /// Motion of one dancer of a group, by number.
     Dancer(u32),
+    /// The name of the motion's style.
+    Style,
 }
 
 impl Role {
@@ -51,6 +55,7 @@ impl Role {
             Role::Beats => "beats",
             Role::Features => "features",
             Role::MotionCapture | Role::MotionNpy | Role::Dancer(_) => "motion",
+            Role::Style => "style",
         }
     }
 }
@@ -155,9 +160,13 @@ fn lacking_files(listing: &Listing) -> Vec<(String, Failure)> {
             continue;
         };
         expecting.push(folder);
-        if phrase_slot(&file.path).is_some() {
-            filled.push(folder);
-            taken.push(folder);
+        match phrase_slot(&file.path) {
+            // The name of a style is no motion.
+            None | Some((_, Role::Style)) => {}
+            Some(_) => {
+                filled.push(folder);
+                taken.push(folder);
+            }
         }
     }
     for problem in &listing.problems {
@@ -194,6 +203,9 @@ fn phrase_slot(path: &str) -> Option<(&str, Role)> {
     let in_folder = |file: &str| rest.strip_suffix(file)?.strip_suffix('/');
     let slot = match top {
         "motion" => in_folder("trajectory.npy").map(|id| (id, Role::MotionNpy)).or_else(|| {
+            if let Some(id) = in_folder(STYLE_FILE) {
+                return Some((id, Role::Style));
+            }
             let (stem, ending) = rest.rsplit_once('.')?;
             if let Some(id) = stem.strip_suffix("/motion") {
                 return CAPTURE_EXTENSIONS.contains(&ending).then_some((id, Role::MotionCapture));

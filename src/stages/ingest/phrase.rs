@@ -5,6 +5,8 @@ use std::io::{Read as _, Seek as _};
 use super::layout::Role;
 use super::motion::{ReadMotion, read_dancers, read_group, read_motion};
 use crate::audio::header::{AudioHeader, AudioHeaderError, read_header, read_header_from};
+use crate::excerpt::preview;
+use crate::motion::style_name::{MAX_STYLE_NAME, is_style_name};
 use crate::motion::text::text_of;
 use crate::motion::{Axis, Beats, BeatsPerBarSource, CaptureAccount, ChannelLimits, Dancers};
 use crate::stages::RARE;
@@ -51,6 +53,8 @@ pub struct CheckedPhrase {
     /// Those of a beat list.
     pub beats: Option<Beats>,
     pub has_beats: bool,
+    /// Name of the style of the motion, as its file says.
+    pub style_name: Option<String>,
 }
 
 /// Tempo and metre, with where each came from.
@@ -123,7 +127,11 @@ impl PhraseFiles {
             match role {
                 Role::Audio => of_audio = Some(hash),
                 Role::Features => of_features = Some(hash),
-                Role::Beats | Role::MotionNpy | Role::MotionCapture | Role::Dancer(_) => {}
+                Role::Beats
+                | Role::MotionNpy
+                | Role::MotionCapture
+                | Role::Dancer(_)
+                | Role::Style => {}
             }
             taken.push((role, file, content));
         }
@@ -151,6 +159,7 @@ impl PhraseFiles {
             tempo: None,
             beats: None,
             has_beats: false,
+            style_name: None,
         };
         let mut motion_path = String::new();
         let mut of_dancers: Vec<(String, bytes::Bytes)> = Vec::new();
@@ -186,6 +195,9 @@ impl PhraseFiles {
                     let read = read_motion(path, &bytes, phrase.beats.as_ref(), rules.up)?;
                     phrase.take_motion(path, read, rules)?;
                     path.clone_into(&mut motion_path);
+                }
+                Role::Style => {
+                    phrase.style_name = Some(read_style_name(path, &bytes_of(&file, content)?)?);
                 }
                 Role::Dancer(_) => of_dancers.push((path.to_owned(), bytes_of(&file, content)?)),
             }
@@ -291,6 +303,27 @@ pub(in crate::stages) fn read_beats(path: &str, bytes: &[u8]) -> Result<Beats, F
     let text = std::str::from_utf8(&text)
         .map_err(|_| refuse(&"is not UTF-8 text; write one beat time in seconds per line"))?;
     Beats::parse(text).map_err(|e| refuse(&e))
+}
+
+/// Reads the name of a style.
+///
+/// # Errors
+/// A [`Failure`] that names the file.
+fn read_style_name(path: &str, bytes: &[u8]) -> Result<String, Failure> {
+    let refuse = |message: String| Failure::new(FailureKind::Layout, path, message);
+    let (text, _) = text_of(bytes);
+    let text = std::str::from_utf8(&text).map_err(|_| {
+        refuse(format!("{path} is not UTF-8 text; write the name of one style in a line"))
+    })?;
+    let name = text.trim();
+    if !is_style_name(name) {
+        return Err(refuse(format!(
+            "{path} has {}; write the name of one style in a line: at most {MAX_STYLE_NAME} letters, digits, spaces, \
+             -, _ and ', and no number",
+            preview(name.as_bytes())
+        )));
+    }
+    Ok(name.to_owned())
 }
 
 fn tempo_of(list: &Beats) -> Tempo {

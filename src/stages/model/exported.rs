@@ -13,6 +13,7 @@ use crate::generation::{
     FamilyCard as _, FileEntry, LearnedFrom, MusicDigests, Sampling, SharedFields, sample,
 };
 use crate::motion::MOTION_DIM;
+use crate::motion::style_name::NamedStyles;
 use crate::stages::model_files::{EngineParams, ModelFolder, OpenModel};
 use crate::stages::{Progress, Summary};
 use crate::units::frames_to_s;
@@ -59,6 +60,18 @@ pub fn least_seconds(mut work: impl FnMut() -> anyhow::Result<()>) -> anyhow::Re
         }
     }
     Ok(best)
+}
+
+/// Returns what a model says of styles.
+pub fn style(style_dim: usize, named: &NamedStyles) -> String {
+    if style_dim == 0 {
+        return "takes none".to_owned();
+    }
+    let names: Vec<&str> = named.keys().map(String::as_str).collect();
+    match names.as_slice() {
+        [] => "eight values; none has a name".to_owned(),
+        names => format!("eight values, or {}", names.join(", ")),
+    }
 }
 
 /// Opens a model, looks through its files, and samples one motion of noise and silence.
@@ -120,6 +133,7 @@ pub fn look(
                 thousands(card.n_parameters.decoder)
             ),
         ),
+        ("style", style(card.unet.style_dim, &card.styles)),
     ];
     Ok(Box::new(ModelSummary {
         name: card.name.clone(),

@@ -5,7 +5,9 @@ use std::time::Instant;
 
 use ndarray::{Array2, Array3};
 
-use super::exported::{ModelSummary, TimedWork, learned, least_seconds, shared_rows, validation};
+use super::exported::{
+    ModelSummary, TimedWork, learned, least_seconds, shared_rows, style, validation,
+};
 use super::thousands;
 use crate::autodiff::Stream;
 use crate::diffusion::{SamplerConfig, Schedule, TokenSampling};
@@ -105,6 +107,7 @@ pub fn look(
             ),
         ),
         ("tokens", format!("{}, one for {} frames", sizes.codes, sizes.frames_per_token)),
+        ("style", style(card.planner.style_dim, &card.styles)),
     ];
     Ok(Box::new(ModelSummary {
         name: card.name.clone(),

@@ -32,6 +32,7 @@ fn card() -> TokensCard {
         normalizer: Normalizer::identity(),
         feature_scale: FeatureScale::identity(FEATURE_DIM),
         motion_range: None,
+        styles: crate::motion::style_name::NamedStyles::default(),
         sampling: None,
         licence: "none".to_owned(),
         files: Vec::new(),

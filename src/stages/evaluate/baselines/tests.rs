@@ -13,6 +13,7 @@ use crate::generation::{
 };
 use crate::model::{DecoderConfig, MotionDecoder, ParameterList, UNet1D, UNetConfig};
 use crate::motion::Normalizer;
+use crate::motion::style_name::NamedStyles;
 use crate::onnx::{EMBEDDED_BYTES, Form, ModelFile, Storage, decoder, unet};
 use crate::stages::Silent;
 use crate::stages::generate::weights_digest;
@@ -93,6 +94,7 @@ fn model_in(folder: &Path, config: UNetConfig) -> OpenModel {
         normalizer,
         feature_scale: scale,
         motion_range: None,
+        styles: NamedStyles::default(),
         sampling: None,
         licence: String::new(),
         files,

@@ -155,6 +155,21 @@ fn one_role_twice_is_a_conflict_and_beats_alone_are_too() {
 }
 
 #[test]
+fn the_name_of_a_style_belongs_to_its_motion_and_is_none() {
+    let plan = plan(
+        listing(&[
+            "motion/a/style.txt",
+            "motion/a/trajectory.npy",
+            "motion/b/style.txt",
+            "motion/style.txt",
+        ]),
+        Layout::Auto,
+    );
+    assert_eq!(lines(&plan), ["a: motion style", "b: layout motion/b"]);
+    assert_eq!(plan.ignored, ["motion/style.txt"]);
+}
+
+#[test]
 fn songs_of_a_library_keep_their_extension_and_share_beats() {
     let plan = plan(
         listing(&[
