@@ -7,10 +7,11 @@ use crate::model::{Parameter, ParameterList, Planner, Tokenizer};
 use crate::onnx::{Model, OnnxError, values_of};
 
 /// The files that hold the weights of a tokenizer, with the beginning of the names that lie in each.
-const OF_TOKENIZER: [(&str, ModelFileName); 4] = [
+const OF_TOKENIZER: [(&str, ModelFileName); 5] = [
     ("encoder.", ModelFileName::Encoder),
     ("codebook", ModelFileName::Encoder),
     ("decoder.", ModelFileName::Signal),
+    ("draft.", ModelFileName::Denoiser),
     ("denoiser.", ModelFileName::Denoiser),
 ];
 
