@@ -4,9 +4,9 @@ use std::sync::Arc;
 
 use crate::training::TrainingError;
 use crate::training::batch::Batch;
-use crate::training::checkpoint::Progress;
-use crate::training::learner::{Learner, Losses, Ownership, StepResult, Validation};
-use crate::weights::{Archive, Section};
+use crate::training::learner::{
+    CheckpointState, Learner, Losses, Ownership, StepResult, Validation,
+};
 
 use super::Ranks;
 
@@ -70,24 +70,11 @@ impl<L: Learner> Learner for ByOne<L> {
         Arc::new(move |n_dancers| vec![is_first; n_dancers.len()])
     }
 
-    fn sections(&self) -> Vec<Section<'_, f32>> {
-        self.learner.as_ref().map_or_else(Vec::new, L::sections)
+    fn state(&self) -> Vec<&dyn CheckpointState> {
+        self.learner.as_ref().map_or_else(Vec::new, L::state)
     }
 
-    fn best(&self) -> Vec<Section<'_, f32>> {
-        self.learner.as_ref().map_or_else(Vec::new, L::best)
-    }
-
-    fn n_updates(&self) -> (u64, u64) {
-        self.learner.as_ref().map_or((0, 0), L::n_updates)
-    }
-
-    fn restore(
-        &mut self,
-        archive: &Archive,
-        place: &str,
-        at: &Progress,
-    ) -> Result<(), TrainingError> {
-        self.learner.as_mut().map_or(Ok(()), |learner| learner.restore(archive, place, at))
+    fn state_mut(&mut self) -> Vec<&mut dyn CheckpointState> {
+        self.learner.as_mut().map_or_else(Vec::new, L::state_mut)
     }
 }
