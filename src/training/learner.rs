@@ -110,7 +110,7 @@ pub trait Learner: Send {
     /// Measures what was learned.
     ///
     /// # Errors
-    /// As [`Learner::step`], and what the store says.
+    /// As [`Learner::step`], and errors of the store.
     fn validate(&mut self) -> Result<Validation, TrainingError>;
 
     /// Returns which windows of a batch this process learns from.

@@ -18,7 +18,7 @@ struct Inputs<E: Element> {
     t: Tensor<E>,
 }
 
-struct Found<E: Element> {
+struct TokensOutputs<E: Element> {
     quantized: Quantized<Tensor<E>>,
     signal: Tensor<E>,
     estimate: Tensor<E>,
@@ -28,12 +28,12 @@ fn forward<E: Element, I: Interpreter<Element = E>>(
     g: &mut I,
     tokenizer: &Tokenizer,
     given: &Inputs<E>,
-) -> Result<Found<E>> {
+) -> Result<TokensOutputs<E>> {
     let quantized = tokenizer.quantize(g, &given.motion)?;
     let q = g.straight_through(&quantized.latents, &quantized.codes)?;
     let signal = tokenizer.signal(g, &q, &given.motion)?;
     let estimate = tokenizer.denoise(g, &given.x, &given.t, &signal)?;
-    Ok(Found { quantized, signal, estimate })
+    Ok(TokensOutputs { quantized, signal, estimate })
 }
 
 fn inputs<E: Element, I: Interpreter<Element = E>>(

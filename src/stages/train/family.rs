@@ -31,7 +31,7 @@ pub trait FamilyTraining: Sized {
     /// Makes the settings of flags, and opens the store.
     ///
     /// # Errors
-    /// Settings of which no network can be made, and what the store says.
+    /// Settings of which no network can be made, and errors of the store.
     fn prepare(params: &Params) -> anyhow::Result<(Self, Location)>;
 
     fn config(&self) -> &Self::Config;
@@ -48,7 +48,7 @@ pub trait FamilyTraining: Sized {
     /// Refuses a run of the store that may not be trained on.
     ///
     /// # Errors
-    /// One sentence, and what the store says.
+    /// One sentence, and errors of the store.
     fn check_run(&self, _run: &Run) -> anyhow::Result<()> {
         Ok(())
     }
@@ -88,7 +88,7 @@ pub trait FamilyTraining: Sized {
     /// Does what comes after the network; nothing where it is all that a run trains.
     ///
     /// # Errors
-    /// What training says.
+    /// Errors of training.
     fn finish(
         &self,
         _run: &Run,
@@ -110,7 +110,7 @@ pub struct FamilyInputs {
 /// Runs the stage.
 ///
 /// # Errors
-/// Settings of which no network can be made, and what the store says.
+/// Settings of which no network can be made, and errors of the store.
 pub fn run<F: FamilyTraining>(
     params: &Params,
     ranks: &Arc<Ranks>,

@@ -85,7 +85,7 @@ pub struct Params {
 
 impl Stage for Train {
     const NAME: &'static str = "train";
-    const ABOUT: &'static str = "train the UNet and the decoder on the phrases of a store";
+    const ABOUT: &'static str = "train the networks of a model on the phrases of a store";
     const CONTRACT: Contract = Contract {
         reads: "phrases, motion, features",
         writes: "runs/<run>/ (checkpoints), training_log, failures",

@@ -1,4 +1,4 @@
-//! A network that is too small to be shared out: the first process trains it, the others hear how it goes.
+//! A network that is too small to be shared out: the first process trains it, the others receive its losses.
 
 use std::sync::Arc;
 
@@ -17,10 +17,10 @@ pub struct ByOne<L> {
 }
 
 impl<L> ByOne<L> {
-    /// Has the first process learn, the only one that has what a learner is made of.
+    /// Makes the learner on the first process, where `of` is given; on others there is none.
     ///
     /// # Errors
-    /// What making the learner says.
+    /// Errors of `learner`.
     pub fn new<T, E>(
         ranks: &Arc<Ranks>,
         of: Option<T>,
