@@ -22,8 +22,8 @@ use motiongen::motion::{MOTION_DIM, Normalizer};
 use motiongen::training::{
     Augmentation, Batch, Chances, Dataset, EmaConfig, FinetuneConfig, FinetuneLearner,
     GroupLearner, GroupLosses, GroupNetworkConfig, GroupTraining, Learner, LearningRate,
-    LearningRateSchedule, NetworkConfig, Objective, OptimizerConfig, TemporalConfig, Windows,
-    WithholdProbabilities,
+    LearningRateSchedule, NetworkConfig, Objective, OptimizerConfig, PartedLearner, TemporalConfig,
+    Windows, WithholdProbabilities,
 };
 use ndarray::Array2;
 use serde_json::{Value, json};

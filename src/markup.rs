@@ -1,4 +1,4 @@
-//! Text from outside as it stands in HTML.
+//! Text from outside as it stands in HTML and SVG.
 //!
 //! `askama.toml` names the escaper; every template uses it for every value that it does not mark as `safe`.
 
@@ -6,16 +6,15 @@ use std::fmt::{self, Write};
 
 use askama::filters::Escaper;
 
-/// Writes text for a place between tags or in a quoted attribute: it can become neither markup nor the end of an
-/// attribute.
+/// Text for a place between tags or in a quoted attribute: it can become neither markup nor the end of an attribute.
 ///
-/// Line breaks and tabs become spaces, other control characters replacement characters.
+/// Line breaks and tabs become spaces; other control characters, and what XML 1.0 cannot hold, replacement characters.
 #[derive(Clone, Copy, Debug)]
-pub struct EscapedText;
+pub struct Escaped<'a>(pub &'a str);
 
-impl Escaper for EscapedText {
-    fn write_escaped_str<W: Write>(&self, mut out: W, text: &str) -> fmt::Result {
-        for c in text.chars() {
+impl fmt::Display for Escaped<'_> {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for c in self.0.chars() {
             match c {
                 '<' => out.write_str("&lt;")?,
                 '>' => out.write_str("&gt;")?,
@@ -23,11 +22,22 @@ impl Escaper for EscapedText {
                 '"' => out.write_str("&quot;")?,
                 '\'' => out.write_str("&#39;")?,
                 '\n' | '\r' | '\t' => out.write_char(' ')?,
+                '\u{fffe}' | '\u{ffff}' => out.write_char(char::REPLACEMENT_CHARACTER)?,
                 c if c.is_control() => out.write_char(char::REPLACEMENT_CHARACTER)?,
                 c => out.write_char(c)?,
             }
         }
         Ok(())
+    }
+}
+
+/// Has templates write values as [`Escaped`].
+#[derive(Clone, Copy, Debug)]
+pub struct EscapedText;
+
+impl Escaper for EscapedText {
+    fn write_escaped_str<W: Write>(&self, mut out: W, text: &str) -> fmt::Result {
+        write!(out, "{}", Escaped(text))
     }
 }
 
@@ -37,7 +47,7 @@ mod tests {
 
     #[derive(Template)]
     #[template(source = "{{ text }}", ext = "html")]
-    struct Shown<'a> {
+    struct EscapedPage<'a> {
         text: &'a str,
     }
 
@@ -48,9 +58,10 @@ mod tests {
             ("a\nb\tc", "a b c"),
             ("\u{1b}[31m", "\u{fffd}[31m"),
             ("m/s² – ß", "m/s² – ß"),
+            ("a\u{0}b\u{fffe}", "a\u{fffd}b\u{fffd}"),
         ];
         for (text, wanted) in cases {
-            assert_eq!(Shown { text }.to_string(), wanted);
+            assert_eq!(EscapedPage { text }.to_string(), wanted);
         }
     }
 

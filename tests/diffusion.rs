@@ -3,6 +3,6 @@
 mod gaussian;
 mod golden;
 mod guidance;
-mod known;
+mod inpainting;
 mod propagation;
 mod samplers;

@@ -1,6 +1,6 @@
 //! `motiongen evaluate`, as a user runs it, on motions whose numbers are known by construction.
 
-mod asked;
+mod requests;
 mod verdicts;
 
 use std::collections::BTreeMap;

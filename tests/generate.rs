@@ -1,7 +1,7 @@
 //! `motiongen generate`, as a user runs it: tables and files, killed, sharded, and with bad input.
 
-mod asked;
 mod priming;
+mod requests;
 mod songs;
 
 use std::collections::BTreeMap;

@@ -248,7 +248,7 @@ fn broken_phrases_are_one_failure_each_and_sound_ones_beside_them_are_kept() {
     unlock(&source);
 }
 
-/// Lets whoever runs the tests remove the source.
+/// Lets the user that runs the tests remove the source.
 fn unlock(source: &Path) {
     use std::os::unix::fs::PermissionsExt as _;
     let folder = source.join("motion/folder-locked");

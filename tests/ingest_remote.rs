@@ -19,7 +19,7 @@ use crate::support::files::{beats, coherent, features_npz, trajectory, wav};
 use crate::support::{Output, finish, motiongen};
 
 /// A bucket with phrases in it and room for stores.
-struct Job {
+struct RemoteIngest {
     stores: Loopback,
     bucket: String,
 }
@@ -34,7 +34,7 @@ struct Expected {
     tempo_bpm: Option<f64>,
 }
 
-impl Job {
+impl RemoteIngest {
     fn start(stores: Option<Loopback>, label: &str) -> Option<Self> {
         let stores = stores?;
         let bucket = stores.create_bucket(label);
@@ -173,7 +173,7 @@ fn failure_kinds(store: &Location) -> BTreeMap<String, String> {
 
 #[test]
 fn gs_phrases_become_rows_and_broken_ones_failures() {
-    let Some(job) = Job::start(servers::gs(), "rows") else { return };
+    let Some(job) = RemoteIngest::start(servers::gs(), "rows") else { return };
     let source = job.write_source(61, 11);
     let output = finish(&mut job.ingest("tables/ä", &[]));
     assert_eq!(output.code, 1, "{output:?}");
@@ -224,7 +224,7 @@ fn gs_phrases_become_rows_and_broken_ones_failures() {
 #[test]
 fn a_second_run_over_a_sound_source_fetches_and_writes_nothing() {
     for stores in [servers::s3(), servers::gs()] {
-        let Some(job) = Job::start(stores, "again") else { return };
+        let Some(job) = RemoteIngest::start(stores, "again") else { return };
         job.write_source(13, 0);
         let output = finish(&mut job.ingest("tables", &[]));
         assert_eq!(output.code, 0, "{output:?}");
@@ -243,7 +243,7 @@ fn a_second_run_over_a_sound_source_fetches_and_writes_nothing() {
 
 /// Kills a run over `n` phrases after some commits, twice, runs it to its end, and compares.
 fn kill_and_resume(stores: Option<Loopback>, n: usize) {
-    let Some(job) = Job::start(stores, "kill") else { return };
+    let Some(job) = RemoteIngest::start(stores, "kill") else { return };
     let broken = job.write_source(n, 9).into_values().filter(Result::is_err).count();
     let flags = ["--batch-phrases", "4", "--workers", "1"];
     let output = finish(&mut job.ingest("whole", &flags));
@@ -285,7 +285,7 @@ fn an_s3_run_killed_twice_and_resumed_ends_like_one_that_was_not() {
 #[test]
 fn throttling_failures_delays_and_broken_lines_change_nothing_but_the_time() {
     for stores in [servers::gs(), servers::s3()] {
-        let Some(job) = Job::start(stores, "faults") else { return };
+        let Some(job) = RemoteIngest::start(stores, "faults") else { return };
         job.write_source(17, 9);
         assert_eq!(finish(&mut job.ingest("whole", &["--batch-phrases", "6"])).code, 1);
         job.stores.inject(Faults {
@@ -305,7 +305,7 @@ fn throttling_failures_delays_and_broken_lines_change_nothing_but_the_time() {
 }
 
 /// Returns the hint that a refused request comes with.
-fn hint(job: &Job) -> &'static str {
+fn hint(job: &RemoteIngest) -> &'static str {
     match job.stores.scheme {
         servers::Scheme::S3 => {
             "; access was refused: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY to a key that \
@@ -321,7 +321,7 @@ fn hint(job: &Job) -> &'static str {
 #[test]
 fn a_store_that_refuses_ends_the_run_with_its_place_and_what_to_set() {
     for stores in [servers::gs(), servers::s3()] {
-        let Some(job) = Job::start(stores, "deny") else { return };
+        let Some(job) = RemoteIngest::start(stores, "deny") else { return };
         job.write_source(3, 0);
         let url = job.url("tables");
         job.stores.inject(Faults { deny: true, ..Faults::default() });
@@ -351,7 +351,7 @@ fn a_store_that_refuses_ends_the_run_with_its_place_and_what_to_set() {
 
 #[test]
 fn throttling_without_end_ends_the_run_after_the_tries_that_were_asked_for() {
-    let Some(job) = Job::start(servers::gs(), "throttle") else { return };
+    let Some(job) = RemoteIngest::start(servers::gs(), "throttle") else { return };
     job.write_source(3, 0);
     let faults = Faults { too_many_requests_first: usize::MAX, ..Faults::default() };
     job.stores.inject(faults.only(|method, _| method == "PUT"));
@@ -367,7 +367,7 @@ fn throttling_without_end_ends_the_run_after_the_tries_that_were_asked_for() {
 
 #[test]
 fn a_source_file_that_cannot_be_fetched_fails_its_phrase_alone() {
-    let Some(job) = Job::start(servers::gs(), "lone") else { return };
+    let Some(job) = RemoteIngest::start(servers::gs(), "lone") else { return };
     job.write_source(7, 0);
     let one = |method: &str, path: &str| method == "GET" && path.ends_with("ü-004/trajectory.npy");
     job.stores.inject(Faults { deny: true, ..Faults::default() }.only(one));
@@ -385,7 +385,7 @@ fn a_source_file_that_cannot_be_fetched_fails_its_phrase_alone() {
 
 #[test]
 fn a_cache_saves_every_download_of_a_second_ingest_but_those_of_changed_phrases() {
-    let Some(job) = Job::start(servers::gs(), "cache") else { return };
+    let Some(job) = RemoteIngest::start(servers::gs(), "cache") else { return };
     job.write_source(19, 0);
     let folder = tempfile::tempdir().expect("a temporary folder");
     let cache = folder.path().join("cache").display().to_string();
@@ -412,7 +412,7 @@ fn query_sums_the_splits_of_a_remote_store_exactly() {
     const SQL: &str = "select split, count(*) n, sum(duration_s) s from phrases group by split \
                        order by split";
     for (stores, n) in [(servers::gs(), 61), (servers::s3(), 47)] {
-        let Some(job) = Job::start(stores, "query") else { return };
+        let Some(job) = RemoteIngest::start(stores, "query") else { return };
         let source = job.write_source(n, 11);
         let output = finish(&mut job.ingest("tables", &["--batch-phrases", "10"]));
         assert_eq!(output.code, 1, "{output:?}");
@@ -446,7 +446,7 @@ fn query_sums_the_splits_of_a_remote_store_exactly() {
 
 #[test]
 fn a_query_for_one_phrase_skips_the_parts_without_it() {
-    let Some(job) = Job::start(servers::gs(), "skip") else { return };
+    let Some(job) = RemoteIngest::start(servers::gs(), "skip") else { return };
     job.write_source(41, 0);
     assert_eq!(finish(&mut job.ingest("tables", &["--batch-phrases", "5"])).code, 0);
     let before = job.stores.requests().len();

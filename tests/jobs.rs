@@ -31,7 +31,7 @@ fn succeed(command: &mut Command) -> Output {
     output
 }
 
-/// Waits until something is so.
+/// Waits until a condition holds.
 #[track_caller]
 fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
     let started = Instant::now();

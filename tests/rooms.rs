@@ -19,7 +19,7 @@ const MAY_USE: [(&str, &[&str]); 22] = [
     ("motion", &["chance", "excerpt", "units"]),
     ("music", &["audio", "chance"]),
     ("onnx", &["audio", "model", "motion"]),
-    ("plot", &["motion", "units"]),
+    ("plot", &["markup", "motion", "units"]),
     ("report", &["markup"]),
     ("store", &["audio", "motion", "units"]),
     (

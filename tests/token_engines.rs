@@ -1,4 +1,4 @@
-//! What runs a model of tokens, and its frames as they come.
+//! The engines of a model of tokens, and its frames as they come.
 
 use std::path::Path;
 use std::process::Command;

@@ -192,7 +192,7 @@ fn motion_of_soloists_and_groups_becomes_tokens_and_motion_again() {
     let output = tokenize(&store, &["--reconstruct", "--workers=3", "--force"]);
     assert_eq!(output.code, 0, "{output:?}");
     assert_eq!(errors(&store), by_one);
-    // Who asks for tokens alone leaves those with errors as they are.
+    // A run for tokens alone leaves those with errors as they are.
     let again = tokenize(&store, &[]);
     assert!(again.stdout.contains("nothing to do: 17 phrases are up to date"), "{again:?}");
     let other = tokenize(&store, &["--reconstruct", "--seed=1"]);

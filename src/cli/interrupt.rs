@@ -11,9 +11,9 @@ use super::exit;
 /// Added to the number of a signal, the exit code of a program that it ended, as shells have it.
 const ENDED_BY_SIGNAL: i32 = 128;
 
-/// Whether an end was asked for.
+/// Whether the user asked to stop.
 static ASKED: AtomicBool = AtomicBool::new(false);
-/// Whether the stage looks at [`ASKED`], and finishes what is under way.
+/// Whether the stage reads [`ASKED`], and finishes the work that has begun.
 static HEEDED: AtomicBool = AtomicBool::new(false);
 
 /// Listens to signals from now on. Before the stage looks for the first time, a signal ends the program at once

@@ -216,12 +216,12 @@ impl ReferenceStatistics {
     pub fn from_json(text: &str) -> Result<Self, ReferenceError> {
         /// The version, which tells whether the rest can be read.
         #[derive(Deserialize)]
-        struct Head {
+        struct VersionField {
             version: u32,
         }
         let unreadable =
             |e: serde_json::Error| ReferenceError::Unreadable { message: e.to_string() };
-        let Head { version } = serde_json::from_str(text).map_err(unreadable)?;
+        let VersionField { version } = serde_json::from_str(text).map_err(unreadable)?;
         if version != REFERENCE_VERSION {
             return Err(ReferenceError::Version { found: version, expected: REFERENCE_VERSION });
         }

@@ -262,6 +262,13 @@ fn find<'a>(numbers: &'a [Number], metric: &str, variant: &str) -> Option<&'a Nu
     numbers.iter().find(|number| number.metric == metric && number.variant == variant)
 }
 
+/// Returns a number of each song less another of the same song; none of songs that lack either.
+fn differences_by_song(own: Option<&Number>, other: Option<&Number>) -> Vec<f64> {
+    let (Some(own), Some(other)) = (own, other) else { return Vec::new() };
+    let difference = |(song, x): (&usize, &f64)| Some(x - other.by_song.get(song)?);
+    own.by_song.iter().filter_map(difference).collect()
+}
+
 /// Returns its estimate, absent where it was not measured.
 fn estimate(numbers: &[Number], metric: &str, variant: &str) -> Estimate {
     find(numbers, metric, variant).map(|number| number.estimate).unwrap_or_default()

@@ -15,6 +15,7 @@ use crate::motion::style_name::NamedStyles;
 use crate::motion::{MOTION_DIM, Normalizer};
 use crate::onnx::Storage;
 use shared::MAX_NAME_BYTES;
+pub(in crate::generation) use shared::shared_fields;
 pub use shared::{
     CardError, FamilyCard, FileEntry, MAX_CARD_BYTES, MODEL_FORMAT, SamplingDefaults, SharedFields,
     check_n_parameters, check_sizes, family_of, is_name, most_bytes, own_channels, own_features,
@@ -193,24 +194,7 @@ impl FamilyCard for ModelCard {
     const USUAL_GUIDANCE: f64 = 4.0;
 
     fn shared(&self) -> SharedFields<'_> {
-        SharedFields {
-            name: &self.name,
-            program: &self.program,
-            run: &self.provenance.run,
-            data: &self.provenance.data,
-            precision: self.precision,
-            licence: &self.licence,
-            diffusion: &self.diffusion,
-            window_frames: self.window_frames,
-            fps: self.fps,
-            channels: &self.channels,
-            features: &self.features,
-            normalizer: &self.normalizer,
-            feature_scale: &self.feature_scale,
-            motion_range: self.motion_range,
-            sampling: self.sampling.as_ref(),
-            files: &self.files,
-        }
+        shared_fields!(self)
     }
 
     fn check_networks(&self) -> Result<(), String> {

@@ -5,11 +5,11 @@ use std::num::NonZeroUsize;
 use ndarray::{Array3, ArrayView3};
 
 use crate::audio::FeatureScale;
-use crate::autodiff::{Arena, Eager, Parameters, Tensor, Threads};
+use crate::autodiff::{Eager, Parameters};
 use crate::model::{MotionDecoder, UNet1D, UNetConfig, UNetInputs, condition_scale};
 
 use super::engine::{Engine, EngineError, EngineInputs};
-use super::pool::Pool;
+use super::interpreter::{EAGER, EagerWorkers, to_array};
 
 /// Runs a model by the interpreter that trains it.
 pub struct EagerEngine {
@@ -20,16 +20,11 @@ pub struct EagerEngine {
     decoder_parameters: Parameters<f32>,
     /// Of the condition.
     scale: FeatureScale,
-    workers: Pool<EagerWorker>,
-}
-
-struct EagerWorker {
-    threads: Threads,
-    arena: Arena<f32>,
+    workers: EagerWorkers,
 }
 
 impl EagerEngine {
-    /// Makes an engine of `n_workers` that have `n_threads` each; `scale` is that of the features.
+    /// Makes an engine of so many workers of so many threads each; `scale` is that of the features.
     ///
     /// # Errors
     /// When the system gives no threads.
@@ -37,11 +32,8 @@ impl EagerEngine {
         (config, unet_parameters): (&UNetConfig, Parameters<f32>),
         (decoder, decoder_parameters): (MotionDecoder, Parameters<f32>),
         scale: &FeatureScale,
-        (n_workers, n_threads): (NonZeroUsize, NonZeroUsize),
+        workers: (NonZeroUsize, NonZeroUsize),
     ) -> std::io::Result<Self> {
-        let worker =
-            |_| Ok(EagerWorker { threads: Threads::start(n_threads)?, arena: Arena::default() });
-        let workers = (0..n_workers.get()).map(worker).collect::<std::io::Result<Vec<_>>>()?;
         Ok(Self {
             unet: UNet1D::new(config).0,
             unet_parameters,
@@ -49,18 +41,18 @@ impl EagerEngine {
             decoder,
             decoder_parameters,
             scale: condition_scale(config, scale),
-            workers: Pool::new(workers),
+            workers: EagerWorkers::start(workers)?,
         })
     }
 }
 
 impl Engine for EagerEngine {
     fn name(&self) -> &'static str {
-        "eager"
+        EAGER
     }
 
     fn n_workers(&self) -> usize {
-        self.workers.len()
+        self.workers.n_workers()
     }
 
     fn predict(&self, inputs: &EngineInputs) -> Result<Array3<f32>, EngineError> {
@@ -78,41 +70,31 @@ impl Engine for EagerEngine {
             Some(style) => style.iter().copied().collect(),
             None => vec![0.0; batch * self.style_dim],
         });
-        self.workers.with(|EagerWorker { threads, arena }| {
-            threads.run(|| {
-                let mut g = Eager::new(&self.unet_parameters, arena);
-                let x = g.input(&[batch, frames, channels], x.as_slice().expect("in order"));
-                let t = g.input(&[batch], &t);
-                let audio =
-                    g.input(&[batch, frames, n_features], audio.as_slice().expect("in order"));
-                let drop = (!drop.is_empty()).then(|| g.input(&[batch], &drop));
-                let style = style.map(|style| g.input(&[batch, self.style_dim], &style));
-                let inputs = UNetInputs {
-                    x: &x,
-                    t: &t,
-                    audio: &audio,
-                    drop_audio: drop.as_ref(),
-                    mask: None,
-                    style: style.as_ref(),
-                };
-                Ok(to_array(&self.unet.forward(&mut g, inputs)?))
-            })
+        self.workers.run(|arena| {
+            let mut g = Eager::new(&self.unet_parameters, arena);
+            let x = g.input(&[batch, frames, channels], x.as_slice().expect("in order"));
+            let t = g.input(&[batch], &t);
+            let audio = g.input(&[batch, frames, n_features], audio.as_slice().expect("in order"));
+            let drop = (!drop.is_empty()).then(|| g.input(&[batch], &drop));
+            let style = style.map(|style| g.input(&[batch, self.style_dim], &style));
+            let inputs = UNetInputs {
+                x: &x,
+                t: &t,
+                audio: &audio,
+                drop_audio: drop.as_ref(),
+                mask: None,
+                style: style.as_ref(),
+            };
+            Ok(to_array(&self.unet.forward(&mut g, inputs)?))
         })
     }
 
     fn decode(&self, latent: ArrayView3<f32>) -> Result<Array3<f32>, EngineError> {
         let latent = latent.as_standard_layout();
-        self.workers.with(|EagerWorker { threads, arena }| {
-            threads.run(|| {
-                let mut g = Eager::new(&self.decoder_parameters, arena);
-                let x = g.input(latent.shape(), latent.as_slice().expect("in order"));
-                Ok(to_array(&self.decoder.forward(&mut g, &x)?))
-            })
+        self.workers.run(|arena| {
+            let mut g = Eager::new(&self.decoder_parameters, arena);
+            let x = g.input(latent.shape(), latent.as_slice().expect("in order"));
+            Ok(to_array(&self.decoder.forward(&mut g, &x)?))
         })
     }
-}
-
-fn to_array(x: &Tensor<f32>) -> Array3<f32> {
-    let [a, b, c] = x.shape() else { unreachable!("networks return three axes") };
-    Array3::from_shape_vec((*a, *b, *c), x.data().to_vec()).expect("as many as its shape says")
 }

@@ -51,13 +51,13 @@ pub trait Engine: Sync {
     /// Predicts, in normalised units. → \[batch, frames, 25\]
     ///
     /// # Errors
-    /// Shapes that do not fit, or what the runtime says.
+    /// Shapes that do not fit, or errors of the runtime.
     fn predict(&self, inputs: &EngineInputs) -> Result<Array3<f32>, EngineError>;
 
     /// Decodes latents to motion, \[batch, frames, 25\] → \[batch, frames, 25\] in metres, seconds, radians.
     ///
     /// # Errors
-    /// Shapes that do not fit, or what the runtime says.
+    /// Shapes that do not fit, or errors of the runtime.
     fn decode(&self, latent: ArrayView3<f32>) -> Result<Array3<f32>, EngineError>;
 }
 

@@ -8,6 +8,7 @@ mod control;
 mod eager;
 mod engine;
 mod group;
+mod interpreter;
 mod learned;
 mod pool;
 mod retrieval;

@@ -42,7 +42,7 @@ impl OnnxEngine {
     /// Loads the files, as many times as there are workers.
     ///
     /// # Errors
-    /// What onnxruntime says of a file, or inputs and outputs that are not those of a model.
+    /// Errors of onnxruntime about a file, or inputs and outputs that are not those of a model.
     pub fn open(
         runtime: &Runtime,
         (unet, is_optimized): (&Path, bool),

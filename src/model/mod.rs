@@ -31,8 +31,8 @@ pub use layers::{AttentionBlock, Conv1d, GroupNorm, LayerNorm, Linear, ResBlock}
 pub use outline::{ActivationCounts, Layer, Outline};
 pub use parameter::{Init, Parameter, ParameterId, ParameterList, Role, Scope};
 pub use tokens::{
-    AskedPose, CONSTRAINT_DIM, ConditionInputs, KeysAndValues, PlanConditions, Planner,
-    PlannerConfig, PlannerInputs, PlannerKind, PlannerStep, PlannerStepInputs, Quantized,
+    CONSTRAINT_DIM, ConditionInputs, KeysAndValues, PlanConditions, Planner, PlannerConfig,
+    PlannerInputs, PlannerKind, PlannerStep, PlannerStepInputs, PoseConstraint, Quantized,
     Tokenizer, TokensConfig,
 };
 pub use unet::{ConfigError, Preset, UNet1D, UNetConfig, UNetInputs};

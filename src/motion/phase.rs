@@ -225,8 +225,8 @@ fn fraction(x: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::beat_list::MAX_BEATS_LINES;
     use super::*;
+    use crate::motion::beat_list::MAX_BEATS_LINES;
     use proptest::prelude::*;
 
     fn refusal(text: &str) -> String {

@@ -164,7 +164,7 @@ mod tests {
 
     #[test]
     fn keys_go_down_and_up() {
-        let score = super::super::compose(1, 0);
+        let score = crate::music::compose(1, 0);
         let events = events(&score);
         assert!(events.is_sorted_by_key(|event| event.sample));
         let down = events.iter().filter(|event| event.velocity > 0.0).count();

@@ -20,15 +20,15 @@ impl MusicNames {
     pub const STYLE: &'static str = "style";
 }
 
-/// What a network hears.
-pub(super) struct Music {
+/// The conditions of a network: music and style.
+pub(super) struct ConditionValues {
     /// Features in units of their spread, then the clock.
     pub audio: Value,
     pub drop_audio: Value,
     pub style: Option<Value>,
 }
 
-impl Music {
+impl ConditionValues {
     /// Adds the inputs; features come as the `features` table has them and are scaled within.
     ///
     /// `who` goes without music: samples, groups or windows.

@@ -9,7 +9,7 @@ use crate::model::{
 use crate::motion::MOTION_DIM;
 
 use super::builder::{Axes, Builder, Form};
-use super::music::{Music, MusicNames};
+use super::music::{ConditionValues, MusicNames};
 use super::proto::Graph;
 use super::storage::Storage;
 
@@ -59,8 +59,8 @@ pub fn unet(
         "noisy motion, normalised, 30 frames a second",
     );
     let t = g.integer_input(UNetNames::T, Axes::Batch, "step of the diffusion, 0 the least noisy");
-    let Music { audio, drop_audio, style } =
-        Music::inputs(&mut g, c.into(), c.style_dim, "samples", scale)?;
+    let ConditionValues { audio, drop_audio, style } =
+        ConditionValues::inputs(&mut g, c.into(), c.style_dim, "samples", scale)?;
     let inputs = UNetInputs {
         x: &x,
         t: &t,
@@ -153,8 +153,8 @@ pub fn group_denoiser(
         "noisy motion, normalised, group by group and dancer by dancer, 30 frames a second",
     );
     let t = g.integer_input(GroupNames::T, Axes::Batch, "step of the diffusion, 0 the least noisy");
-    let Music { audio, drop_audio, .. } =
-        Music::inputs(&mut g, config.condition(), 0, "groups", scale)?;
+    let ConditionValues { audio, drop_audio, .. } =
+        ConditionValues::inputs(&mut g, config.condition(), 0, "groups", scale)?;
     let number = g.integer_input(GroupNames::NUMBER, Axes::Batch, NUMBER);
     let z = g.input(
         GroupNames::Z,

@@ -4,11 +4,11 @@
 use crate::audio::FeatureScale;
 use crate::model::{
     ConditionInputs, Graph as _, KeysAndValues, ParameterId, PlanConditions, Planner,
-    PlannerConfig, PlannerInputs, PlannerStepInputs, Result,
+    PlannerConfig, PlannerStepInputs, Result,
 };
 
 use super::builder::{Axes, Builder, Form, Value};
-use super::music::{Music, MusicNames};
+use super::music::{ConditionValues, MusicNames};
 use super::proto::Graph;
 use super::storage::Storage;
 use super::tokens::TOKENS_AXIS;
@@ -85,6 +85,27 @@ impl ConstraintValues {
     }
 }
 
+/// Writes what a planner makes of the music, of the style and of constraints, with their inputs.
+fn conditions(
+    g: &mut Builder<'_>,
+    planner: &Planner,
+    config: &PlannerConfig,
+    scale: &FeatureScale,
+) -> Result<PlanConditions<Value>> {
+    let ConditionValues { audio, drop_audio, style } =
+        ConditionValues::inputs(g, config.condition(), config.style_dim, "windows", scale)?;
+    let asked = ConstraintValues::inputs(g, config);
+    let inputs = ConditionInputs {
+        audio: &audio,
+        drop_audio: Some(&drop_audio),
+        style: style.as_ref(),
+        constraints: asked.as_ref().map(|asked| &asked.constraints),
+        drop_constraints: asked.as_ref().map(|asked| &asked.drop_constraints),
+        mask: None,
+    };
+    planner.conditions(g, &inputs)
+}
+
 /// Writes a planner: tokens and the music → what is said of each token.
 ///
 /// Features come as the `features` table has them and are scaled within.
@@ -106,19 +127,8 @@ pub fn planner(
          for a token that is not known, of the autoregressive kind a position sees none from its own on",
     );
     g.name_axis(1, TOKENS_AXIS);
-    let Music { audio, drop_audio, style } =
-        Music::inputs(&mut g, config.condition(), config.style_dim, "windows", scale)?;
-    let asked = ConstraintValues::inputs(&mut g, config);
-    let inputs = PlannerInputs {
-        tokens: &tokens,
-        audio: &audio,
-        drop_audio: Some(&drop_audio),
-        style: style.as_ref(),
-        constraints: asked.as_ref().map(|asked| &asked.constraints),
-        drop_constraints: asked.as_ref().map(|asked| &asked.drop_constraints),
-        mask: None,
-    };
-    let logits = planner.forward(&mut g, &inputs)?;
+    let conditions = conditions(&mut g, &planner, config, scale)?;
+    let logits = planner.forward_under(&mut g, &tokens, &conditions, None)?;
     g.output(PlannerNames::LOGITS, logits, "ln p of each code at each position, up to a constant")?;
     g.name_output_axis(1, TOKENS_AXIS);
     Ok(g.finish("planner"))
@@ -136,18 +146,7 @@ pub fn planner_music(
 ) -> Result<Graph> {
     let (planner, list) = Planner::new(config);
     let mut g = Builder::new(&list, weights, Form::default(), storage);
-    let Music { audio, drop_audio, style } =
-        Music::inputs(&mut g, config.condition(), config.style_dim, "windows", scale)?;
-    let asked = ConstraintValues::inputs(&mut g, config);
-    let inputs = ConditionInputs {
-        audio: &audio,
-        drop_audio: Some(&drop_audio),
-        style: style.as_ref(),
-        constraints: asked.as_ref().map(|asked| &asked.constraints),
-        drop_constraints: asked.as_ref().map(|asked| &asked.drop_constraints),
-        mask: None,
-    };
-    let PlanConditions { local, global } = planner.conditions(&mut g, &inputs)?;
+    let PlanConditions { local, global } = conditions(&mut g, &planner, config, scale)?;
     let meaning = "the music, and what is asked, at each token, for planner_step.onnx";
     g.output(PlannerMusicNames::LOCAL, local, meaning)?;
     g.name_output_axis(1, TOKENS_AXIS);

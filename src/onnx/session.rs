@@ -54,7 +54,7 @@ impl Session {
     /// Loads a file.
     ///
     /// # Errors
-    /// [`OnnxError::Refused`] with what onnxruntime says of it.
+    /// [`OnnxError::Refused`] with the message of onnxruntime.
     pub fn open(
         runtime: &Runtime,
         path: &Path,
@@ -79,7 +79,7 @@ impl Session {
     /// is mapped into memory when it is loaded.
     ///
     /// # Errors
-    /// [`OnnxError::Refused`] with what onnxruntime says of it.
+    /// [`OnnxError::Refused`] with the message of onnxruntime.
     pub fn optimize(runtime: &Runtime, path: &Path, to: &Path) -> Result<(), OnnxError> {
         let options = SessionOptions {
             n_threads: 1,
@@ -148,7 +148,7 @@ impl Session {
     /// Runs the model: returns the sizes and the numbers of an output.
     ///
     /// # Errors
-    /// [`OnnxError::Run`] with what onnxruntime says.
+    /// [`OnnxError::Run`] with the message of onnxruntime.
     pub fn run(
         &mut self,
         inputs: &[NamedTensor],
@@ -161,7 +161,7 @@ impl Session {
     /// Runs the model: returns the sizes and the numbers of several outputs.
     ///
     /// # Errors
-    /// [`OnnxError::Run`] with what onnxruntime says.
+    /// [`OnnxError::Run`] with the message of onnxruntime.
     pub fn run_for<const N: usize>(
         &mut self,
         inputs: &[NamedTensor],

@@ -11,6 +11,7 @@ use base64::engine::general_purpose::STANDARD;
 use super::scene::{Anchor, Point, Rect, Scene, SceneItem};
 use super::style::{PAPER, Rgb};
 use super::{PlotError, png};
+use crate::markup::Escaped;
 
 const FONTS: &str = "'DejaVu Sans', Verdana, sans-serif";
 
@@ -149,25 +150,6 @@ impl fmt::Display for Points<'_> {
     }
 }
 
-/// Text between tags; what XML 1.0 cannot hold becomes a replacement character.
-struct Escaped<'a>(&'a str);
-
-impl fmt::Display for Escaped<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        for c in self.0.chars() {
-            match c {
-                '<' => f.write_str("&lt;")?,
-                '>' => f.write_str("&gt;")?,
-                '&' => f.write_str("&amp;")?,
-                '\u{fffe}' | '\u{ffff}' => f.write_char(char::REPLACEMENT_CHARACTER)?,
-                c if c.is_control() => f.write_char(char::REPLACEMENT_CHARACTER)?,
-                c => f.write_char(c)?,
-            }
-        }
-        Ok(())
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -178,10 +160,5 @@ mod tests {
         for (number, wanted) in cases {
             assert_eq!(Number(number).to_string(), wanted);
         }
-    }
-
-    #[test]
-    fn text_cannot_break_out_of_its_tag() {
-        assert_eq!(Escaped("a<b>&\u{0}c").to_string(), "a&lt;b&gt;&amp;\u{fffd}c");
     }
 }

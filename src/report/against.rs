@@ -91,9 +91,9 @@ impl<'a> PairRow<'a> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::PairedNumber;
-    use super::super::example::{metric, with_interval};
     use super::*;
+    use crate::report::PairedNumber;
+    use crate::report::example::{metric, with_interval};
 
     fn told(here: Vec<Metric>, against: &ComparedRun) -> String {
         let report = Report { metrics: here, ..Report::default() };

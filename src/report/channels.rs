@@ -115,19 +115,19 @@ fn shown<'a>(rows: &[&Row<'a>]) -> Vec<&'a str> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::example::metric;
-    use super::super::rows::{rows, subjects};
     use super::*;
+    use crate::report::example::metric;
+    use crate::report::rows::{rows, subjects};
 
     fn figure(metrics: &[Metric]) -> String {
         let rows = rows(metrics, &subjects(metrics));
         let figure = BarFigure::new(&rows.iter().collect::<Vec<_>>(), "unseen music");
-        Alone { figure }.to_string()
+        FigureMarkup { figure }.to_string()
     }
 
     #[derive(askama::Template)]
     #[template(path = "report/templates/bars.html")]
-    struct Alone {
+    struct FigureMarkup {
         figure: BarFigure,
     }
 

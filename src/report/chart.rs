@@ -204,18 +204,18 @@ fn truth(row: &Row) -> Option<f64> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::example::{metric, with_interval};
     use super::*;
+    use crate::report::example::{metric, with_interval};
 
     fn chart(metrics: &[Metric]) -> String {
         let cells = metrics.iter().map(Some).collect();
         let row = Row { metric: "fid_k", variant: "axes", split: "all", unit: "", cells };
-        DotChart::new(&row).map_or_else(String::new, |chart| Alone { chart }.to_string())
+        DotChart::new(&row).map_or_else(String::new, |chart| ChartMarkup { chart }.to_string())
     }
 
     #[derive(askama::Template)]
     #[template(path = "report/templates/dots.html")]
-    struct Alone {
+    struct ChartMarkup {
         chart: DotChart,
     }
 

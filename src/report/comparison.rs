@@ -162,8 +162,8 @@ pub(super) fn family(against: &ComparedRun) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::example::{metric, with_interval};
     use super::*;
+    use crate::report::example::{metric, with_interval};
 
     fn of(name: &str, value: f64) -> Metric {
         metric("generated", "all", name, "", Some(value))

@@ -213,8 +213,8 @@ pub(super) fn lines(report: &Report) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::example::{metric, with_interval};
     use super::*;
+    use crate::report::example::{metric, with_interval};
 
     fn run(consistency: f64, unison: Option<f64>) -> DialRun {
         let index = metric(OWN, "held_out", "unison_index", "", unison);

@@ -85,13 +85,13 @@ impl WorstMotion {
 mod tests {
     use proptest::prelude::*;
 
-    use super::super::example::{example, metric, with_interval};
-    use super::super::names::SUBJECTS;
-    use super::super::{
+    use super::*;
+    use crate::report::example::{example, metric, with_interval};
+    use crate::report::names::SUBJECTS;
+    use crate::report::{
         BY_CONSTRUCTION, CheckLine, ComparedRun, DialRun, Metric, Outcome, PairedNumber, Verdict,
         VerdictTest,
     };
-    use super::*;
 
     #[test]
     fn every_section_is_there() {

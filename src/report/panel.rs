@@ -83,9 +83,9 @@ impl<'a> TestRow<'a> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::Verdict;
-    use super::super::example::{test, verdict};
     use super::*;
+    use crate::report::Verdict;
+    use crate::report::example::{test, verdict};
 
     fn panel(verdicts: Vec<Verdict>, notes: &[&str]) -> String {
         let notes = notes.iter().map(|note| (*note).to_owned()).collect();

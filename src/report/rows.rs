@@ -147,8 +147,8 @@ pub(super) fn telling_split<'a>(metrics: &'a [Metric], [metric, variant]: [&str;
 
 #[cfg(test)]
 mod tests {
-    use super::super::example::metric;
     use super::*;
+    use crate::report::example::metric;
 
     fn told(rows: &[Row]) -> Vec<String> {
         let cell = |cell: &Option<&Metric>| match cell {

@@ -219,9 +219,9 @@ fn capitalized(text: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::Metric;
-    use super::super::example::{check, metric};
     use super::*;
+    use crate::report::Metric;
+    use crate::report::example::{check, metric};
 
     fn told(report: &Report) -> String {
         SanitySection::new(report).expect("checks").to_string()

@@ -217,8 +217,8 @@ fn tooltip(metric: &Metric) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::example::{metric, with_interval};
     use super::*;
+    use crate::report::example::{metric, with_interval};
 
     fn told(metrics: Vec<Metric>) -> String {
         let report = Report { metrics, ..Report::default() };

@@ -263,9 +263,9 @@ fn fitted(text: &str, n: usize) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::example::{check, example, metric, test, verdict};
-    use super::super::{Metric, VerdictTest};
     use super::*;
+    use crate::report::example::{check, example, metric, test, verdict};
+    use crate::report::{Metric, VerdictTest};
 
     /// What stands over the rest where no verdict was measured.
     const ALL_OPEN: &str = "\

@@ -177,8 +177,8 @@ pub(super) fn measured(test: &VerdictTest) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::example::{test, verdict};
     use super::*;
+    use crate::report::example::{test, verdict};
     use Outcome::{Lost, Open, Won};
 
     #[test]

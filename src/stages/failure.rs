@@ -47,7 +47,7 @@ kinds! {
     CsvFormat = "csv_format",
     DuplicateId = "duplicate_id",
     EmptyFile = "empty_file",
-    /// What runs a model stopped.
+    /// The engine of a model failed.
     Engine = "engine",
     Layout = "layout",
     LengthMismatch = "length_mismatch",
@@ -133,7 +133,7 @@ impl Failure {
 /// Does the work on one item; a defect of ours costs the item, not the job.
 ///
 /// # Errors
-/// What `work` says, or [`FailureKind::Panic`] for the file at `path`.
+/// Errors of `work`, or [`FailureKind::Panic`] for the file at `path`.
 pub fn guarded<T>(path: &str, work: impl FnOnce() -> Result<T, Failure>) -> Result<T, Failure> {
     catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| {
         let said = panic

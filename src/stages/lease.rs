@@ -10,7 +10,7 @@ use crate::store::{Lease, Location, StoreError};
 /// `what` is how the user knows the thing that is written; `note` receives a sentence for whom is waited.
 ///
 /// # Errors
-/// [`StoreError::Held`] when another process writes it; what the storage says.
+/// [`StoreError::Held`] when another process writes it; errors of the storage.
 pub fn take(
     store: &Location,
     name: &str,

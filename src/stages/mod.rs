@@ -25,10 +25,10 @@ mod pretrained;
 #[cfg(feature = "query")]
 pub mod query;
 mod retrieval;
-mod seen;
 pub mod status;
 pub mod tokenize;
 mod tokens_model;
+mod touched;
 pub mod train;
 mod trained;
 pub mod vacuum;

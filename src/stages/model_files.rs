@@ -19,7 +19,7 @@ use crate::model::{MotionDecoder, ParameterList, UNet1D};
 use crate::onnx::{Device, Model, OnnxError, PINNED_VERSION, Runtime, Session, check, values_of};
 use crate::store::{Location, prepared};
 
-/// What runs a model.
+/// The engine of a model.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum EngineChoice {
     /// onnxruntime where its library is found, else eager.
@@ -94,7 +94,7 @@ impl OpenModel {
     /// Makes an engine: onnxruntime's or ours, and what to tell of the choice.
     ///
     /// # Errors
-    /// When the engine that was asked for cannot be had, or a file is not what the card says.
+    /// When the engine that was asked for cannot be had, or a file is not the one that the card lists.
     pub fn engine(
         &self,
         params: &EngineParams,
@@ -128,7 +128,7 @@ impl OpenModel {
     /// Makes the engine of our own interpreter, with the weights that the files have.
     ///
     /// # Errors
-    /// When a file is not what the card says.
+    /// When a file is not the one that the card lists.
     pub fn eager(
         &self,
         n_workers: NonZeroUsize,
@@ -218,7 +218,7 @@ impl OpenModel {
     /// Makes the engine of onnxruntime; on a processor from a copy of the UNet that was optimised once.
     ///
     /// # Errors
-    /// When a file is not what the card says, or onnxruntime refuses it.
+    /// When a file is not the one that the card lists, or onnxruntime refuses it.
     pub fn onnx(
         &self,
         runtime: &Runtime,

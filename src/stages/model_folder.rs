@@ -259,7 +259,7 @@ impl ModelFolder {
     /// Reads a file and holds it against the card.
     ///
     /// # Errors
-    /// When it is missing, or not what the card says.
+    /// When it is missing, or not the one that the card lists.
     pub fn read(&self, name: ModelFileName) -> anyhow::Result<Bytes> {
         let entry = self.entry(name)?;
         let bytes = self.bytes(entry)?;
@@ -272,7 +272,7 @@ impl ModelFolder {
     /// Holds every file against the card.
     ///
     /// # Errors
-    /// The first that is not what the card says.
+    /// The first that is not the one that the card lists.
     pub fn verify(&self) -> anyhow::Result<()> {
         if self.is_verified {
             return Ok(());

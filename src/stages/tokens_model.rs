@@ -20,7 +20,7 @@ pub struct OpenTokens {
     files: ModelFolder,
 }
 
-/// What runs a model of tokens.
+/// The engines of a model of tokens.
 pub struct TokenEngines {
     pub tokens: TokenEngine,
     pub planner: PlannerEngine,
@@ -41,7 +41,7 @@ impl OpenTokens {
     /// Holds every file against the card.
     ///
     /// # Errors
-    /// The first that is not what the card says.
+    /// The first that is not the one that the card lists.
     pub fn verify(&self) -> anyhow::Result<()> {
         self.files.verify()
     }
@@ -52,7 +52,7 @@ impl OpenTokens {
     /// onnxruntime is named, motion does not depend on whether its library is found.
     ///
     /// # Errors
-    /// When the engine that was asked for cannot be had, or a file is not what the card says.
+    /// When the engine that was asked for cannot be had, or a file is not the one that the card lists.
     pub fn engines(
         &self,
         params: &EngineParams,
@@ -112,7 +112,7 @@ impl TokensWeights {
     /// Reads the weights of a model that was exported.
     ///
     /// # Errors
-    /// A file that is not what the card says.
+    /// A file that is not the one that the card lists.
     pub fn read(files: &ModelFolder, card: &TokensCard) -> anyhow::Result<Self> {
         let (tokenizer, planner) = tokens_parameters(card, |name| -> anyhow::Result<_> {
             let place = files.place_of(name);

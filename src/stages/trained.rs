@@ -162,7 +162,7 @@ pub fn has_best(store: &Location, run: &str, stage: &str) -> Result<bool, Traini
 /// configuration.
 ///
 /// # Errors
-/// A checkpoint that is damaged or of another configuration, and what `list` says.
+/// A checkpoint that is damaged or of another configuration, and errors of `list`.
 pub fn read_best<C: Serialize + DeserializeOwned>(
     checkpoints: &Checkpoints,
     step: u64,

@@ -74,7 +74,7 @@ impl Lease {
     /// kill; `waiting` is told once for how long.
     ///
     /// # Errors
-    /// [`StoreError::Held`] when the other process lives; what the storage says.
+    /// [`StoreError::Held`] when the other process lives; errors of the storage.
     pub fn take(
         store: &Location,
         name: &str,

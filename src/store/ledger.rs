@@ -115,8 +115,8 @@ impl Ledger {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Commit, StoreSnapshot, checkpoint};
     use super::*;
+    use crate::store::{Commit, StoreSnapshot, checkpoint};
 
     #[test]
     fn a_ledger_of_some_items_says_of_them_what_the_whole_one_says() {

@@ -218,7 +218,7 @@ impl Location {
     /// Returns the size of an object, which locally must be a regular file.
     ///
     /// # Errors
-    /// [`StoreError::NotFound`], [`StoreError::NotAFile`] or what the storage says.
+    /// [`StoreError::NotFound`], [`StoreError::NotAFile`] or errors of the storage.
     pub(crate) fn size_bytes(&self, path: &str) -> Result<u64, StoreError> {
         let place = || self.url_of(path);
         match &self.kind {
@@ -242,7 +242,7 @@ impl Location {
     /// Reads a whole object; a large remote one in ranges, so that a stalled request costs one range.
     ///
     /// # Errors
-    /// [`StoreError::NotFound`] or what the storage says.
+    /// [`StoreError::NotFound`] or errors of the storage.
     pub fn read(&self, path: &str) -> Result<Bytes, StoreError> {
         let place = || self.url_of(path);
         match &self.kind {
@@ -259,7 +259,7 @@ impl Location {
     /// Reads the first bytes of an object; all of a shorter one.
     ///
     /// # Errors
-    /// [`StoreError::NotFound`] or what the storage says.
+    /// [`StoreError::NotFound`] or errors of the storage.
     pub fn read_start(&self, path: &str, n_bytes: u64) -> Result<Bytes, StoreError> {
         use std::io::Read as _;
         let place = || self.url_of(path);
@@ -340,7 +340,7 @@ impl Location {
     /// Writes `bytes` at `path` unless something is there: whole or absent, and durable on return.
     ///
     /// # Errors
-    /// What the storage says; an existing object is not an error but [`PutOutcome::AlreadyThere`].
+    /// Errors of the storage; an existing object is not an error but [`PutOutcome::AlreadyThere`].
     pub fn put_new(&self, path: &str, bytes: Bytes) -> Result<PutOutcome, StoreError> {
         let place = || self.url_of(path);
         match &self.kind {
@@ -427,7 +427,7 @@ impl Location {
     /// writer of the same path writes the same bytes, because paths are content keys.
     ///
     /// # Errors
-    /// What the storage says; an existing object is not an error but [`PutOutcome::AlreadyThere`].
+    /// Errors of the storage; an existing object is not an error but [`PutOutcome::AlreadyThere`].
     pub fn put_file_new(
         &self,
         path: &str,

@@ -78,7 +78,7 @@ pub struct Item {
 }
 
 impl Item {
-    /// Returns an item that the store has no rows of any more, and whose next sight is news.
+    /// Returns an item without rows in the store, which is new when it comes again.
     pub fn forgotten(id: &str) -> Self {
         // Neither text can be a digest of anything.
         let (fingerprint, input_hash) = (String::new(), String::new());

@@ -15,7 +15,7 @@ const N_KEPT: usize = 12;
 /// same time one wins.
 ///
 /// # Errors
-/// [`StoreError::Cache`] when the disk refuses, and what `make` says.
+/// [`StoreError::Cache`] when the disk refuses, and errors of `make`.
 pub fn prepared<E: From<StoreError>>(
     root: &FsPath,
     key: &str,

@@ -294,7 +294,7 @@ pub(super) fn read_local(path: &FsPath, size_bytes: u64) -> Result<Content, Stor
 /// Opens or reads a file of this machine, whichever its size asks for.
 ///
 /// # Errors
-/// What the disk says.
+/// Errors of the disk.
 pub fn content_of(path: &FsPath, size_bytes: u64) -> std::io::Result<Content> {
     if size_bytes <= IN_MEMORY_BYTES {
         std::fs::read(path).map(|bytes| Content::Bytes(bytes.into()))

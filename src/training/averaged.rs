@@ -9,6 +9,7 @@ use super::checkpoint::Progress;
 use super::config::OptimizerConfig;
 use super::ema::{Ema, EmaConfig};
 use super::error::TrainingError;
+use super::learner::CheckpointState;
 use super::ranks::Ranks;
 
 /// Names of a checkpoint's sections beside that of the weights.
@@ -107,20 +108,14 @@ impl NetworkState {
         let of_chunk = |chunk: usize| all[chunk % size].get(chunk / size).copied();
         Ok((0..n_chunks).map(|chunk| of_chunk(chunk).unwrap_or(f64::NAN)).collect())
     }
+}
 
-    /// Puts the average of the weights together on the first process.
-    ///
-    /// # Errors
-    /// When another process is gone.
-    pub fn collect_average(&mut self) -> Result<(), TrainingError> {
+impl CheckpointState for NetworkState {
+    fn collect_average(&mut self) -> Result<(), TrainingError> {
         Ok(self.ranks.collect(self.ema.average_mut().all_mut())?)
     }
 
-    /// Puts everything together on the first process.
-    ///
-    /// # Errors
-    /// When another process is gone.
-    pub fn collect(&mut self) -> Result<(), TrainingError> {
+    fn collect(&mut self) -> Result<(), TrainingError> {
         self.collect_average()?;
         for moment in self.optimizer.moments_mut() {
             self.ranks.collect(moment.as_slice_mut().expect("one run of memory"))?;
@@ -128,8 +123,7 @@ impl NetworkState {
         Ok(())
     }
 
-    /// Gives the memory back in which others' shares were put together.
-    pub fn release(&mut self) {
+    fn release(&mut self) {
         let shard = self.ranks.shard();
         if shard.is_whole() || !self.ranks.is_first() {
             return;
@@ -141,8 +135,7 @@ impl NetworkState {
         }
     }
 
-    /// Returns all numbers, to go on from.
-    pub fn sections(&self) -> Vec<Section<'_, f32>> {
+    fn sections(&self) -> Vec<Section<'_, f32>> {
         let plan = self.parameters.plan();
         let ([m, v], _) = self.optimizer.state();
         vec![
@@ -153,22 +146,16 @@ impl NetworkState {
         ]
     }
 
-    /// Returns the weights to use, as a file's section.
-    pub fn best(&self) -> Vec<Section<'_, f32>> {
+    fn best(&self) -> Vec<Section<'_, f32>> {
         let plan = self.parameters.plan();
         vec![Section { prefix: self.prefix, plan, values: self.average().all() }]
     }
 
-    /// Returns how many updates optimizer and average have seen.
-    pub fn n_updates(&self) -> (u64, u64) {
+    fn n_updates(&self) -> (u64, u64) {
         (self.optimizer.state().1, self.ema.n_updates())
     }
 
-    /// Takes up the numbers of [`NetworkState::sections`].
-    ///
-    /// # Errors
-    /// When they are not those of this network.
-    pub fn restore(
+    fn restore(
         &mut self,
         archive: &Archive,
         place: &str,
@@ -184,46 +171,6 @@ impl NetworkState {
         Ok(())
     }
 }
-
-/// Writes the methods of [`Learner`](super::learner::Learner) that say what a checkpoint keeps, for a learner that keeps
-/// a [`NetworkState`] and nothing else.
-macro_rules! keeps_network {
-    ($field:ident) => {
-        fn collect_average(&mut self) -> Result<(), crate::training::TrainingError> {
-            self.$field.collect_average()
-        }
-
-        fn collect(&mut self) -> Result<(), crate::training::TrainingError> {
-            self.$field.collect()
-        }
-
-        fn release(&mut self) {
-            self.$field.release();
-        }
-
-        fn sections(&self) -> Vec<crate::weights::Section<'_, f32>> {
-            self.$field.sections()
-        }
-
-        fn best(&self) -> Vec<crate::weights::Section<'_, f32>> {
-            self.$field.best()
-        }
-
-        fn n_updates(&self) -> (u64, u64) {
-            self.$field.n_updates()
-        }
-
-        fn restore(
-            &mut self,
-            archive: &crate::weights::Archive,
-            place: &str,
-            at: &crate::training::checkpoint::Progress,
-        ) -> Result<(), crate::training::TrainingError> {
-            self.$field.restore(archive, place, at)
-        }
-    };
-}
-pub(super) use keeps_network;
 
 /// Reads a section of a checkpoint that lies as `like` does.
 pub(super) fn section(

@@ -111,14 +111,14 @@ impl<C: Serialize + DeserializeOwned> State<C> {
         let refuse =
             |reason: String| Err(TrainingError::Checkpoint { place: place.to_owned(), reason });
         #[derive(Deserialize)]
-        struct Head {
+        struct FormatField {
             format: u32,
         }
         let Some(text) = metadata.get(STATE) else {
             return refuse("holds weights but no state; name a checkpoint that train wrote".into());
         };
-        match serde_json::from_str::<Head>(text) {
-            Ok(Head { format }) if format != FORMAT => {
+        match serde_json::from_str::<FormatField>(text) {
+            Ok(FormatField { format }) if format != FORMAT => {
                 return refuse(format!(
                     "has format {format}, this program reads format {FORMAT}; use the version of \
                      motiongen that wrote it, or train anew with --force"
@@ -173,7 +173,7 @@ impl<'a> Checkpoints<'a> {
     /// Refuses a store in which a file of the run is missing.
     ///
     /// # Errors
-    /// [`StoreError::NotFound`], or what the store says.
+    /// [`StoreError::NotFound`], or errors of the store.
     pub fn check_anchor(&self, path: &str) -> Result<(), StoreError> {
         self.store.size_bytes(path).map(|_| ())
     }
@@ -198,7 +198,7 @@ impl<'a> Checkpoints<'a> {
     /// The same step of the same run has the same numbers, so one that is there already is left.
     ///
     /// # Errors
-    /// What the store says, a full disk among others; older checkpoints are untouched then.
+    /// Errors of the store, a full disk among others; older checkpoints are untouched then.
     pub fn write<C: Serialize>(
         &self,
         kind: CheckpointKind,
@@ -232,7 +232,7 @@ impl<'a> Checkpoints<'a> {
     /// Removes a checkpoint.
     ///
     /// # Errors
-    /// What the store says.
+    /// Errors of the store.
     pub fn remove(&self, kind: CheckpointKind, step: u64) -> Result<(), TrainingError> {
         Ok(self.store.remove(&self.path(kind, step))?)
     }
@@ -240,7 +240,7 @@ impl<'a> Checkpoints<'a> {
     /// Removes all checkpoints of the stage.
     ///
     /// # Errors
-    /// What the store says.
+    /// Errors of the store.
     pub fn clear(&self) -> Result<(), TrainingError> {
         for kind in [CheckpointKind::Step, CheckpointKind::Best] {
             for step in self.steps(kind)? {
@@ -275,7 +275,7 @@ impl<'a> Checkpoints<'a> {
     /// Reads a checkpoint and hands it to `load`.
     ///
     /// # Errors
-    /// When it cannot be read, or what `load` says.
+    /// When it cannot be read, or errors of `load`.
     pub fn read<T>(
         &self,
         kind: CheckpointKind,

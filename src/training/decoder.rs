@@ -10,12 +10,12 @@ use crate::diffusion::{Schedule, ddim_update};
 use crate::model::{DecoderConfig, MotionDecoder, ParameterList};
 use crate::motion::{ChannelLimits, ColumnRole, MOTION_DIM, Normalizer};
 
-use super::averaged::{NetworkState, keeps_network};
+use super::averaged::NetworkState;
 use super::batch::Batch;
 use super::config::DecoderTraining;
 use super::diffusion::tape_seed;
 use super::error::TrainingError;
-use super::learner::{Learner, Losses, StepResult, Validation};
+use super::learner::{CheckpointState, Learner, Losses, StepResult, Validation};
 use super::objective::{Reconstruction, reconstruction};
 use super::sampling::{Condition, Denoiser, motion_view};
 use super::window::Windows;
@@ -269,7 +269,13 @@ impl Learner for DecoderLearner<'_> {
         Ok(Validation { losses, live: Some(live), distance: None })
     }
 
-    keeps_network!(network);
+    fn state(&self) -> Vec<&dyn CheckpointState> {
+        vec![&self.network]
+    }
+
+    fn state_mut(&mut self) -> Vec<&mut dyn CheckpointState> {
+        vec![&mut self.network]
+    }
 }
 
 #[cfg(test)]

@@ -4,21 +4,22 @@ use std::borrow::Cow;
 use std::sync::Arc;
 
 use crate::audio::FEATURE_DIM;
-use crate::autodiff::{Eager, Interpreter, Parameters, Tape, Tensor, Threads};
+use crate::autodiff::{Eager, Interpreter, Parameters, Tape, Tensor};
 use crate::diffusion::Schedule;
 use crate::model::{Graph as _, UNet1D, UNetInputs};
 use crate::motion::style::STYLE_DIM;
 use crate::motion::{MOTION_DIM, Normalizer};
 
-use super::averaged::{NetworkState, keeps_network};
+use super::averaged::NetworkState;
 use super::batch::Batch;
 use super::config::{DiffusionTraining, NetworkConfig};
 use super::error::TrainingError;
 use super::judge::{SampleJudge, sampled_distance};
-use super::learner::{Learner, Losses, Ownership, StepResult, Validation};
+use super::learner::{
+    CheckpointState, Learner, Losses, Ownership, PartedLearner, StepResult, Validation,
+};
 use super::objective::Objective;
 use super::parts::Parts;
-use super::ranks::Ranks;
 use super::sampling::{Denoiser, is_partial, motion_view};
 use super::window::Windows;
 
@@ -79,26 +80,10 @@ impl DiffusionLearner {
         })
     }
 
-    /// Has steps run on threads; the results are the same on any.
-    pub fn on(mut self, threads: &Arc<Threads>) -> Self {
-        self.parts.on(threads);
-        self
-    }
-
     /// Has validations sample motion, by whose distance the best is chosen.
     pub fn judged_by(mut self, judge: impl SampleJudge + 'static) -> Self {
         self.judge = Some(Box::new(judge));
         self
-    }
-
-    /// Trains together with other processes.
-    ///
-    /// # Errors
-    /// When the parts of a batch cannot be shared out evenly.
-    pub fn among(mut self, ranks: &Arc<Ranks>) -> Result<Self, TrainingError> {
-        self.parts.among(ranks)?;
-        self.network.among(ranks);
-        Ok(self)
     }
 
     /// Computes the gradients of a batch, part by part; returns its loss.
@@ -398,13 +383,8 @@ impl Learner for DiffusionLearner {
         n_steps: u64,
     ) -> Result<StepResult, TrainingError> {
         let loss = self.differentiate(batch, step)?;
-        let learning_rate = self.config.learning_rate.at(step, n_steps);
-        let Self { network, parts, .. } = self;
-        let threads = Arc::clone(parts.threads());
-        let gradient_norm =
-            threads.run(|| network.step(parts.gradients(), loss, learning_rate, step))?;
         let losses = Losses { total: loss, parts: vec![("diffusion", loss)] };
-        Ok(StepResult { losses, gradient_norm, learning_rate, lr_decoder: None })
+        self.take_step(losses, self.config.learning_rate.at(step, n_steps), step)
     }
 
     fn rehearse(&mut self, batch: &Batch) -> Result<(), TrainingError> {
@@ -425,7 +405,19 @@ impl Learner for DiffusionLearner {
         self.parts.ownership(1)
     }
 
-    keeps_network!(network);
+    fn state(&self) -> Vec<&dyn CheckpointState> {
+        vec![&self.network]
+    }
+
+    fn state_mut(&mut self) -> Vec<&mut dyn CheckpointState> {
+        vec![&mut self.network]
+    }
+}
+
+impl PartedLearner for DiffusionLearner {
+    fn parts_and_network(&mut self) -> (&mut Parts, &mut NetworkState) {
+        (&mut self.parts, &mut self.network)
+    }
 }
 
 #[cfg(test)]

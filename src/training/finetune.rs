@@ -29,7 +29,7 @@ use super::config::{FinetuneConfig, NetworkConfig};
 use super::decoder::DECODER;
 use super::diffusion::{DiffusionInputs, UNET, WithholdProbabilities, tape_seed};
 use super::error::TrainingError;
-use super::learner::{Learner, Losses, StepResult, Validation};
+use super::learner::{CheckpointState, Learner, Losses, StepResult, Validation};
 use super::objective::{Objective, reconstruction};
 use super::pipeline::{Pipeline, weighted_sum};
 use super::sampling::motion_view;
@@ -61,12 +61,17 @@ pub struct EndToEndLosses<T> {
     pub decoded: T,
 }
 
+/// The parameters of both networks, whose names begin with `unet.` and `decoder.`, and their optimizer.
+struct BothNetworks {
+    parameters: Parameters<f32>,
+    optimizer: AdamW<f32>,
+}
+
 /// Trains both networks together.
 pub struct FinetuneLearner {
     pipeline: Pipeline,
-    parameters: Parameters<f32>,
+    networks: BothNetworks,
     gradients: Gradients<f32>,
-    optimizer: AdamW<f32>,
     arena: Arena<f32>,
     threads: Arc<Threads>,
     schedule: Schedule,
@@ -101,8 +106,10 @@ impl FinetuneLearner {
         Ok(Self {
             pipeline,
             gradients: Gradients::new(&parameters),
-            optimizer: AdamW::new(config.optimizer.adamw(), &parameters),
-            parameters,
+            networks: BothNetworks {
+                optimizer: AdamW::new(config.optimizer.adamw(), &parameters),
+                parameters,
+            },
             arena: Arena::default(),
             threads: Arc::new(Threads::of_process()),
             schedule,
@@ -121,7 +128,7 @@ impl FinetuneLearner {
 
     /// Returns the parameters of both networks; names begin with `unet.` and `decoder.`.
     pub fn parameters(&self) -> &Parameters<f32> {
-        &self.parameters
+        &self.networks.parameters
     }
 
     /// Returns all losses of a batch.
@@ -197,7 +204,7 @@ impl FinetuneLearner {
     /// Motion as it will be generated: sampled from noise alone, and decoded.
     fn generated(&self, batch: &Batch) -> Result<Tensor<f32>, TrainingError> {
         let Self { pipeline, schedule, config, .. } = self;
-        let mut g = Eager::new(&self.parameters, &self.arena);
+        let mut g = Eager::new(&self.networks.parameters, &self.arena);
         let noise: Vec<f32> = batch.noise.iter().rev().copied().collect();
         let plan = (schedule.len(), config.num_steps);
         let latent = pipeline.sample(&mut g, schedule, plan, &noise, batch)?;
@@ -210,7 +217,7 @@ impl FinetuneLearner {
         // prediction is not kept while motion is sampled: a tenth of the memory of a step of `base`.
         let tape = |part: u64| {
             let seed = tape_seed(self.config.seed, 2 * step + part);
-            Tape::new(&self.parameters, &self.arena, Some(seed))
+            Tape::new(&self.networks.parameters, &self.arena, Some(seed))
         };
         let mut first = tape(0);
         let diffusion = self.diffusion(&mut first, batch)?;
@@ -316,7 +323,8 @@ impl Learner for FinetuneLearner {
         threads.run(|| {
             let losses = self.differentiate(batch, step)?;
             let gradient_norm = if losses.total.is_finite() {
-                self.optimizer.step_by(&mut self.parameters, &mut self.gradients, |parameter| {
+                let BothNetworks { parameters, optimizer } = &mut self.networks;
+                optimizer.step_by(parameters, &mut self.gradients, |parameter| {
                     if parameter.name.starts_with(UNET) { lr_diffusion } else { lr_decoder }
                 })
             } else {
@@ -339,7 +347,7 @@ impl Learner for FinetuneLearner {
         for i in 0..n {
             let batch = self.windows.validation(i * size..(i + 1) * size)?;
             let found = self.threads.run(|| {
-                let mut g = Eager::new(&self.parameters, &self.arena);
+                let mut g = Eager::new(&self.networks.parameters, &self.arena);
                 self.losses(&mut g, &batch)
             })?;
             let EndToEndLosses { total, diffusion, position, quaternion, temporal, .. } = &found;
@@ -382,6 +390,16 @@ impl Learner for FinetuneLearner {
         Ok(Validation { losses: sum, live: None, distance: None })
     }
 
+    fn state(&self) -> Vec<&dyn CheckpointState> {
+        vec![&self.networks]
+    }
+
+    fn state_mut(&mut self) -> Vec<&mut dyn CheckpointState> {
+        vec![&mut self.networks]
+    }
+}
+
+impl CheckpointState for BothNetworks {
     fn sections(&self) -> Vec<Section<'_, f32>> {
         let plan = self.parameters.plan();
         let ([m, v], _) = self.optimizer.state();

@@ -33,7 +33,7 @@ impl RowKind {
     }
 }
 
-/// A row to be.
+/// A row to write.
 pub struct Entry<'a> {
     pub kind: RowKind,
     pub epoch: u64,
@@ -189,7 +189,7 @@ impl<'a> Journal<'a> {
     /// Commits the stretch up to `step` and begins the next.
     ///
     /// # Errors
-    /// What the store says, once patience is at its end; the rows are kept then.
+    /// Errors of the store, once patience is at its end; the rows are kept then.
     pub fn commit(
         &mut self,
         step: u64,
@@ -236,7 +236,7 @@ impl<'a> Journal<'a> {
     /// Withdraws everything that was logged of the run's stage.
     ///
     /// # Errors
-    /// What the store says.
+    /// Errors of the store.
     pub fn clear(&mut self) -> Result<(), TrainingError> {
         let mine = format!("{}/{}/", self.run, self.stage);
         let mut ids: Vec<String> = self.ledger.ids().map(str::to_owned).collect();

@@ -2,11 +2,15 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
+use crate::autodiff::Threads;
 use crate::weights::{Archive, Section};
 
+use super::averaged::NetworkState;
 use super::batch::Batch;
 use super::checkpoint::Progress;
 use super::error::TrainingError;
+use super::parts::Parts;
+use super::ranks::Ranks;
 
 /// The loss that is minimised, and its parts by name.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -106,7 +110,7 @@ pub trait Learner: Send {
     /// Measures what was learned.
     ///
     /// # Errors
-    /// As [`Learner::step`], and what the store says.
+    /// As [`Learner::step`], and errors of the store.
     fn validate(&mut self) -> Result<Validation, TrainingError>;
 
     /// Returns which windows of a batch this process learns from.
@@ -114,12 +118,18 @@ pub trait Learner: Send {
         all_windows()
     }
 
+    /// Returns what a checkpoint keeps of it: a network comes first, where there is one.
+    fn state(&self) -> Vec<&dyn CheckpointState>;
+
+    /// Returns what a checkpoint keeps of it for writing, in the order of [`Learner::state`].
+    fn state_mut(&mut self) -> Vec<&mut dyn CheckpointState>;
+
     /// Puts the weights to use together on the first of several processes.
     ///
     /// # Errors
     /// When another process is gone.
     fn collect_average(&mut self) -> Result<(), TrainingError> {
-        Ok(())
+        self.state_mut().into_iter().try_for_each(|state| state.collect_average())
     }
 
     /// Puts all numbers together on the first of several processes.
@@ -127,20 +137,28 @@ pub trait Learner: Send {
     /// # Errors
     /// When another process is gone.
     fn collect(&mut self) -> Result<(), TrainingError> {
-        Ok(())
+        self.state_mut().into_iter().try_for_each(|state| state.collect())
     }
 
     /// Keeps a process's own share of the numbers again.
-    fn release(&mut self) {}
+    fn release(&mut self) {
+        self.state_mut().into_iter().for_each(|state| state.release());
+    }
 
     /// Returns all numbers, to go on from.
-    fn sections(&self) -> Vec<Section<'_, f32>>;
+    fn sections(&self) -> Vec<Section<'_, f32>> {
+        self.state().into_iter().flat_map(|state| state.sections()).collect()
+    }
 
     /// Returns the weights to use.
-    fn best(&self) -> Vec<Section<'_, f32>>;
+    fn best(&self) -> Vec<Section<'_, f32>> {
+        self.state().into_iter().flat_map(|state| state.best()).collect()
+    }
 
-    /// Returns how many updates optimizer and average have seen.
-    fn n_updates(&self) -> (u64, u64);
+    /// Returns how many updates optimizer and average of the network have seen.
+    fn n_updates(&self) -> (u64, u64) {
+        self.state().first().map_or((0, 0), |state| state.n_updates())
+    }
 
     /// Takes up the numbers of [`Learner::sections`].
     ///
@@ -151,5 +169,93 @@ pub trait Learner: Send {
         archive: &Archive,
         place: &str,
         at: &Progress,
+    ) -> Result<(), TrainingError> {
+        self.state_mut().into_iter().try_for_each(|state| state.restore(archive, place, at))
+    }
+}
+
+/// What a checkpoint keeps of a learner: a network with its optimizer and its average, or what belongs to one.
+pub trait CheckpointState {
+    /// Puts the weights to use together on the first of several processes that keep a share each.
+    ///
+    /// # Errors
+    /// When another process is gone.
+    fn collect_average(&mut self) -> Result<(), TrainingError> {
+        Ok(())
+    }
+
+    /// Puts all numbers together on the first of several processes that keep a share each.
+    ///
+    /// # Errors
+    /// When another process is gone.
+    fn collect(&mut self) -> Result<(), TrainingError> {
+        Ok(())
+    }
+
+    /// Gives the memory back in which others' shares were put together.
+    fn release(&mut self) {}
+
+    /// Returns all numbers, to go on from.
+    fn sections(&self) -> Vec<Section<'_, f32>>;
+
+    /// Returns the weights to use, as a file's sections; none where they are a network's already.
+    fn best(&self) -> Vec<Section<'_, f32>> {
+        Vec::new()
+    }
+
+    /// Returns how many updates optimizer and average have seen.
+    fn n_updates(&self) -> (u64, u64) {
+        (0, 0)
+    }
+
+    /// Takes up the numbers of [`CheckpointState::sections`].
+    ///
+    /// # Errors
+    /// When they are not those of the same shapes.
+    fn restore(
+        &mut self,
+        archive: &Archive,
+        place: &str,
+        at: &Progress,
     ) -> Result<(), TrainingError>;
+}
+
+/// A learner of one network that does the parts of a batch by themselves, on threads and by several processes.
+pub trait PartedLearner: Learner + Sized {
+    /// Returns the parts of a batch and the network.
+    fn parts_and_network(&mut self) -> (&mut Parts, &mut NetworkState);
+
+    /// Has steps run on threads; the results are the same on any.
+    fn on(mut self, threads: &Arc<Threads>) -> Self {
+        self.parts_and_network().0.on(threads);
+        self
+    }
+
+    /// Trains together with other processes.
+    ///
+    /// # Errors
+    /// When the parts of a batch cannot be shared out evenly.
+    fn among(mut self, ranks: &Arc<Ranks>) -> Result<Self, TrainingError> {
+        let (parts, network) = self.parts_and_network();
+        parts.among(ranks)?;
+        network.among(ranks);
+        Ok(self)
+    }
+
+    /// Takes step number `step` by the gradients of a batch, whose losses are given.
+    ///
+    /// # Errors
+    /// When another process is gone.
+    fn take_step(
+        &mut self,
+        losses: Losses,
+        learning_rate: f64,
+        step: u64,
+    ) -> Result<StepResult, TrainingError> {
+        let (parts, network) = self.parts_and_network();
+        let threads = Arc::clone(parts.threads());
+        let gradient_norm =
+            threads.run(|| network.step(parts.gradients(), losses.total, learning_rate, step))?;
+        Ok(StepResult { losses, gradient_norm, learning_rate, lr_decoder: None })
+    }
 }

@@ -51,7 +51,9 @@ pub use group::{
 };
 pub use journal::{Journal, RowKind};
 pub use judge::SampleJudge;
-pub use learner::{Learner, Losses, Ownership, StepResult, Validation};
+pub use learner::{
+    CheckpointState, Learner, Losses, Ownership, PartedLearner, StepResult, Validation,
+};
 pub use learning_rate::{LearningRate, LearningRateSchedule};
 pub use loader::Loader;
 pub use objective::{ChannelWeights, Objective, Reconstruction, reconstruction};

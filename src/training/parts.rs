@@ -199,7 +199,7 @@ impl Parts {
     /// processes; returns what the work found, in order of parts.
     ///
     /// # Errors
-    /// What the work says, and when another process is gone.
+    /// Errors of the work, and when another process is gone.
     pub fn differentiate<R: Send>(
         &mut self,
         n_parts: usize,

@@ -141,8 +141,8 @@ fn inert(json: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Audio, ViewSample};
     use super::*;
+    use crate::view::{Audio, ViewSample};
     use ndarray::Array3;
     use proptest::prelude::*;
 

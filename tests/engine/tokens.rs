@@ -18,7 +18,7 @@ struct Inputs<E: Element> {
     t: Tensor<E>,
 }
 
-struct Found<E: Element> {
+struct TokensOutputs<E: Element> {
     quantized: Quantized<Tensor<E>>,
     signal: Tensor<E>,
     draft: Option<Tensor<E>>,
@@ -29,13 +29,13 @@ fn forward<E: Element, I: Interpreter<Element = E>>(
     g: &mut I,
     tokenizer: &Tokenizer,
     given: &Inputs<E>,
-) -> Result<Found<E>> {
+) -> Result<TokensOutputs<E>> {
     let quantized = tokenizer.quantize(g, &given.motion)?;
     let q = g.straight_through(&quantized.latents, &quantized.codes)?;
     let signal = tokenizer.signal(g, &q, &given.motion)?;
     let estimate = tokenizer.denoise(g, &given.x, &given.t, &signal)?;
     let draft = tokenizer.draft(g, &signal)?;
-    Ok(Found { quantized, signal, draft, estimate })
+    Ok(TokensOutputs { quantized, signal, draft, estimate })
 }
 
 fn inputs<E: Element, I: Interpreter<Element = E>>(

@@ -86,7 +86,7 @@ const HEADS: usize = 2;
 const ROWS: usize = 9;
 
 /// The inputs of a call, by the names that all calls share.
-struct Given<T> {
+struct CallInputs<T> {
     x: T,
     other: T,
     context: T,
@@ -134,7 +134,7 @@ fn filter(taps: usize) -> Arc<Array2<f64>> {
     Arc::new(Array2::from_shape_fn((WIDTH, taps), tap))
 }
 
-fn run<G: Graph>(call: Call, g: &mut G, x: &Given<G::Tensor>, ids: &Ids) -> Result<G::Tensor> {
+fn run<G: Graph>(call: Call, g: &mut G, x: &CallInputs<G::Tensor>, ids: &Ids) -> Result<G::Tensor> {
     let convolved = |g: &mut G| g.conv1d(&x.x, ids.taps, Some(ids.gain), SAME);
     match call {
         Call::Linear => g.linear(&x.x, ids.weight, Some(ids.bias)),
@@ -325,7 +325,7 @@ fn by_interpreter(call: Call) -> (Vec<usize>, Vec<f32>) {
             let (shape, numbers) = &values[name];
             g.input(shape, numbers)
         };
-        Given {
+        CallInputs {
             x: input("x"),
             other: input("other"),
             context: input("context"),
@@ -346,7 +346,7 @@ fn by_onnxruntime(call: Call, form: Form) -> (Vec<usize>, Vec<f32>) {
     let parameters = Parameters::<f32>::new(list.clone(), 7);
     let weights = |id| parameters.unpacked(id);
     let mut g = Builder::new(&list, &weights, form, Storage::Fp32);
-    let given = Given {
+    let given = CallInputs {
         x: g.input("x", Axes::Frames, WIDTH, ""),
         other: g.input("other", Axes::Frames, WIDTH, ""),
         context: g.framed_input("context", "keys", WIDTH, ""),

@@ -17,7 +17,7 @@ fn computed_columns_have_the_names_that_they_are_asked_by() {
     let sql = "select lower(phrase_id), power(2, 10), sqrt(4) from phrases order by lower(phrase_id) limit 1";
     let expected = "lower(phrase_id),\"power(2, 10)\",sqrt(4)\n\"a/ü, \"\"quoted\"\"\",1024,2.0\n";
     assert_eq!(csv(&store, sql), expected);
-    // Whoever asks for one column twice is told what to do.
+    // A query that names one column twice is refused with the way out.
     let sql = "select phrase_id, n_frames as phrase_id from phrases";
     let expected = "two columns of the answer are called \"phrase_id\"; give one of them another name with \"as\"";
     assert_eq!(refusal(&store, sql), expected);

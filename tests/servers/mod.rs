@@ -8,7 +8,7 @@
 //! stores.inject(Faults { too_many_requests_first: 1, ..Faults::default() });
 //! ```
 //!
-//! Nothing here reaches beyond loopback or reads the credentials of whoever runs the tests.
+//! Nothing here reaches beyond loopback or reads the user's credentials.
 
 // Each program that includes this module uses another part of it.
 #![allow(dead_code)]

@@ -220,7 +220,7 @@ fn locations_that_cannot_be_opened_are_refused_in_a_sentence() {
 
 #[test]
 fn permission_to_a_local_folder_is_left_to_the_operating_system() {
-    // Whoever is root may write anywhere, so a refused local write is not tried here; the remote
+    // Root may write anywhere, so a refused local write is not tried here; the remote
     // refusals are in `faults`. A file where the folder should be is refused to everybody.
     let folder = tempfile::tempdir().expect("a temporary folder");
     let file = folder.path().join("a file");

@@ -1,7 +1,7 @@
 //! The low-pass filter of a conversion: exactly, and from a table of a few thousand values.
 
-use super::super::SAMPLE_RATE_HZ;
-use super::super::decimate::{Kaiser, sinc};
+use crate::audio::SAMPLE_RATE_HZ;
+use crate::audio::decimate::{Kaiser, sinc};
 
 /// Cut-off relative to the lower rate's Nyquist frequency, midway between pass and stop band.
 const CUT_OFF: f64 = 0.956_871_8;

@@ -2,9 +2,9 @@
 
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
-use super::super::SAMPLE_RATE_HZ;
 use super::dot::{LANES, dot};
 use super::filter::{Filter, FilterTable, TABLE_ERROR};
+use crate::audio::SAMPLE_RATE_HZ;
 
 /// Taps up to which a conversion holds every phase: 768 kHz has 569,184. Beyond, phases are blended.
 const MAX_EXACT_TAPS: usize = 600_000;
@@ -120,8 +120,8 @@ impl PhaseCache {
 
 #[cfg(test)]
 mod tests {
-    use super::super::filter::EVALUATIONS;
     use super::*;
+    use crate::audio::resample::filter::EVALUATIONS;
     use proptest::prelude::*;
     use std::sync::mpsc::channel;
     use std::time::Duration;

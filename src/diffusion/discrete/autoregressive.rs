@@ -12,7 +12,7 @@ use crate::diffusion::config::DiffusionError;
 /// - `uniform`: the number of the draw n, for token n
 ///
 /// # Errors
-/// Settings that nothing can be drawn by, a token that is given and does not exist, what `logits` says, and logits of
+/// Settings that nothing can be drawn by, a token that is given and does not exist, errors of `logits`, and logits of
 /// another length or that are no numbers.
 pub fn sample_autoregressive<E: From<DiffusionError>>(
     sampling: &TokenSampling,

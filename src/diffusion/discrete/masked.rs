@@ -20,7 +20,7 @@ use crate::diffusion::config::DiffusionError;
 ///   those of Gumbel's noise, which is not asked for where τ is 0
 ///
 /// # Errors
-/// Settings that nothing can be drawn by, a token that is given and does not exist, what `logits` says, and logits of
+/// Settings that nothing can be drawn by, a token that is given and does not exist, errors of `logits`, and logits of
 /// another shape or that are no numbers.
 pub fn sample_masked<E: From<DiffusionError>>(
     sampling: &TokenSampling,

@@ -27,7 +27,7 @@ const SEED: u64 = 2026;
 
 /// The music of a phrase, from its first frame on.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Music {
+pub struct PhraseMusic {
     /// Beats, s.
     pub beats_s: Vec<f64>,
     /// Bars that had passed at each frame of the song, or of the phrase where nothing else is known.
@@ -50,7 +50,7 @@ pub struct MusicWindow<'a> {
     pub is_of_motion: bool,
 }
 
-impl Music {
+impl PhraseMusic {
     /// Returns the music of `n_frames` frames from `first` on; none where it ends before.
     pub fn window(&self, first: usize, n_frames: usize) -> Option<MusicWindow<'_>> {
         let frames = first..first + n_frames;

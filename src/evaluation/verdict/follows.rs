@@ -1,6 +1,9 @@
 //! Does it follow its music?
 
-use super::{Evidence, GroupEvidence, Outcome, Rule, Test, estimate, find, real, rounded};
+use super::{
+    Evidence, GroupEvidence, Outcome, Rule, Test, differences_by_song, estimate, find, real,
+    rounded,
+};
 use crate::evaluation::interval::{Estimate, holm, paired_difference};
 use crate::evaluation::metrics::Number;
 
@@ -97,13 +100,7 @@ fn wrong_tempi(own: &[Number]) -> Test {
 /// A test of whether the coefficient is higher than that of a control, song by song.
 fn paired(name: &'static str, what: &str, own: Option<&Number>, control: &[Number]) -> Test {
     let other = own.and_then(|own| find(control, own.metric, &own.variant));
-    let differences: Vec<f64> = own
-        .zip(other)
-        .map(|(own, other)| {
-            let difference_of_song = |(song, x): (&usize, &f64)| Some(x - other.by_song.get(song)?);
-            own.by_song.iter().filter_map(difference_of_song).collect()
-        })
-        .unwrap_or_default();
+    let differences = differences_by_song(own, other);
     let found = paired_difference(&differences);
     let against = match other.and_then(|other| other.estimate.value) {
         Some(x) => format!("{} {what}, {} songs", rounded(x), differences.len()),

@@ -1,6 +1,8 @@
 //! Do the dancers of a group belong together, and keep apart?
 
-use super::{GroupEvidence, Outcome, Rule, Test, estimate, find, real, rounded};
+use super::{
+    GroupEvidence, Outcome, Rule, Test, differences_by_song, estimate, find, real, rounded,
+};
 use crate::evaluation::interval::{Estimate, paired_difference};
 
 /// Largest share of frames and pairs whose bodies touch.
@@ -94,13 +96,7 @@ fn over_real(
 fn belong_together(group: &GroupEvidence) -> Test {
     let number = |numbers| find(numbers, "unison_index", "");
     let (own, alone) = (number(group.own), number(group.independent));
-    let differences: Vec<f64> = own
-        .zip(alone)
-        .map(|(own, alone)| {
-            let difference_of_song = |(song, x): (&usize, &f64)| Some(x - alone.by_song.get(song)?);
-            own.by_song.iter().filter_map(difference_of_song).collect()
-        })
-        .unwrap_or_default();
+    let differences = differences_by_song(own, alone);
     let found = paired_difference(&differences);
     let against = match alone.and_then(|alone| alone.estimate.value) {
         Some(x) => format!("{} of independent soloists, {} songs", rounded(x), differences.len()),

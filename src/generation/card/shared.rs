@@ -51,6 +51,31 @@ pub struct SharedFields<'a> {
     pub files: &'a [FileEntry],
 }
 
+/// Borrows what a card of any family says beside its networks, from fields that are called alike in all of them.
+macro_rules! shared_fields {
+    ($card:expr) => {
+        SharedFields {
+            name: &$card.name,
+            program: &$card.program,
+            run: &$card.provenance.run,
+            data: &$card.provenance.data,
+            precision: $card.precision,
+            licence: &$card.licence,
+            diffusion: &$card.diffusion,
+            window_frames: $card.window_frames,
+            fps: $card.fps,
+            channels: &$card.channels,
+            features: &$card.features,
+            normalizer: &$card.normalizer,
+            feature_scale: &$card.feature_scale,
+            motion_range: $card.motion_range,
+            sampling: $card.sampling.as_ref(),
+            files: &$card.files,
+        }
+    };
+}
+pub(in crate::generation) use shared_fields;
+
 /// The card of a model of one family.
 pub trait FamilyCard: DeserializeOwned {
     const FAMILY: Family;
@@ -77,7 +102,7 @@ pub trait FamilyCard: DeserializeOwned {
     /// One sentence for a text that is no card of this family, another format, another layout of channels or
     /// features, and for sizes that no memory holds.
     fn read(bytes: &[u8], place: &str) -> Result<Self, CardError> {
-        Head::read(bytes, place)?.expect(Self::FAMILY, place)?;
+        CardHead::read(bytes, place)?.expect(Self::FAMILY, place)?;
         let card: Self = serde_json::from_slice(bytes).map_err(|e| CardError::Unreadable {
             place: place.to_owned(),
             reason: e.to_string(),
@@ -184,13 +209,13 @@ pub struct FileEntry {
 
 /// What a card says first of all.
 #[derive(Debug, Deserialize)]
-struct Head {
+struct CardHead {
     format: u32,
     #[serde(default)]
     family: Option<String>,
 }
 
-impl Head {
+impl CardHead {
     /// Reads format and family; another format is refused.
     fn read(bytes: &[u8], place: &str) -> Result<Self, CardError> {
         let place = || place.to_owned();
@@ -218,7 +243,7 @@ impl Head {
 /// # Errors
 /// [`CardError`] for a text that is no card, or one of another format.
 pub fn family_of(bytes: &[u8], place: &str) -> Result<Family, CardError> {
-    let head = Head::read(bytes, place)?;
+    let head = CardHead::read(bytes, place)?;
     let known = [Family::Group, Family::Tokens];
     let found = known.into_iter().find(|family| head.family.as_deref() == Some(family.name()));
     Ok(found.unwrap_or(Family::Unet))

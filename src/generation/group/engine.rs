@@ -7,10 +7,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::audio::FeatureScale;
 use crate::autodiff::op::reduce::{Over, Reduce};
-use crate::autodiff::{Arena, Eager, Gradients, Interpreter, Parameters, Tape, Tensor, Threads};
+use crate::autodiff::{Eager, Gradients, Interpreter, Parameters, Tape, Tensor};
 use crate::diffusion::Schedule;
 use crate::generation::engine::EngineError;
-use crate::generation::pool::Pool;
+use crate::generation::interpreter::{EAGER, EagerWorkers, to_array};
 use crate::model::{
     Graph, GroupConfig, GroupInputs, GroupNetworks, GroupScoreInputs, GroupScores,
     Result as GraphResult, condition_scale,
@@ -23,12 +23,7 @@ pub struct GroupEngine {
     parameters: Parameters<f32>,
     /// Of the condition.
     scale: FeatureScale,
-    workers: Pool<GroupWorker>,
-}
-
-struct GroupWorker {
-    threads: Threads,
-    arena: Arena<f32>,
+    workers: EagerWorkers,
 }
 
 /// What estimates the clean motion of groups.
@@ -39,7 +34,7 @@ pub trait GroupEstimator: Sync {
     /// Returns the length of the noise of the group embedding.
     fn embedding_dim(&self) -> usize;
 
-    /// Estimates clean motion, normalised: \[B N, T, 25\], moved along the gradient of the score where that is asked.
+    /// Estimates clean motion, normalised: \[B N, T, 25\], moved along the gradient of the score where consistency is not 0.
     ///
     /// # Errors
     /// Shapes that do not fit.
@@ -131,7 +126,7 @@ impl ConsistencyForm {
 }
 
 impl GroupEngine {
-    /// Makes an engine of `n_workers` that have `n_threads` each; `parameters` are those of [`GroupNetworks`],
+    /// Makes an engine of so many workers of so many threads each; `parameters` are those of [`GroupNetworks`],
     /// `scale` is that of the features.
     ///
     /// # Errors
@@ -140,23 +135,20 @@ impl GroupEngine {
         config: &GroupConfig,
         parameters: Parameters<f32>,
         scale: &FeatureScale,
-        (n_workers, n_threads): (NonZeroUsize, NonZeroUsize),
+        workers: (NonZeroUsize, NonZeroUsize),
     ) -> std::io::Result<Self> {
-        let worker =
-            |_| Ok(GroupWorker { threads: Threads::start(n_threads)?, arena: Arena::default() });
-        let workers = (0..n_workers.get()).map(worker).collect::<std::io::Result<Vec<_>>>()?;
         Ok(Self {
             config: config.clone(),
             networks: GroupNetworks::new(config).0,
             parameters,
             scale: condition_scale(config.condition(), scale),
-            workers: Pool::new(workers),
+            workers: EagerWorkers::start(workers)?,
         })
     }
 
     /// Returns how many calls run at once.
     pub fn n_workers(&self) -> usize {
-        self.workers.len()
+        self.workers.n_workers()
     }
 
     /// Returns the sizes of the networks.
@@ -179,43 +171,40 @@ impl GroupEngine {
         }
         let audio = self.scaled(inputs.audio);
         let x = inputs.x.as_standard_layout();
-        self.workers.with(|GroupWorker { threads, arena }| {
-            threads.run(|| {
-                let given =
-                    ForwardInputs { inputs, audio: &audio, x: x.as_slice().expect("in order") };
-                let (form, factor) = inputs.consistency;
-                let follows_noise = factor != 0.0 && form.is_by_noisy_motion();
-                let mut tape = Tape::new(&self.parameters, arena, None);
-                let (x0, w, by) = if follows_noise {
-                    let x = tape.input(inputs.x.shape(), given.x);
-                    let (x0, w) = self.estimate(&mut tape, &given, &x)?;
-                    (x0, w, x)
-                } else {
-                    let mut g = Eager::new(&self.parameters, arena);
-                    let x = g.constant(inputs.x.shape(), given.x);
-                    let (x0, w) = self.estimate(&mut g, &given, &x)?;
-                    if factor == 0.0 {
-                        return Ok(to_array(&x0));
-                    }
-                    let x0 = tape.input(x0.shape(), x0.data());
-                    (x0.clone(), tape.constant(w.shape(), w.data()), x0)
-                };
-                let guide = self.consistency(&mut tape, &given, &x0, &w)?;
-                let mut moved = to_array(&x0);
-                drop((x0, w));
-                let mut unused = Gradients::new(&self.parameters);
-                let found = tape.backward(guide, &mut unused)?;
-                if let Some(gradient) = found.of(&by) {
-                    let size = (moved.len() / groups).max(1);
-                    let moved = moved.as_slice_mut().expect("an array made in order");
-                    let of_groups = moved.chunks_exact_mut(size);
-                    for (moved, gradient) in of_groups.zip(gradient.data().chunks_exact(size)) {
-                        let factor = (factor * form.scale(gradient)) as f32;
-                        moved.iter_mut().zip(gradient).for_each(|(x, &g)| *x += factor * g);
-                    }
+        self.workers.run(|arena| {
+            let given = ForwardInputs { inputs, audio: &audio, x: x.as_slice().expect("in order") };
+            let (form, factor) = inputs.consistency;
+            let follows_noise = factor != 0.0 && form.is_by_noisy_motion();
+            let mut tape = Tape::new(&self.parameters, arena, None);
+            let (x0, w, by) = if follows_noise {
+                let x = tape.input(inputs.x.shape(), given.x);
+                let (x0, w) = self.estimate(&mut tape, &given, &x)?;
+                (x0, w, x)
+            } else {
+                let mut g = Eager::new(&self.parameters, arena);
+                let x = g.constant(inputs.x.shape(), given.x);
+                let (x0, w) = self.estimate(&mut g, &given, &x)?;
+                if factor == 0.0 {
+                    return Ok(to_array(&x0));
                 }
-                Ok(moved)
-            })
+                let x0 = tape.input(x0.shape(), x0.data());
+                (x0.clone(), tape.constant(w.shape(), w.data()), x0)
+            };
+            let guide = self.consistency(&mut tape, &given, &x0, &w)?;
+            let mut moved = to_array(&x0);
+            drop((x0, w));
+            let mut unused = Gradients::new(&self.parameters);
+            let found = tape.backward(guide, &mut unused)?;
+            if let Some(gradient) = found.of(&by) {
+                let size = (moved.len() / groups).max(1);
+                let moved = moved.as_slice_mut().expect("an array made in order");
+                let of_groups = moved.chunks_exact_mut(size);
+                for (moved, gradient) in of_groups.zip(gradient.data().chunks_exact(size)) {
+                    let factor = (factor * form.scale(gradient)) as f32;
+                    moved.iter_mut().zip(gradient).for_each(|(x, &g)| *x += factor * g);
+                }
+            }
+            Ok(moved)
         })
     }
 
@@ -235,19 +224,14 @@ impl GroupEngine {
     pub fn score(&self, inputs: &GroupEngineInputs) -> Result<Vec<GroupScores<f32>>, EngineError> {
         let audio = self.scaled(inputs.audio);
         let x = inputs.x.as_standard_layout();
-        self.workers.with(|GroupWorker { threads, arena }| {
-            threads.run(|| {
-                let given =
-                    ForwardInputs { inputs, audio: &audio, x: x.as_slice().expect("in order") };
-                let mut g = Eager::new(&self.parameters, arena);
-                let x = g.constant(inputs.x.shape(), given.x);
-                let (_, w) = self.estimate(&mut g, &given, &x)?;
-                let GroupScores { log_ratio, agreement } = self.scores(&mut g, &given, &x, &w)?;
-                let both = log_ratio.data().iter().zip(agreement.data());
-                Ok(both
-                    .map(|(&log_ratio, &agreement)| GroupScores { log_ratio, agreement })
-                    .collect())
-            })
+        self.workers.run(|arena| {
+            let given = ForwardInputs { inputs, audio: &audio, x: x.as_slice().expect("in order") };
+            let mut g = Eager::new(&self.parameters, arena);
+            let x = g.constant(inputs.x.shape(), given.x);
+            let (_, w) = self.estimate(&mut g, &given, &x)?;
+            let GroupScores { log_ratio, agreement } = self.scores(&mut g, &given, &x, &w)?;
+            let both = log_ratio.data().iter().zip(agreement.data());
+            Ok(both.map(|(&log_ratio, &agreement)| GroupScores { log_ratio, agreement }).collect())
         })
     }
 
@@ -289,7 +273,7 @@ impl GroupEngine {
     }
 
     /// Returns Σ of what consistency moves along over all groups, a scalar: of groups the agreement of their dancers, of a
-    /// soloist, who agrees with himself, log f.
+    /// soloist, who has nobody to agree with, log f.
     fn consistency<I: Interpreter<Element = f32>>(
         &self,
         g: &mut I,
@@ -319,7 +303,7 @@ impl GroupEngine {
 
 impl GroupEstimator for GroupEngine {
     fn name(&self) -> &'static str {
-        "eager"
+        EAGER
     }
 
     fn embedding_dim(&self) -> usize {
@@ -344,11 +328,6 @@ impl ForwardInputs<'_, '_> {
         let row = config.embedded_number(self.inputs.n_dancers) as f32;
         g.constant(&[groups], &vec![row; groups])
     }
-}
-
-fn to_array(x: &Tensor<f32>) -> Array3<f32> {
-    let [a, b, c] = x.shape() else { unreachable!("networks return three axes") };
-    Array3::from_shape_vec((*a, *b, *c), x.data().to_vec()).expect("as many as its shape says")
 }
 
 #[cfg(test)]

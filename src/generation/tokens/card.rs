@@ -6,7 +6,7 @@ use crate::audio::{FEATURE_DIM, FeatureScale};
 use crate::diffusion::{DiffusionConfig, Prediction};
 use crate::generation::card::{
     FamilyCard, FileEntry, ModelFileName, SamplingDefaults, SharedFields, check_n_parameters,
-    check_sizes, most_bytes,
+    check_sizes, most_bytes, shared_fields,
 };
 use crate::generation::learned::LearnedFrom;
 use crate::model::{CONSTRAINT_DIM, Family, Planner, PlannerConfig, Tokenizer, TokensConfig};
@@ -87,24 +87,7 @@ impl FamilyCard for TokensCard {
     const USUAL_GUIDANCE: f64 = 1.0;
 
     fn shared(&self) -> SharedFields<'_> {
-        SharedFields {
-            name: &self.name,
-            program: &self.program,
-            run: &self.provenance.run,
-            data: &self.provenance.data,
-            precision: self.precision,
-            licence: &self.licence,
-            diffusion: &self.diffusion,
-            window_frames: self.window_frames,
-            fps: self.fps,
-            channels: &self.channels,
-            features: &self.features,
-            normalizer: &self.normalizer,
-            feature_scale: &self.feature_scale,
-            motion_range: self.motion_range,
-            sampling: self.sampling.as_ref(),
-            files: &self.files,
-        }
+        shared_fields!(self)
     }
 
     fn check_networks(&self) -> Result<(), String> {

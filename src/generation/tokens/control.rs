@@ -78,7 +78,7 @@ pub fn steer(
     }
 }
 
-/// Turns frames to the orientations that are asked for, and their angular velocities with them.
+/// Turns frames to the orientations of constraints, and their angular velocities with them.
 fn turn(asked: &[(usize, WantedValue)], frames: &mut Array2<f32>, steering: Steering, share: f64) {
     let n = frames.nrows();
     let mut missing: Vec<(usize, [f64; 3])> = asked
@@ -137,7 +137,7 @@ fn continue_turns(turns: &mut [(usize, [f64; 3])]) {
     }
 }
 
-/// Returns the smoothest correction of an axis; none where nothing is asked of it.
+/// Returns the smoothest correction of an axis; none where it has no constraint.
 fn correction(n: usize, missing: &[Missing], steering: Steering) -> Option<Vec<f64>> {
     let (n_pinned, closeness) = match steering {
         Steering::Estimate { n_pinned, .. } => (n_pinned, Closeness::Near),

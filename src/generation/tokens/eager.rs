@@ -6,9 +6,9 @@ use ndarray::{Array3, ArrayView3};
 
 use super::networks::{PlanWindow, PlannerNetworks, TokenizerNetworks, WindowPlan};
 use crate::audio::FeatureScale;
-use crate::autodiff::{Arena, Eager, Interpreter as _, Parameters, Tensor, Threads};
+use crate::autodiff::{Eager, Interpreter as _, Parameters, Tensor};
 use crate::generation::engine::EngineError;
-use crate::generation::pool::Pool;
+use crate::generation::interpreter::{EAGER, EagerWorkers, to_array};
 use crate::model::{
     ConditionInputs, KeysAndValues, PlanConditions, Planner, PlannerConfig, PlannerKind,
     PlannerStepInputs, Tokenizer, TokensConfig, condition_scale,
@@ -16,31 +16,34 @@ use crate::model::{
 use crate::motion::MOTION_DIM;
 use crate::motion::style::STYLE_DIM;
 
-/// Name of the interpreter in flags and tables.
-const NAME: &str = "eager";
-
-/// Threads of a worker and the memory of its results.
-struct EagerWorker {
-    threads: Threads,
-    arena: Arena<f32>,
+/// Weights of a network, and the workers that run it.
+struct EagerNetwork {
+    parameters: Parameters<f32>,
+    workers: EagerWorkers,
 }
 
-/// Starts so many workers of so many threads each.
-fn start(
-    (n_workers, n_threads): (NonZeroUsize, NonZeroUsize),
-) -> std::io::Result<Pool<EagerWorker>> {
-    let worker =
-        |_| Ok(EagerWorker { threads: Threads::start(n_threads)?, arena: Arena::default() });
-    let workers = (0..n_workers.get()).map(worker).collect::<std::io::Result<Vec<_>>>()?;
-    Ok(Pool::new(workers))
+impl EagerNetwork {
+    /// Starts so many workers of so many threads each.
+    fn start(
+        parameters: Parameters<f32>,
+        workers: (NonZeroUsize, NonZeroUsize),
+    ) -> std::io::Result<Self> {
+        Ok(Self { parameters, workers: EagerWorkers::start(workers)? })
+    }
+
+    fn run<R: Send>(
+        &self,
+        forward: impl FnOnce(&mut Eager<f32>) -> Result<R, EngineError> + Send,
+    ) -> Result<R, EngineError> {
+        self.workers.run(|arena| forward(&mut Eager::new(&self.parameters, arena)))
+    }
 }
 
 /// The networks of a tokenizer.
 pub struct EagerTokenizer {
     config: TokensConfig,
     tokenizer: Tokenizer,
-    parameters: Parameters<f32>,
-    workers: Pool<EagerWorker>,
+    network: EagerNetwork,
 }
 
 impl EagerTokenizer {
@@ -56,32 +59,22 @@ impl EagerTokenizer {
         Ok(Self {
             config: config.clone(),
             tokenizer: Tokenizer::new(config).0,
-            parameters,
-            workers: start(workers)?,
-        })
-    }
-
-    fn run<R: Send>(
-        &self,
-        network: impl FnOnce(&mut Eager<f32>) -> Result<R, EngineError> + Send,
-    ) -> Result<R, EngineError> {
-        self.workers.with(|EagerWorker { threads, arena }| {
-            threads.run(|| network(&mut Eager::new(&self.parameters, arena)))
+            network: EagerNetwork::start(parameters, workers)?,
         })
     }
 }
 
 impl TokenizerNetworks for EagerTokenizer {
     fn name(&self) -> &'static str {
-        NAME
+        EAGER
     }
 
     fn n_workers(&self) -> usize {
-        self.workers.len()
+        self.network.workers.n_workers()
     }
 
     fn encode(&self, motion: ArrayView3<f32>) -> Result<Vec<u32>, EngineError> {
-        self.run(|g| {
+        self.network.run(|g| {
             let motion = constant(g, motion);
             let tokens = self.tokenizer.tokens(g, &motion)?;
             Ok(tokens.data().iter().map(|&token| token as u32).collect())
@@ -94,11 +87,11 @@ impl TokenizerNetworks for EagerTokenizer {
         (n, frames): (usize, usize),
     ) -> Result<Array3<f32>, EngineError> {
         let tokens: Vec<f32> = tokens.iter().map(|&token| token as f32).collect();
-        self.run(|g| {
+        self.network.run(|g| {
             let like = g.constant(&[n, frames, MOTION_DIM], &vec![0.0; n * frames * MOTION_DIM]);
             let tokens = g.constant(&[n, self.config.n_tokens(frames)], &tokens);
             let q = self.tokenizer.codes(g, &tokens)?;
-            Ok(array(&self.tokenizer.signal(g, &q, &like)?))
+            Ok(to_array(&self.tokenizer.signal(g, &q, &like)?))
         })
     }
 
@@ -108,18 +101,18 @@ impl TokenizerNetworks for EagerTokenizer {
         t: usize,
         signal: ArrayView3<f32>,
     ) -> Result<Array3<f32>, EngineError> {
-        self.run(|g| {
+        self.network.run(|g| {
             let n = x.dim().0;
             let t = g.constant(&[n], &vec![t as f32; n]);
             let (x, s) = (constant(g, x), constant(g, signal));
-            Ok(array(&self.tokenizer.denoise(g, &x, &t, &s)?))
+            Ok(to_array(&self.tokenizer.denoise(g, &x, &t, &s)?))
         })
     }
 
     fn draft(&self, signal: ArrayView3<f32>) -> Result<Option<Array3<f32>>, EngineError> {
-        self.run(|g| {
+        self.network.run(|g| {
             let s = constant(g, signal);
-            Ok(self.tokenizer.draft(g, &s)?.as_ref().map(array))
+            Ok(self.tokenizer.draft(g, &s)?.as_ref().map(to_array))
         })
     }
 }
@@ -128,10 +121,9 @@ impl TokenizerNetworks for EagerTokenizer {
 pub struct EagerPlanner {
     config: PlannerConfig,
     planner: Planner,
-    parameters: Parameters<f32>,
-    /// Of the condition.
+    /// Scale of the condition.
     scale: FeatureScale,
-    workers: Pool<EagerWorker>,
+    network: EagerNetwork,
 }
 
 impl EagerPlanner {
@@ -148,25 +140,15 @@ impl EagerPlanner {
         Ok(Self {
             config: config.clone(),
             planner: Planner::new(config).0,
-            parameters,
             scale: condition_scale(config.condition(), feature_scale),
-            workers: start(workers)?,
-        })
-    }
-
-    fn run<R: Send>(
-        &self,
-        network: impl FnOnce(&mut Eager<f32>) -> Result<R, EngineError> + Send,
-    ) -> Result<R, EngineError> {
-        self.workers.with(|EagerWorker { threads, arena }| {
-            threads.run(|| network(&mut Eager::new(&self.parameters, arena)))
+            network: EagerNetwork::start(parameters, workers)?,
         })
     }
 }
 
 impl PlannerNetworks for EagerPlanner {
     fn name(&self) -> &'static str {
-        NAME
+        EAGER
     }
 
     fn begin<'a>(&'a self, window: &PlanWindow) -> Result<Box<dyn WindowPlan + 'a>, EngineError> {
@@ -182,7 +164,7 @@ impl PlannerNetworks for EagerPlanner {
             ([n, asked.nrows(), asked.ncols()], values.repeat(n))
         });
         let without = window.drops(|withheld| withheld.constraints);
-        let conditions = self.run(|g| {
+        let conditions = self.network.run(|g| {
             let audio = g.constant(&[n, frames, channels], &condition);
             let drop_audio = g.constant(&[n], &dropped);
             let style = (self.config.style_dim > 0).then(|| g.constant(&[n, STYLE_DIM], &style));
@@ -217,14 +199,14 @@ impl WindowPlan for EagerPlan<'_> {
         let (n, conditions, past) = (self.n_answers, &self.conditions, self.past.as_deref());
         let mut seen: Vec<f32> = tokens.iter().map(|&token| token as f32).collect();
         match config.kind {
-            PlannerKind::Masked => self.of.run(|g| {
+            PlannerKind::Masked => self.of.network.run(|g| {
                 let tokens = g.constant(&[n, seen.len()], &seen.repeat(n));
                 Ok(planner.forward_under(g, &tokens, conditions, None)?.data().to_vec())
             }),
             PlannerKind::Autoregressive => {
-                // The token that is asked for stands behind those that are known; any will do.
+                // The next token stands behind those that are known; its value is not read.
                 seen.push(0.0);
-                let (logits, present) = self.of.run(|g| {
+                let (logits, present) = self.of.network.run(|g| {
                     let tokens = g.constant(&[n, seen.len()], &seen.repeat(n));
                     let inputs = PlannerStepInputs { tokens: &tokens, conditions, past };
                     let step = planner.step(g, &inputs)?;
@@ -243,9 +225,4 @@ impl WindowPlan for EagerPlan<'_> {
 fn constant(g: &mut Eager<f32>, x: ArrayView3<f32>) -> Tensor<f32> {
     let x = x.as_standard_layout();
     g.constant(x.shape(), x.as_slice().expect("in order"))
-}
-
-fn array(x: &Tensor<f32>) -> Array3<f32> {
-    let shape = <[usize; 3]>::try_from(x.shape()).expect("invariant: [batch, frames, channels]");
-    Array3::from_shape_vec(shape, x.data().to_vec()).expect("invariant: as many as its shape says")
 }

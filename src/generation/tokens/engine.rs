@@ -19,7 +19,7 @@ const WINDOWS_AT_ONCE: usize = 16;
 ///
 /// A motion is cut into windows of the frames that training saw, the last as long as is left; each is put over the
 /// origin, facing +Z, by its own first frame, as in training. So a token means the same wherever a phrase is danced,
-/// and tokens know nothing of what is beyond their window.
+/// and tokens do not depend on frames beyond their window.
 pub struct TokenEngine {
     config: TokensConfig,
     networks: Box<dyn TokenizerNetworks + Send>,
@@ -44,7 +44,7 @@ impl TokenEngine {
         Ok(Self::with(config, Box::new(networks), normalizer, window_frames))
     }
 
-    /// Makes an engine of networks, whatever runs them.
+    /// Makes an engine of networks that the interpreter or onnxruntime runs.
     pub fn with(
         config: &TokensConfig,
         networks: Box<dyn TokenizerNetworks + Send>,
@@ -178,7 +178,7 @@ impl TokenEngine {
         Ok(found)
     }
 
-    /// Decodes a window with noise and changes of one's own: \[1, n, 25\] in units of spread.
+    /// Decodes a window with the caller's noise and changes: \[1, n, 25\] in units of spread.
     ///
     /// - `x`: where sampling begins, \[1, n, 25\]
     /// - `noise`, `refine`: as for [`sample_refined`]

@@ -1,8 +1,8 @@
 //! Motion by tokens: the card of a model of the family `tokens`, the engines that run its networks, and motion for a
 //! track of any length.
 
-mod asked;
 mod card;
+mod constraints;
 mod control;
 mod eager;
 mod engine;
@@ -13,8 +13,8 @@ mod runtime;
 mod track;
 mod weights;
 
-pub use asked::Control;
 pub use card::{TokensCard, TokensNetworks, TokensProvenance};
+pub use constraints::Control;
 pub use control::{Steering, steer};
 pub use engine::TokenEngine;
 pub use networks::{

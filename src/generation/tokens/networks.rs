@@ -1,4 +1,4 @@
-//! What motion by tokens needs of whatever runs the networks: the interpreter that trains them, or onnxruntime.
+//! The networks of motion by tokens, which the interpreter that trains them runs, or onnxruntime.
 
 use ndarray::{Array3, ArrayView2, ArrayView3};
 
@@ -18,19 +18,19 @@ pub trait TokenizerNetworks: Sync {
     /// `motion`: normalised, \[n, T, 25\]
     ///
     /// # Errors
-    /// What the runtime says.
+    /// Errors of the runtime.
     fn encode(&self, motion: ArrayView3<f32>) -> Result<Vec<u32>, EngineError>;
 
     /// Returns the signal of the tokens of n windows of so many frames, \[n, frames, d\].
     ///
     /// # Errors
-    /// A token that the codebook does not have, and what the runtime says.
+    /// A token that the codebook does not have, and errors of the runtime.
     fn signal(&self, tokens: &[u32], windows: (usize, usize)) -> Result<Array3<f32>, EngineError>;
 
     /// Estimates clean motion of step t, normalised, \[n, T, 25\].
     ///
     /// # Errors
-    /// Shapes that do not fit, and what the runtime says.
+    /// Shapes that do not fit, and errors of the runtime.
     fn denoise(
         &self,
         x: ArrayView3<f32>,
@@ -47,20 +47,20 @@ pub trait TokenizerNetworks: Sync {
     }
 }
 
-/// What a planner is told of a window before it is asked for tokens.
+/// The conditions of a window that is planned.
 #[derive(Clone, Copy, Debug)]
 pub struct PlanWindow<'a> {
     /// Features as the table has them, then the clock of a network that hears it, \[T, condition_dim\].
     pub condition: ArrayView2<'a, f32>,
     /// Normalised style, for a network that takes one.
     pub style: Option<[f32; STYLE_DIM]>,
-    /// What is asked of its motion, for a network that takes constraints, \[T, 12\]; nothing where absent.
+    /// Constraints on its motion, for a network that takes them, \[T, 12\]; none where absent.
     pub constraints: Option<ArrayView2<'a, f32>>,
-    /// For each answer that is wanted, what is withheld.
+    /// The conditions that each answer goes without; one answer for each.
     pub withheld: &'a [WithheldConditions],
 }
 
-/// The conditions of which an answer knows nothing.
+/// The conditions that an answer goes without, for guidance.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct WithheldConditions {
     pub music: bool,
@@ -79,10 +79,10 @@ pub trait PlannerNetworks: Sync {
     /// Returns the name that flags and tables use.
     fn name(&self) -> &'static str;
 
-    /// Begins a plan: what the window hears is computed once.
+    /// Begins a plan: the conditions of the window are computed once.
     ///
     /// # Errors
-    /// Shapes that do not fit, and what the runtime says.
+    /// Shapes that do not fit, and errors of the runtime.
     fn begin<'a>(&'a self, window: &PlanWindow) -> Result<Box<dyn WindowPlan + 'a>, EngineError>;
 }
 
@@ -94,6 +94,6 @@ pub trait WindowPlan {
     /// behind the tokens, \[answers · K\]; from one call to the next tokens only come to those before.
     ///
     /// # Errors
-    /// A token that does not exist, and what the runtime says.
+    /// A token that does not exist, and errors of the runtime.
     fn logits(&mut self, tokens: &[u32]) -> Result<Vec<f32>, EngineError>;
 }

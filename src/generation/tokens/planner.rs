@@ -17,19 +17,19 @@ use crate::motion::style::STYLE_DIM;
 pub struct PlannerEngine {
     config: PlannerConfig,
     networks: Box<dyn PlannerNetworks + Send>,
-    /// Whether the tokens of a plan come in an order of chance.
+    /// Whether the tokens of a plan are shuffled.
     is_shuffled: bool,
 }
 
-/// A window whose tokens are asked for.
+/// A window to plan.
 #[derive(Clone, Copy, Debug)]
 pub struct PlanRequest<'a> {
     /// Features as the table has them, then the clock of a network that hears it, \[T, condition_dim\].
     pub condition: ArrayView2<'a, f32>,
     /// Normalised style, for a network that takes one.
     pub style: Option<[f32; STYLE_DIM]>,
-    /// What is asked of the motion, \[T, 12\] (`AskedPose::channels`), of a planner that takes it; none where nothing
-    /// is asked.
+    /// Constraints on the motion, \[T, 12\] (`PoseConstraint::channels`), of a planner that takes them; none where there
+    /// are none.
     pub constraints: Option<ArrayView2<'a, f32>>,
     /// The first tokens, where they are known.
     pub given: &'a [u32],
@@ -71,8 +71,8 @@ impl PlannerEngine {
         Self { config: config.clone(), networks, is_shuffled: false }
     }
 
-    /// Puts the tokens of every plan, but for those that are given, in an order of chance: what such motion still has
-    /// is owed to which tokens there are, and not to where they stand.
+    /// Shuffles the tokens of every plan, but for those that are given: a baseline that keeps which tokens there are, and
+    /// loses their order.
     #[must_use]
     pub fn with_shuffled_plans(self) -> Self {
         Self { is_shuffled: true, ..self }
@@ -116,7 +116,7 @@ impl PlannerEngine {
         let (codes, n) = (self.config.codes, self.config.n_tokens(condition.nrows()));
         let first = PLANS + request.window * DRAWS_OF_A_WINDOW;
         let stream = |draw: usize| Stream::new(request.seed, first + draw as u64);
-        // What is said is c of everything, u of what is left without one condition, or both: u + s (c − u). With two
+        // The guided logits are u + s (c − u), c with all conditions and u without one of them. With two
         // conditions either is withheld by chance, each as often (paper, eq. 10 and 11); with one it is the music.
         let constraints = request.constraints.filter(|_| self.config.constraint_dim > 0);
         let is_constrained = constraints.is_some();
@@ -176,7 +176,7 @@ impl PlannerEngine {
     }
 }
 
-/// Puts tokens in an order of chance, each as likely (Fisher and Yates).
+/// Shuffles tokens, every order as likely (Fisher and Yates).
 pub fn shuffle(tokens: &mut [u32], stream: Stream) {
     let mut numbers = vec![0.0_f64; tokens.len()];
     stream.uniform(0, &mut numbers);

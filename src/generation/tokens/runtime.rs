@@ -57,7 +57,7 @@ impl OnnxTokenizer {
     /// Loads the files of a model in a folder.
     ///
     /// # Errors
-    /// What onnxruntime says of a file, or inputs and outputs that are not those of a model.
+    /// Errors of onnxruntime about a file, or inputs and outputs that are not those of a model.
     pub fn open(
         runtime: &Runtime,
         folder: &Path,
@@ -135,7 +135,7 @@ impl TokenizerNetworks for OnnxTokenizer {
     }
 }
 
-/// A planner: the whole network, or, of one that plans token by token, what it hears and its steps.
+/// A planner: the whole network, or, of one that plans token by token, its conditions and its steps.
 pub struct OnnxPlanner {
     config: PlannerConfig,
     sessions: PlannerSessions,
@@ -160,7 +160,7 @@ impl OnnxPlanner {
     /// Loads the files of a model in a folder.
     ///
     /// # Errors
-    /// What onnxruntime says of a file, or inputs and outputs that are not those of a model.
+    /// Errors of onnxruntime about a file, or inputs and outputs that are not those of a model.
     pub fn open(
         runtime: &Runtime,
         folder: &Path,
@@ -197,7 +197,7 @@ impl OnnxPlanner {
         Ok(Self { config: config.clone(), sessions })
     }
 
-    /// Returns what a window hears as inputs, the same for each answer.
+    /// Returns the conditions of a window as inputs, the same for each answer.
     fn heard(&self, window: &PlanWindow) -> Vec<NamedTensor<'static>> {
         let (n, frames) = (window.withheld.len(), window.condition.nrows());
         let columns = |range: std::ops::Range<usize>| -> Vec<f32> {
@@ -289,7 +289,7 @@ struct SteppedPlan<'a> {
 impl WindowPlan for SteppedPlan<'_> {
     fn logits(&mut self, tokens: &[u32]) -> Result<Vec<f32>, EngineError> {
         let (n, codes) = (self.n_answers, self.of.config.codes);
-        // The token that is asked for stands behind those that are known; any will do.
+        // The next token stands behind those that are known; its value is not read.
         let seen = [tokens, &[0]].concat();
         let (shape, numbers) = std::mem::take(&mut self.past);
         let n_new = seen.len() - shape[1];

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use ndarray::{Array2, Array3, ArrayView3};
 
-use super::asked::Control;
+use super::constraints::Control;
 use super::eager::{EagerPlanner, EagerTokenizer};
 use super::networks::{
     PlanWindow, PlannerNetworks, TokenizerNetworks, WindowPlan, WithheldConditions,

@@ -10,7 +10,7 @@ use std::ops::Range;
 
 use ndarray::{Array2, Array3, ArrayView2, Axis, s};
 
-use super::asked::{Control, asked_of_window};
+use super::constraints::{Control, window_constraints};
 use super::control::{Steering, steer};
 use super::engine::TokenEngine;
 use super::planner::{PlanRequest, PlannerEngine};
@@ -48,7 +48,7 @@ pub struct TokenTrack<'a> {
     pub phase: Option<&'a [f64]>,
     /// Normalised style, for a planner that takes one.
     pub style: Option<[f32; STYLE_DIM]>,
-    /// What the motion must do; the strength is the length of a step of the descent.
+    /// Constraints; the strength is the length of a step of the descent.
     pub constraints: Option<WeightedConstraints<'a>>,
     /// Where they act.
     pub control: Control,
@@ -166,7 +166,7 @@ impl TokenGenerator<'_> {
         let asked = track
             .constraints
             .filter(|_| track.control.plans())
-            .and_then(|of| asked_of_window(of.constraints, &frames, place, normalizer));
+            .and_then(|of| window_constraints(of.constraints, &frames, place, normalizer));
         let request = PlanRequest {
             constraints: asked.as_ref().map(|asked| asked.view()),
             condition: track.condition.slice(s![frames.clone(), ..]),
@@ -222,7 +222,7 @@ impl TokenGenerator<'_> {
     }
 }
 
-/// Gives frames, the first of which is frame `first` of a track, the phase of its music, where that is known.
+/// Writes the phase of the music, where that is known, into frames, the first of which is frame `first` of a track.
 fn set_phase(frames: &mut Array2<f32>, phase: Option<&[f64]>, first: usize) {
     if let Some(phase) = phase {
         let column = frames.column_mut(Channel::Phase.range().start);

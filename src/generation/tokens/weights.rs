@@ -18,7 +18,7 @@ const OF_TOKENIZER: [(&str, ModelFileName); 5] = [
 /// Returns the parameters of the tokenizer and of the planner; `read` gives a file and what messages call it.
 ///
 /// # Errors
-/// What `read` says, and a file that lacks a weight or has one of another size.
+/// Errors of `read`, and a file that lacks a weight or has one of another size.
 pub fn tokens_parameters<E: From<OnnxError>>(
     card: &TokensCard,
     read: impl Fn(ModelFileName) -> Result<(Model, String), E>,

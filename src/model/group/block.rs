@@ -11,7 +11,7 @@ const EPSILON: f64 = 1e-8;
 
 /// Local decoder layer → global attention → group modulation.
 ///
-/// h̃ = S(w) ⊙ (h − μ) / √(σ² + ε) + b(w), μ and σ² of each channel over all frames of all dancers who are there
+/// h̃ = S(w) ⊙ (h − μ) / √(σ² + ε) + b(w), μ and σ² of each channel over all frames of all dancers of the group
 /// (paper, eq. 7); \[S, b\] = linear(w), without the 1 of FiLM.
 #[derive(Clone, Debug)]
 pub struct GroupBlock {
@@ -39,7 +39,7 @@ impl GroupBlock {
     /// # Shapes
     /// - `h`: \[B, N T, d\]; `token`: \[B, d\] or \[B, 1, d\], of the number of dancers; `w`: \[B, d\]
     /// - `x`: the motion with its dancers in the batch, \[B N, T, …\]; `context`: \[B, d\]
-    /// - `masks`: dancers who are there, \[B, N T\], and the same with two tokens before them
+    /// - `masks`: 1 for dancers of the group, 0 for empty places, \[B, N T\], and the same with two tokens before them
     /// - returns \[B, N T, d\] and the token, \[B, 1, d\]
     pub fn forward<G: Graph>(
         &self,

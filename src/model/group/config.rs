@@ -33,7 +33,7 @@ pub struct GroupConfig {
     pub audio_cond_dim: usize,
     /// Whether the clock of the music is given beside its features.
     pub clock: bool,
-    /// Whether the music is added to the frames that hear it, too; the reference knows attention alone.
+    /// Whether the music is also added to the frames of its time; the reference has attention alone.
     pub add_audio: bool,
     /// Most dancers of a group in training; larger groups take the embedding of this number.
     pub max_dancers: usize,
@@ -69,7 +69,7 @@ impl GroupConfig {
         })
     }
 
-    /// Returns what the networks hear of the music.
+    /// Returns the condition that the networks take: features, and the clock.
     pub fn condition(&self) -> ConditionConfig {
         ConditionConfig { audio_cond_dim: self.audio_cond_dim, clock: self.clock }
     }

@@ -156,7 +156,7 @@ pub struct CrossAttention {
     dropout: f64,
 }
 
-/// What motion attends to.
+/// The memory of cross-attention.
 pub struct Memory<T> {
     /// Music, normalised, \[B, T, d\].
     pub music: T,

@@ -91,11 +91,11 @@ pub struct GroupInputs<'a, T> {
     pub number: &'a T,
     /// Noise of the group embedding, standard normal, \[B, d\].
     pub z: &'a T,
-    /// Dancers who are there, \[B, N T\], 1 or 0; all where absent.
+    /// 1 for dancers of the group, 0 for empty places, \[B, N T\]; all are dancers where absent.
     pub mask: Option<&'a T>,
 }
 
-/// What a denoiser says.
+/// The outputs of a denoiser.
 pub struct GroupPrediction<T> {
     /// Clean motion, normalised, \[B N, T, motion_dim\].
     pub x0: T,
@@ -103,7 +103,7 @@ pub struct GroupPrediction<T> {
     pub w: T,
 }
 
-/// Sinusoids of the step → 4 d → mish → what is asked for.
+/// Sinusoids of the step → 4 d → mish → the width that is given.
 #[derive(Clone, Debug)]
 struct StepEmbedding {
     table: Arc<Array2<f64>>,

@@ -46,13 +46,13 @@ pub struct GroupScoreInputs<'a, T> {
     pub w: &'a T,
     /// Row of the number of dancers, \[B\].
     pub number: &'a T,
-    /// Dancers who are there, \[B, N ⌈T / patch⌉\], 1 or 0; all where absent.
+    /// 1 for dancers of the group, 0 for empty places, \[B, N ⌈T / patch⌉\]; all are dancers where absent.
     pub mask: Option<&'a T>,
     /// The same for each dancer, \[B, N\].
     pub there: Option<&'a T>,
 }
 
-/// What a score says of B groups.
+/// The scores of B groups.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GroupScores<T> {
     /// log f, \[B, 1\].

@@ -8,7 +8,7 @@ use crate::model::graph::{Activation, Convolution, Graph, Result};
 use crate::model::layers::Conv1d;
 use crate::model::parameter::Scope;
 
-/// How much farther a residual block sees than the one behind it.
+/// Ratio of the dilations of a residual block and of the one behind it.
 const DILATION_GROWTH: usize = 3;
 
 /// x + conv₁(ReLU(conv₃(ReLU(x)))), the first with a dilation.
@@ -81,7 +81,7 @@ impl From<&TokensConfig> for EncoderConfig {
     }
 }
 
-/// E: frames to latents, one for ρ of them; of motion, or of the music that a planner hears.
+/// E: frames to latents, one for ρ of them; of motion, or of the music that conditions a planner.
 #[derive(Clone, Debug)]
 pub struct Encoder {
     first: Conv1d,

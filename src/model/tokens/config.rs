@@ -58,7 +58,7 @@ impl TokensConfig {
         })
     }
 
-    /// Returns how many frames a convolution of the denoiser sees: fewer tokens need less of what is around them.
+    /// Returns how many frames a convolution of the denoiser sees: fewer tokens need fewer neighbouring frames.
     pub fn usual_taps(frames_per_token: usize) -> usize {
         if frames_per_token <= 2 { 7 } else { 5 }
     }

@@ -14,8 +14,8 @@ pub use self::coder::{Encoder, SignalDecoder};
 pub use self::config::TokensConfig;
 pub use self::denoiser::SignalDenoiser;
 pub use self::planner::{
-    AskedPose, CONSTRAINT_DIM, ConditionInputs, KeysAndValues, PlanConditions, Planner,
-    PlannerConfig, PlannerInputs, PlannerKind, PlannerStep, PlannerStepInputs,
+    CONSTRAINT_DIM, ConditionInputs, KeysAndValues, PlanConditions, Planner, PlannerConfig,
+    PlannerInputs, PlannerKind, PlannerStep, PlannerStepInputs, PoseConstraint,
 };
 use super::graph::{Graph, Result};
 use super::layers::Linear;

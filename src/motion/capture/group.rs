@@ -138,9 +138,9 @@ fn joined(
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::post;
-    use super::super::{convert_capture, convert_track};
     use super::*;
+    use crate::motion::capture::tests::post;
+    use crate::motion::capture::{convert_capture, convert_track};
     use crate::motion::quaternion::from_axis_angle;
 
     /// A body at 60 Hz that walks along +Z at 0.5 m/s from a place, upright, or lying on its side.

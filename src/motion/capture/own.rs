@@ -8,7 +8,7 @@ use crate::motion::exchange::{END_SITE_CM, ROOT_NAME};
 /// Metres of a unit that this program writes.
 pub const OWN_UNIT_M: f64 = 0.01;
 
-/// Returns whether a take is one of [`super::super::exchange::write_bvh`].
+/// Returns whether a take is one of [`crate::motion::exchange::write_bvh`].
 pub fn is_own(bvh: &Bvh) -> bool {
     use JointChannel::{Position, Rotation};
     let [root, end] = bvh.joints() else { return false };

@@ -248,7 +248,7 @@ pub fn tilt(q: Quaternion) -> Quaternion {
     let (w, y) = (q[0] / norm, q[2] / norm);
     // The turn about +Y, inverted, times the whole.
     let back = [w, 0.0, -y, 0.0];
-    normalize(super::super::quaternion::mul(back, q))
+    normalize(crate::motion::quaternion::mul(back, q))
 }
 
 fn mean(vectors: impl Iterator<Item = [f64; 3]>) -> [f64; 3] {

@@ -26,7 +26,7 @@ pub struct BeatGrid {
 impl BeatGrid {
     /// Lays the grid over `0..=end_s`.
     ///
-    /// Beats are counted from the first downbeat, as [`super::super::phase::bar_phase`] counts them.
+    /// Beats are counted from the first downbeat, as [`crate::motion::phase::bar_phase`] counts them.
     pub fn over(beats: &Beats, end_s: f64) -> Self {
         let times_s = beats.times_s();
         let interval_s = 60.0 / beats.tempo_bpm();

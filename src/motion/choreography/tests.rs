@@ -50,14 +50,14 @@ pub(super) fn repertoire() -> Repertoire {
 }
 
 /// A song of steady beats whose loudness swells and falls every 12 s.
-pub(super) struct Music {
+pub(super) struct SteadySong {
     pub(super) beats: Beats,
     rms: Vec<f32>,
     onset_strength: Vec<f32>,
     pub(super) times_s: Vec<f64>,
 }
 
-impl Music {
+impl SteadySong {
     pub(super) fn new(tempo_bpm: f64, beats_per_bar: u32, duration_s: f64) -> Self {
         let n_beats = (duration_s * tempo_bpm / 60.0) as usize;
         let beat_s = |i: usize| 0.31 + i as f64 * 60.0 / tempo_bpm;
@@ -108,7 +108,7 @@ pub(super) const SONGS: [(f64, u32); 5] =
 fn vertical_velocity_is_locked_to_the_bar_and_to_no_other_tempo() {
     let repertoire = repertoire();
     for (tempo_bpm, beats_per_bar) in SONGS {
-        let music = Music::new(tempo_bpm, beats_per_bar, 60.0);
+        let music = SteadySong::new(tempo_bpm, beats_per_bar, 60.0);
         let dance = choreograph(&music.song(), &repertoire, 11);
         let velocity_y = column(&dance.frames, 4);
         let locked = bar_locking(&velocity_y, &column(&dance.frames, 16));
@@ -132,7 +132,7 @@ fn vertical_velocity_is_locked_to_the_bar_and_to_no_other_tempo() {
 fn energy_follows_the_activity_of_the_song() {
     let repertoire = repertoire();
     for (tempo_bpm, beats_per_bar) in SONGS {
-        let music = Music::new(tempo_bpm, beats_per_bar, 60.0);
+        let music = SteadySong::new(tempo_bpm, beats_per_bar, 60.0);
         let song = music.song();
         let dance = choreograph(&song, &repertoire, 3);
         let energy = accent::energy(
@@ -149,7 +149,7 @@ fn energy_follows_the_activity_of_the_song() {
 fn steps_follow_each_other_on_beats_at_allowed_rates() {
     let repertoire = repertoire();
     for (tempo_bpm, beats_per_bar) in SONGS {
-        let music = Music::new(tempo_bpm, beats_per_bar, 30.0);
+        let music = SteadySong::new(tempo_bpm, beats_per_bar, 30.0);
         let song = music.song();
         let dance = choreograph(&song, &repertoire, 0);
         let grid = song.grid();
@@ -177,7 +177,7 @@ fn steps_follow_each_other_on_beats_at_allowed_rates() {
 
 #[test]
 fn accents_fall_on_beats() {
-    let music = Music::new(104.0, 4, 60.0);
+    let music = SteadySong::new(104.0, 4, 60.0);
     let dance = choreograph(&music.song(), &repertoire(), 2);
     // The bar's rise and fall is no part of an accent.
     let effort: Vec<f64> = vectors(&dance.frames, Channel::Velocity)
@@ -201,7 +201,7 @@ fn accents_fall_on_beats() {
 fn every_frame_obeys_the_identities_and_moves_as_people_do() {
     let repertoire = repertoire();
     for (tempo_bpm, beats_per_bar) in SONGS {
-        let music = Music::new(tempo_bpm, beats_per_bar, 40.0);
+        let music = SteadySong::new(tempo_bpm, beats_per_bar, 40.0);
         let dance = choreograph(&music.song(), &repertoire, 9).frames;
         check_identities(&dance, &music);
         let is_on_floor =
@@ -216,7 +216,7 @@ fn every_frame_obeys_the_identities_and_moves_as_people_do() {
 }
 
 /// Asserts that a dance keeps to the limits, that its derivatives are those of its poses, and its phase the music's.
-pub(super) fn check_identities(dance: &Array2<f32>, music: &Music) {
+pub(super) fn check_identities(dance: &Array2<f32>, music: &SteadySong) {
     Trajectory::new(dance.clone()).unwrap().check(&ChannelLimits::Wide).unwrap();
     let x = dance.mapv(f64::from);
     for t in 0..x.nrows() - 1 {
@@ -240,7 +240,7 @@ pub(super) fn check_identities(dance: &Array2<f32>, music: &Music) {
 
 #[test]
 fn a_dance_is_the_same_for_one_seed_and_another_for_the_next() {
-    let (music, repertoire) = (Music::new(120.5, 4, 20.0), repertoire());
+    let (music, repertoire) = (SteadySong::new(120.5, 4, 20.0), repertoire());
     let song = music.song();
     let dance = |seed| choreograph(&song, &repertoire, seed);
     assert_eq!(dance(1), dance(1));
@@ -250,7 +250,7 @@ fn a_dance_is_the_same_for_one_seed_and_another_for_the_next() {
 
 #[test]
 fn phrases_begin_over_the_origin_and_face_forward() {
-    let music = Music::new(120.5, 4, 20.0);
+    let music = SteadySong::new(120.5, 4, 20.0);
     let dance = choreograph(&music.song(), &repertoire(), 1).frames;
     assert_eq!(dance.nrows(), 600);
     let starts: Vec<usize> = (0..n_phrases(600, 120, 60)).map(|k| 60 * k).collect();
@@ -277,7 +277,7 @@ fn phrases_begin_over_the_origin_and_face_forward() {
 
 #[test]
 fn without_a_fitting_primitive_the_body_rests() {
-    let music = Music::new(100.0, 4, 10.0);
+    let music = SteadySong::new(100.0, 4, 10.0);
     let dance = choreograph(&music.song(), &Repertoire::new(), 5);
     assert!(dance.steps.iter().all(|step| step.primitive.is_none() && step.n_beats == 1));
     let x = &dance.frames;

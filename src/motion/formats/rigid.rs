@@ -129,8 +129,8 @@ fn width_of(rotations: &NpyArray<f64>, positions: &[usize]) -> Option<usize> {
 mod tests {
     use std::io::Cursor;
 
-    use super::super::super::npz::NpzWriter;
     use super::*;
+    use crate::motion::npz::NpzWriter;
 
     type Member<'a> = (&'a str, &'a [usize], Vec<f64>);
 

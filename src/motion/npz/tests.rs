@@ -3,8 +3,8 @@ use std::io::Write;
 use proptest::prelude::*;
 use zip::{ZipWriter, write::SimpleFileOptions};
 
-use super::super::npy::write;
 use super::*;
+use crate::motion::npy::write;
 
 fn archive(members: &[(&str, &[u8])], method: CompressionMethod) -> Vec<u8> {
     let mut writer = ZipWriter::new(Cursor::new(Vec::new()));

@@ -1,9 +1,9 @@
 //! Where voices meet: levels, ducking, equalisation, room, saturation, noise.
 
-use super::super::score::{Score, SectionKind, Voice};
 use super::filter::{Noise, OnePole, decay, gain};
 use super::{RATE_HZ, onset_sample};
 use crate::chance::Chance;
+use crate::music::score::{Score, SectionKind, Voice};
 
 /// Voices that are mixed together.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

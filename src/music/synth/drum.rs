@@ -2,11 +2,11 @@
 
 use std::collections::BTreeMap;
 
-use super::super::score::{Note, Score, Voice};
 use super::RATE_HZ;
 use super::filter::{Noise, OnePole, decay, gain, pitch_hz};
 use super::wave::{phase_step, sine};
 use crate::chance::Chance;
+use crate::music::score::{Note, Score, Voice};
 
 /// Longest sound of a drum, in seconds.
 const LONGEST_S: f64 = 1.6;

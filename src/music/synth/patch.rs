@@ -1,8 +1,8 @@
 //! The timbre of a tonal voice, drawn for every song.
 
-use super::super::score::Voice;
 use super::wave::Wave;
 use crate::chance::Chance;
+use crate::music::score::Voice;
 
 /// Where a tone's vibration comes from.
 #[derive(Clone, Debug)]

@@ -1,10 +1,10 @@
 //! A tone: vibration, filter, envelope.
 
-use super::super::score::Note;
 use super::RATE_HZ;
 use super::filter::{Noise, OnePole, decay, pitch_hz};
 use super::patch::{Patch, Timbre};
 use super::wave::{Table, phase_step, sine};
+use crate::music::score::Note;
 
 /// Level at which a released tone ends.
 const SILENT: f32 = 2e-4;

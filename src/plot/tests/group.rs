@@ -70,11 +70,11 @@ fn text_touches_neither_text_nor_the_edge() {
 fn groups_become_pictures_and_nobody_none() {
     let group = walkers(3, 31);
     let plot = GroupPlot { title: "trio", group: group.view() };
-    let picture = super::super::group(&plot, 640, Format::Png).expect("a picture");
+    let picture = crate::plot::group(&plot, 640, Format::Png).expect("a picture");
     let (width, height) = (picture.width_px, picture.height_px);
     assert_eq!(width, 1280);
     assert!(height > 720 && decode(&picture.bytes).0 == 1280);
-    let svg = super::super::group(&plot, 640, Format::Svg).expect("a picture");
+    let svg = crate::plot::group(&plot, 640, Format::Svg).expect("a picture");
     assert!(svg.bytes.starts_with(b"<svg"));
     for shape in [(0, 31, 25), (3, 0, 25), (3, 31, 24)] {
         let group = Array3::zeros(shape);

@@ -21,7 +21,7 @@ use crate::motion::group::RADIUS_M;
 use crate::motion::{Channel, bar_phase};
 use crate::training::Split;
 use crate::units::frames_to_s;
-use made_up::{Place, copied, independent, placed, places};
+use made_up::{FloorPoint, copied, independent, placed, places};
 
 /// Frames of a window, unless groups have fewer: 8 s, the least span of one kind of unison.
 const WINDOW_FRAMES: usize = 240;
@@ -64,7 +64,7 @@ pub(super) struct GroupMeasurer {
     windows: BTreeMap<(&'static str, Subject), Vec<GroupWindow>>,
     sampled: Vec<SampledGroup>,
     /// Where the dancers of a group stood for whom soloists were sampled, by phrase and first frame.
-    places: BTreeMap<(String, usize), Vec<Place>>,
+    places: BTreeMap<(String, usize), Vec<FloorPoint>>,
     /// Dancers of groups before, the latest last, and their songs.
     strangers: Vec<(usize, Array2<f32>)>,
     /// The music of the group before of another song.

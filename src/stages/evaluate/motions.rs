@@ -9,7 +9,7 @@ use ndarray::ArrayView2;
 use super::foreign;
 use crate::audio::BLOCKS;
 use crate::evaluation::locking::since_start;
-use crate::evaluation::metrics::Music;
+use crate::evaluation::metrics::PhraseMusic;
 use crate::motion::choreography::activity;
 use crate::motion::phase::unwrapped;
 use crate::motion::{Beats, bar_phase};
@@ -195,12 +195,12 @@ impl PhraseIndex {
     }
 
     /// Returns the music of `n_frames` frames of a phrase, from its beats; none for too few of them.
-    pub fn music(&self, phrase_id: &str, n_frames: usize) -> Option<Music> {
+    pub fn music(&self, phrase_id: &str, n_frames: usize) -> Option<PhraseMusic> {
         let row = self.rows.get(phrase_id)?;
         let beats = self.beats.get(phrase_id)?.in_bars(row)?;
         let times_s: Vec<f64> = (0..n_frames).map(frames_to_s).collect();
         let bars = unwrapped(&bar_phase(&times_s, &beats));
-        Some(Music {
+        Some(PhraseMusic {
             beats_s: beats.times_s().to_vec(),
             bars: since_start(&bars, self.start_frames(phrase_id)),
             beats_per_bar: beats.beats_per_bar(),
@@ -216,13 +216,13 @@ impl PhraseIndex {
 
     /// Returns the music of a phrase with real motion; where its beats are not numbered, its bars are known by the
     /// motion's own phase alone.
-    pub fn music_of_real(&self, phrase_id: &str, phase: &[f64]) -> Option<Music> {
+    pub fn music_of_real(&self, phrase_id: &str, phase: &[f64]) -> Option<PhraseMusic> {
         let from_beats = self.music(phrase_id, phase.len())?;
         if self.beats.get(phrase_id).is_some_and(PhraseBeats::is_numbered) {
             return Some(from_beats);
         }
         let bars = since_start(&unwrapped(phase), self.start_frames(phrase_id));
-        Some(Music { bars, is_of_motion: true, ..from_beats })
+        Some(PhraseMusic { bars, is_of_motion: true, ..from_beats })
     }
 
     fn activity(&self, row: &PhraseRow, n_frames: usize) -> Option<Vec<f64>> {

@@ -11,8 +11,8 @@ use super::splits::{ALL, MusicSplit};
 use crate::evaluation::WindowMeasures;
 use crate::evaluation::coupling::Coupling;
 use crate::evaluation::metrics::{
-    MotionContext, MotionWindow, Music, MusicContext, MusicWindow, N_WRONG_TEMPI, Number,
-    PhaseOrigin, channel_numbers, motion_numbers, music_numbers, phase_numbers, shifted_numbers,
+    MotionContext, MotionWindow, MusicContext, MusicWindow, N_WRONG_TEMPI, Number, PhaseOrigin,
+    PhraseMusic, channel_numbers, motion_numbers, music_numbers, phase_numbers, shifted_numbers,
     soundness_numbers,
 };
 use crate::evaluation::reference_statistics::ReferenceStatistics;
@@ -92,7 +92,7 @@ pub struct MeasuredWindow {
     pub measured: Arc<WindowMeasures>,
     /// The same window as it was decoded; none where that is not known.
     pub decoded: Option<Arc<WindowMeasures>>,
-    pub music: Option<Arc<Music>>,
+    pub music: Option<Arc<PhraseMusic>>,
 }
 
 impl MeasuredWindow {
@@ -167,7 +167,7 @@ impl MeasureSettings<'_> {
     ///
     /// The coupling is that with up to eight other songs; all else is with the next song. Nothing for a single song.
     pub fn shuffled(&self, items: &[&MeasuredWindow]) -> Vec<Number> {
-        let mut songs: BTreeMap<usize, &Arc<Music>> = BTreeMap::new();
+        let mut songs: BTreeMap<usize, &Arc<PhraseMusic>> = BTreeMap::new();
         for item in items {
             if let Some(music) = &item.music {
                 let known = songs.entry(item.song).or_insert(music);
@@ -181,11 +181,14 @@ impl MeasureSettings<'_> {
         if numbers.len() < 2 {
             return Vec::new();
         }
-        let other = |item: &MeasuredWindow, step: usize| -> Option<&Music> {
+        let other = |item: &MeasuredWindow, step: usize| -> Option<&PhraseMusic> {
             let place = numbers.iter().position(|song| *song == item.song)?;
             songs.get(&numbers[(place + step) % numbers.len()]).map(|music| &***music)
         };
-        fn danced_to<'a>(item: &'a MeasuredWindow, music: Option<&'a Music>) -> MotionWindow<'a> {
+        fn danced_to<'a>(
+            item: &'a MeasuredWindow,
+            music: Option<&'a PhraseMusic>,
+        ) -> MotionWindow<'a> {
             let n = item.measured.n_frames;
             let music = music.filter(|_| item.music.is_some()).and_then(|music| {
                 // Music that is shorter begins again.

@@ -90,7 +90,7 @@ struct Original<'a> {
 /// Runs the stage on the tokenizer of a run.
 ///
 /// # Errors
-/// What the store says, a run without a tokenizer, and a store without real motion that it did not learn from.
+/// Errors of the store, a run without a tokenizer, and a store without real motion that it did not learn from.
 pub fn run(
     params: &Params,
     store: &Location,

@@ -1,9 +1,11 @@
 //! A model held against the interpreter that trained it, on real music.
 
 use std::num::NonZeroUsize;
+use std::path::Path;
 use std::time::Instant;
 
 use anyhow::{Context as _, bail};
+use bytes::Bytes;
 use ndarray::{Array3, ArrayView3, Axis, s};
 
 use super::Params;
@@ -11,11 +13,12 @@ use super::files::ExportedFiles;
 use crate::autodiff::{Parameters, Stream};
 use crate::diffusion::{Sampler, SamplerConfig, Schedule, Spacing};
 use crate::generation::{
-    EagerEngine, Engine, EngineInputs, OnnxEngine, Sampling, SessionPlan, file_names, sample,
+    EagerEngine, Engine, EngineInputs, ModelCard, ModelFileName, OnnxEngine, Sampling, SessionPlan,
+    file_names, sample,
 };
 use crate::model::{MotionDecoder, Parameter, ParameterList, UNet1D, condition};
 use crate::motion::MOTION_DIM;
-use crate::onnx::{Device, Model, Runtime, Storage, values_of};
+use crate::onnx::{Device, Model, Runtime, Session, SessionOptions, Storage, values_of};
 use crate::stages::Progress;
 use crate::stages::trained::TrainedRun;
 use crate::store::tables::OnnxCheckRow;
@@ -45,7 +48,7 @@ pub struct ExportChecks<'a> {
     pub dataset: &'a Dataset,
     pub params: &'a Params,
     pub trained: &'a TrainedRun,
-    pub files: &'a ExportedFiles,
+    pub files: &'a ExportedFiles<ModelCard>,
 }
 
 /// The results of the checks.
@@ -96,6 +99,68 @@ pub(super) fn difference<'a>(
     Difference { max_abs, rms: (squares / f64::from(n.max(1))).sqrt() }
 }
 
+/// Returns the row of a check of so many samples and frames, without times and runtime.
+pub(super) fn check_row(
+    params: &Params,
+    check: &str,
+    (n_samples, n_frames): (usize, usize),
+    difference: Difference,
+    tolerance: f64,
+) -> OnnxCheckRow {
+    OnnxCheckRow {
+        model: params.model.clone(),
+        run: params.run.clone(),
+        check: check.to_owned(),
+        precision: params.precision.name().to_owned(),
+        n_samples: n_samples as i32,
+        n_frames: n_frames as i32,
+        n_steps: None,
+        guidance: None,
+        max_abs: difference.max_abs,
+        rms: difference.rms,
+        tolerance,
+        // NaN is not within any tolerance.
+        passed: difference.max_abs <= tolerance,
+        onnx_s: None,
+        eager_s: 0.0,
+        runtime: String::new(),
+        time: TimestampUs::now(),
+    }
+}
+
+/// Writes files into a folder.
+fn write_into(folder: &Path, files: &[(ModelFileName, Bytes)]) -> anyhow::Result<()> {
+    for (name, bytes) in files {
+        let path = folder.join(name.name());
+        write_file(&path, |out| out.write_all(bytes))
+            .with_context(|| format!("while writing {}", path.display()))?;
+    }
+    Ok(())
+}
+
+/// Opens each file of a model by itself, with all threads and as the file has it.
+///
+/// # Errors
+/// When a file cannot be written, or the runtime refuses it.
+pub(super) fn sessions(
+    files: &[(ModelFileName, Bytes)],
+    params: &Params,
+    runtime: &Runtime,
+) -> anyhow::Result<Vec<Session>> {
+    let folder = tempfile::tempdir().context("while making a temporary folder")?;
+    write_into(folder.path(), files)?;
+    let options = SessionOptions {
+        n_threads: params.machine.threads.get(),
+        is_alone: true,
+        device: Device::Cpu,
+        is_optimized: false,
+    };
+    let open = |(name, _): &(ModelFileName, Bytes)| {
+        Ok(Session::open(runtime, &folder.path().join(name.name()), options)?)
+    };
+    files.iter().map(open).collect()
+}
+
 /// A batch that both engines are asked about.
 struct Case {
     n_samples: usize,
@@ -110,11 +175,7 @@ impl ExportChecks<'_> {
     pub fn run(&self, runtime: &Runtime, progress: &dyn Progress) -> anyhow::Result<CheckResults> {
         let machine = &self.params.machine;
         let folder = tempfile::tempdir().context("while making a temporary folder")?;
-        for (name, bytes) in &self.files.bytes {
-            let path = folder.path().join(name.name());
-            write_file(&path, |out| out.write_all(bytes))
-                .with_context(|| format!("while writing {}", path.display()))?;
-        }
+        write_into(folder.path(), &self.files.bytes)?;
         let network = &self.trained.state.config.network;
         let plan =
             SessionPlan { n_workers: 1, n_threads: machine.threads.get(), device: Device::Cpu };
@@ -233,25 +294,8 @@ impl ExportChecks<'_> {
     }
 
     fn row(&self, check: &str, case: &Case, difference: Difference) -> OnnxCheckRow {
-        OnnxCheckRow {
-            model: self.params.model.clone(),
-            run: self.params.run.clone(),
-            check: check.to_owned(),
-            precision: self.params.precision.name().to_owned(),
-            n_samples: case.n_samples as i32,
-            n_frames: case.n_frames as i32,
-            n_steps: None,
-            guidance: None,
-            max_abs: difference.max_abs,
-            rms: difference.rms,
-            tolerance: FORWARD_TOLERANCE,
-            // NaN is not within any tolerance.
-            passed: difference.max_abs <= FORWARD_TOLERANCE,
-            onnx_s: None,
-            eager_s: 0.0,
-            runtime: String::new(),
-            time: TimestampUs::now(),
-        }
+        let shape = (case.n_samples, case.n_frames);
+        check_row(self.params, check, shape, difference, FORWARD_TOLERANCE)
     }
 
     fn forward(

@@ -5,23 +5,14 @@ use std::collections::BTreeMap;
 use bytes::Bytes;
 use serde::Serialize;
 
-use super::Params;
 use crate::autodiff::Parameters;
 use crate::diffusion::{DiffusionConfig, Schedule};
-use crate::generation::{
-    FamilyCard as _, FileEntry, LearnedFrom, MODEL_FORMAT, ModelCard, ModelFileName, Networks,
-    Provenance, SamplingDefaults, SharedFields, own_channels, own_features,
-};
-use crate::model::{Family, ParameterId};
-use crate::motion::rates::MotionRange;
-use crate::motion::style_name::NamedStyles;
-use crate::onnx::{EncodedModel, Form, Graph, Model, ModelFile, OnnxError, check, decoder, unet};
+use crate::generation::{FileEntry, ModelFileName, SharedFields};
+use crate::onnx::{EncodedModel, Graph, Model, ModelFile, OnnxError, check};
 use crate::stages::model_files::{sha256, sha256_of};
-use crate::stages::trained::TrainedRun;
-use crate::units::FPS;
 
 /// A model that is not yet anywhere.
-pub struct ExportedFiles<C = ModelCard> {
+pub struct ExportedFiles<C> {
     pub card: C,
     pub card_text: Bytes,
     /// Name and content, in the order in which they are written.
@@ -102,93 +93,7 @@ impl<C: Serialize> ExportedFiles<C> {
     }
 }
 
-impl ExportedFiles {
-    /// Writes the networks of a run down, and checks them against the rules of the format.
-    ///
-    /// # Errors
-    /// A network that cannot be written, or one that breaks a rule.
-    pub fn make(
-        trained: &TrainedRun,
-        params: &Params,
-        (range, styles, sampling): (Option<MotionRange>, NamedStyles, Option<SamplingDefaults>),
-        learned_from: Option<LearnedFrom>,
-    ) -> anyhow::Result<Self> {
-        let config = &trained.state.config.network;
-        let scales = &trained.state.scales;
-        let storage = params.precision;
-        let unet_weights = |id: ParameterId| trained.unet.parameters.unpacked(id);
-        let decoder_weights = |id: ParameterId| trained.decoder.parameters.unpacked(id);
-        let weights_sha256 = Networks {
-            unet: weights_sha256(&trained.unet.parameters),
-            decoder: weights_sha256(&trained.decoder.parameters),
-        };
-        let mut card = ModelCard {
-            format: MODEL_FORMAT,
-            family: Family::Unet,
-            name: params.model.clone(),
-            program: program(),
-            provenance: Provenance {
-                run: params.run.clone(),
-                stage: trained.stage.to_owned(),
-                unet_step: trained.unet.step,
-                decoder_step: trained.decoder.step,
-                validation_loss: trained.loss,
-                data: trained.state.data.clone(),
-                learned_from,
-            },
-            precision: storage,
-            unet: config.unet.clone(),
-            decoder: config.decoder.clone(),
-            diffusion: config.diffusion.clone(),
-            alphas_cumprod: alphas_cumprod(&config.diffusion)?,
-            n_parameters: Networks {
-                unet: trained.unet.parameters.list().n_elements(),
-                decoder: trained.decoder.parameters.list().n_elements(),
-            },
-            weights_sha256,
-            window_frames: config.window_frames,
-            fps: FPS,
-            channels: own_channels(),
-            features: own_features(),
-            normalizer: scales.motion.clone(),
-            feature_scale: scales.features.clone(),
-            motion_range: range,
-            styles,
-            sampling,
-            licence: params.licence.clone(),
-            files: Vec::new(),
-        };
-        let weights_beside = |name| Some((name, params.embed_mb.saturating_mul(1_000_000)));
-        let own = [
-            ("stage", card.provenance.stage.clone()),
-            ("unet", serde_json::to_string(&card.unet)?),
-            ("decoder", serde_json::to_string(&card.decoder)?),
-        ];
-        let networks = vec![
-            NetworkFile {
-                graph: unet(
-                    &config.unet,
-                    &unet_weights,
-                    &scales.features,
-                    Form::default(),
-                    storage,
-                )?,
-                name: ModelFileName::Unet,
-                weights_sha256: &card.weights_sha256.unet,
-                weights_beside: weights_beside(ModelFileName::UnetWeights),
-            },
-            NetworkFile {
-                graph: decoder(&config.decoder, &decoder_weights, storage)?,
-                name: ModelFileName::Decoder,
-                weights_sha256: &card.weights_sha256.decoder,
-                weights_beside: weights_beside(ModelFileName::DecoderWeights),
-            },
-        ];
-        let bytes = encode(networks, card.shared(), &own)?;
-        card.files = entries(&bytes);
-        Self::new(card, bytes)
-    }
-
+impl<C> ExportedFiles<C> {
     /// Returns the content of a file.
     pub fn get(&self, name: &str) -> Option<&Bytes> {
         self.bytes.iter().find(|(known, _)| known.name() == name).map(|(_, bytes)| bytes)

@@ -1,142 +1,52 @@
 //! A run of the family `group` becomes a model: a denoiser and a score, checked through onnxruntime.
 
 mod checks;
-mod summary;
 
 use std::num::NonZeroUsize;
 
 use anyhow::Context as _;
 use bytes::Bytes;
 
+use super::Params;
+use super::checks::CheckResults;
+use super::family::{CardMeasures, FamilyExport};
 use super::files::{
     ExportedFiles, NetworkFile, alphas_cumprod, encode, entries, program, weights_sha256,
 };
-use super::{Export, MAX_TRAIN_PHRASES, Params, motion_range, put_in_place, tuning};
+use super::tuning::group_sampling_defaults;
 use crate::autodiff::Parameters;
 use crate::generation::{
-    FamilyCard as _, GroupCard, GroupEngine, GroupProvenance, MODEL_FORMAT, ModelFileName,
-    own_channels, own_features,
+    FamilyCard as _, GroupCard, GroupEngine, GroupProvenance, LearnedFrom, MODEL_FORMAT,
+    ModelFileName, SamplingDefaults, own_channels, own_features,
 };
 use crate::model::{Family, GroupNetworks, ParameterId, ParameterList};
-use crate::onnx::{group_denoiser, group_score};
-use crate::stages::learned;
-use crate::stages::model_files::folder_of;
-use crate::stages::train::session::{ProgressWatch, read_phrases};
+use crate::onnx::{Runtime, group_denoiser, group_score};
 use crate::stages::trained::{has_best, read_best};
-use crate::stages::{Progress, Stage as _, Summary};
+use crate::stages::{Progress, learned};
 use crate::store::Location;
 use crate::training::{
-    CheckpointKind, Checkpoints, GROUP, GroupLearner, GroupTrainConfig, Learner as _, State,
-    TrainingError,
+    CheckpointKind, Checkpoints, Dataset, GROUP, GroupLearner, GroupTrainConfig, Learner as _,
+    State, TrainingError,
 };
 use crate::units::FPS;
 use checks::checks;
-use summary::GroupExportSummary;
 
-/// Returns whether a run is one of the family `group`.
-///
-/// # Errors
-/// When the store cannot be listed.
-pub fn is_of_group(store: &Location, run: &str) -> anyhow::Result<bool> {
-    Ok(has_best(store, run, GroupLearner::STAGE)?)
-}
-
-/// Runs the stage.
-///
-/// # Errors
-/// What export says of a run of any family.
-pub fn run(
-    params: &Params,
-    store: &Location,
-    progress: &dyn Progress,
-) -> anyhow::Result<Box<dyn Summary>> {
-    let trained = TrainedGroup::read(store, &params.run)?;
-    let machine = &params.machine;
-    let watch = ProgressWatch(progress);
-    let (most, is_dry_run) = (Some(MAX_TRAIN_PHRASES), params.dry_run);
-    let phrases = read_phrases(
-        store,
-        Export::NAME,
-        (machine, Family::Group),
-        most,
-        progress,
-        &watch,
-        is_dry_run,
-    )?;
-    let data = &trained.state.data;
-    let learned_from = learned::of_group(store, &params.run, data, machine, progress, is_dry_run)?;
-    let network = &trained.state.config.network;
-    let scales = &trained.state.scales;
-    let engine = GroupEngine::new(
-        &network.group,
-        trained.parameters.clone(),
-        &scales.features,
-        (NonZeroUsize::MIN, machine.threads),
-    )
-    .context("while starting threads")?;
-    let dataset = &phrases.dataset;
-    let sampling =
-        tuning::group_sampling_defaults(&engine, network, &scales.motion, dataset, progress)?;
-    drop(engine);
-    let range = motion_range(dataset)?;
-    let mut card = GroupCard {
-        format: MODEL_FORMAT,
-        family: Family::Group,
-        name: params.model.clone(),
-        program: program(),
-        provenance: GroupProvenance {
-            run: params.run.clone(),
-            step: trained.step,
-            validation_loss: trained.state.progress.best.map(|best| best.loss),
-            data: data.clone(),
-            learned_from,
-        },
-        precision: params.precision,
-        group: network.group.clone(),
-        diffusion: network.diffusion.clone(),
-        alphas_cumprod: alphas_cumprod(&network.diffusion)?,
-        n_parameters: trained.parameters.list().n_elements(),
-        weights_sha256: weights_sha256(&trained.parameters),
-        window_frames: network.window_frames,
-        fps: FPS,
-        channels: own_channels(),
-        features: own_features(),
-        normalizer: scales.motion.clone(),
-        feature_scale: scales.features.clone(),
-        motion_range: range,
-        sampling,
-        licence: params.licence.clone(),
-        files: Vec::new(),
-    };
-    let bytes = files(&trained, params, &card)?;
-    card.files = entries(&bytes);
-    let files = ExportedFiles::new(card, bytes)?;
-    let place = store.url_of(&folder_of(&params.model));
-    let summary = |is_up_to_date, checks| {
-        let (card, place) = (files.card.clone(), place.clone());
-        Box::new(GroupExportSummary { card, place, checks, is_up_to_date, is_dry_run })
-    };
-    if is_dry_run {
-        return Ok(summary(false, Vec::new()));
-    }
-    let results =
-        put_in_place(params, store, (&files.bytes, &files.card_text), progress, |runtime| {
-            checks(&trained, params, &files.bytes, runtime)
-        })?;
-    Ok(match results {
-        Some(results) => summary(false, results.rows),
-        None => summary(true, Vec::new()),
-    })
-}
-
-/// A run that was trained.
-struct TrainedGroup {
+/// A run of the family `group` that was trained.
+pub struct TrainedGroup {
     state: State<GroupTrainConfig>,
     parameters: Parameters<f32>,
     step: u64,
 }
 
 impl TrainedGroup {
+    /// Returns whether a run is one of the family `group`.
+    ///
+    /// # Errors
+    /// When the store cannot be listed.
+    pub fn is_of(store: &Location, run: &str) -> anyhow::Result<bool> {
+        Ok(has_best(store, run, GroupLearner::STAGE)?)
+    }
+
     fn read(store: &Location, run: &str) -> Result<Self, TrainingError> {
         let checkpoints = Checkpoints::new(store, run, GroupLearner::STAGE);
         let Some(&step) = checkpoints.steps(CheckpointKind::Best)?.last() else {
@@ -156,6 +66,95 @@ impl TrainedGroup {
         let found = all.find(|(_, p)| GroupNetworks::own_name(&p.name) == (is_denoiser, name));
         let (id, _) = found.expect("invariant: both networks are in the list");
         self.parameters.unpacked(id)
+    }
+}
+
+impl FamilyExport for TrainedGroup {
+    type Card = GroupCard;
+
+    const FAMILY: Family = Family::Group;
+
+    fn of_run(store: &Location, params: &Params) -> anyhow::Result<Self> {
+        Ok(Self::read(store, &params.run)?)
+    }
+
+    fn learned_from(
+        &self,
+        store: &Location,
+        params: &Params,
+        progress: &dyn Progress,
+    ) -> anyhow::Result<Option<LearnedFrom>> {
+        let Params { run, machine, dry_run, .. } = params;
+        learned::of_group(store, run, &self.state.data, machine, progress, *dry_run)
+    }
+
+    fn sampling(
+        &self,
+        dataset: &Dataset,
+        params: &Params,
+        progress: &dyn Progress,
+    ) -> anyhow::Result<Option<SamplingDefaults>> {
+        let network = &self.state.config.network;
+        let scales = &self.state.scales;
+        let engine = GroupEngine::new(
+            &network.group,
+            self.parameters.clone(),
+            &scales.features,
+            (NonZeroUsize::MIN, params.machine.threads),
+        )
+        .context("while starting threads")?;
+        group_sampling_defaults(&engine, network, &scales.motion, dataset, progress)
+    }
+
+    fn files(
+        &mut self,
+        params: &Params,
+        CardMeasures { learned_from, motion_range, sampling, .. }: CardMeasures,
+    ) -> anyhow::Result<ExportedFiles<GroupCard>> {
+        let network = &self.state.config.network;
+        let scales = &self.state.scales;
+        let mut card = GroupCard {
+            format: MODEL_FORMAT,
+            family: Family::Group,
+            name: params.model.clone(),
+            program: program(),
+            provenance: GroupProvenance {
+                run: params.run.clone(),
+                step: self.step,
+                validation_loss: self.state.progress.best.map(|best| best.loss),
+                data: self.state.data.clone(),
+                learned_from,
+            },
+            precision: params.precision,
+            group: network.group.clone(),
+            diffusion: network.diffusion.clone(),
+            alphas_cumprod: alphas_cumprod(&network.diffusion)?,
+            n_parameters: self.parameters.list().n_elements(),
+            weights_sha256: weights_sha256(&self.parameters),
+            window_frames: network.window_frames,
+            fps: FPS,
+            channels: own_channels(),
+            features: own_features(),
+            normalizer: scales.motion.clone(),
+            feature_scale: scales.features.clone(),
+            motion_range,
+            sampling,
+            licence: params.licence.clone(),
+            files: Vec::new(),
+        };
+        let bytes = files(self, params, &card)?;
+        card.files = entries(&bytes);
+        ExportedFiles::new(card, bytes)
+    }
+
+    fn checks(
+        &self,
+        files: &ExportedFiles<GroupCard>,
+        _dataset: &Dataset,
+        params: &Params,
+        (runtime, _): (&Runtime, &dyn Progress),
+    ) -> anyhow::Result<CheckResults> {
+        checks(self, params, &files.bytes, runtime)
     }
 }
 

@@ -1,28 +1,28 @@
 //! `export`: a trained run becomes a model: two ONNX files that were checked, and what they say of themselves.
 
 mod checks;
+mod family;
 mod files;
 mod group;
 mod report;
 mod tokens;
 mod tuning;
+mod unet;
 
 use std::path::PathBuf;
 
 use anyhow::{bail, ensure};
 use bytes::Bytes;
 
-use self::checks::{CheckResults, ExportChecks, eager};
-use self::files::ExportedFiles;
+use self::checks::CheckResults;
 pub(in crate::stages) use self::files::weights_sha256;
-use self::report::{ExportDryRun, ExportSummary};
-use super::learned;
+use self::group::TrainedGroup;
+use self::tokens::TrainedTokens;
 use super::model_files::{POINTER, current_folder, folder_of, is_model_name, pointer_to, sha256};
-use super::train::session::{MachineParams, ProgressWatch, check_run_name, read_phrases};
+use super::train::session::{MachineParams, check_run_name};
 use super::trained::{TrainedPlanner, TrainedRun, TrainedTokenizer, WeightsChoice};
 use super::{ClientParams, Contract, Progress, RARE, Stage, Summary, lease};
 use crate::generation::{ModelFileName, file_names};
-use crate::model::Family;
 use crate::motion::rates::MotionRange;
 use crate::motion::style_name::{NamedStyles, StyleMeans};
 use crate::onnx::{Runtime, Storage};
@@ -87,7 +87,7 @@ impl Stage for Export {
     const ABOUT: &'static str = "write a trained run as ONNX files, checked through onnxruntime";
     const CONTRACT: Contract = Contract {
         reads: "runs/<run>/, phrases, motion, features",
-        writes: "models/<model>/ (unet.onnx, decoder.onnx, model.json), onnx_checks",
+        writes: "models/<model>/ (.onnx files, model.json), onnx_checks",
     };
     type Params = Params;
 
@@ -95,11 +95,11 @@ impl Stage for Export {
         check_run_name(&params.run)?;
         check_model_name(&params.model)?;
         let store = Location::open(&params.store, &params.client.options())?;
-        if group::is_of_group(&store, &params.run)? {
-            return group::run(&params, &store, progress);
+        if TrainedGroup::is_of(&store, &params.run)? {
+            return family::run::<TrainedGroup>(&params, &store, progress);
         }
         if TrainedPlanner::is_of(&store, &params.run)? {
-            return tokens::run(&params, &store, progress);
+            return family::run::<TrainedTokens>(&params, &store, progress);
         }
         ensure!(
             !TrainedTokenizer::is_of(&store, &params.run)?,
@@ -107,58 +107,7 @@ impl Stage for Export {
              --family tokens --tokenizer {run} --run NAME) and export that run",
             run = params.run
         );
-        let mut trained = TrainedRun::read(&store, &params.run, params.weights)?;
-        let machine = &params.machine;
-        let watch = ProgressWatch(progress);
-        let (most, is_dry_run) = (Some(MAX_TRAIN_PHRASES), params.dry_run);
-        let phrases = read_phrases(
-            &store,
-            Self::NAME,
-            (machine, Family::Unet),
-            most,
-            progress,
-            &watch,
-            is_dry_run,
-        )?;
-        let learned_from =
-            learned::of_run(&store, &params.run, &trained, machine, progress, is_dry_run)?;
-        if learned_from.is_none() {
-            progress.note(&format!(
-                "run {} does not tell what it learned from, and the phrases of {store} are others by now: the \
-                 model's card will not tell either, and evaluate will hold no music for held out",
-                params.run
-            ));
-        }
-        let network = &trained.state.config.network;
-        let (unet, decoder) = (&trained.unet.parameters, &trained.decoder.parameters);
-        let engine = eager(&trained, (unet.clone(), decoder.clone()), machine.threads)?;
-        let sampling = tuning::sampling_defaults(&engine, network, &phrases.dataset, progress)?;
-        drop(engine);
-        let styles = named_styles(&phrases.dataset, network.unet.style_dim)?;
-        // In training its heads speak for themselves, and by what they were measured to leave they are fused.
-        trained.state.config.network.decoder.fusion = sampling
-            .as_ref()
-            .filter(|_| !params.no_fusion)
-            .map(|sampling| sampling.fusion_variances);
-        let measured = (motion_range(&phrases.dataset)?, styles, sampling);
-        let files = ExportedFiles::make(&trained, &params, measured, learned_from)?;
-        if params.dry_run {
-            return Ok(Box::new(ExportDryRun::new(&params, &files, &store)));
-        }
-        let checking = ExportChecks {
-            dataset: &phrases.dataset,
-            params: &params,
-            trained: &trained,
-            files: &files,
-        };
-        let model = (&files.bytes[..], &files.card_text);
-        let results = put_in_place(&params, &store, model, progress, |runtime| {
-            checking.run(runtime, progress)
-        })?;
-        Ok(Box::new(match results {
-            Some(results) => ExportSummary::written(&params, &store, &files, results),
-            None => ExportSummary::up_to_date(&params, &store, &files),
-        }))
+        family::run::<TrainedRun>(&params, &store, progress)
     }
 }
 
@@ -295,6 +244,7 @@ fn record(
 
 #[cfg(all(test, feature = "pretrained"))]
 mod tests {
+    use super::files::ExportedFiles;
     use super::*;
     use crate::generation::{FamilyCard as _, ModelCard};
     use crate::stages::pretrained::ShippedModel;
@@ -303,7 +253,7 @@ mod tests {
     const NAMES: [&str; 2] = [file_names::UNET, file_names::DECODER];
 
     /// Files of a model that all say `version`.
-    fn files(version: usize) -> ExportedFiles {
+    fn files(version: usize) -> ExportedFiles<ModelCard> {
         let card = ShippedModel::Soloist.file(file_names::CARD).expect("the model that ships");
         let card = ModelCard::read(&card, "card").expect("a card");
         let text = |name: &str| format!("{name} of {version}").into();
@@ -330,7 +280,7 @@ mod tests {
         Some(found)
     }
 
-    fn published(store: &Location, files: &ExportedFiles) -> Result<(), StoreError> {
+    fn published(store: &Location, files: &ExportedFiles<ModelCard>) -> Result<(), StoreError> {
         publish(store, "m", (&files.bytes, &files.card_text))
     }
 

@@ -2,48 +2,108 @@
 
 use std::io::{self, Write};
 
-use serde_json::json;
+use serde::Serialize;
+use serde_json::{Value, json};
 
-use super::Params;
-use super::checks::{CheckResults, ROUNDING};
-use super::files::ExportedFiles;
-use crate::generation::{FileEntry, ModelCard};
+use super::checks::ROUNDING;
+use crate::generation::{
+    FamilyCard, FileEntry, GroupCard, GroupProvenance, ModelCard, TokensCard, TokensProvenance,
+};
 use crate::stages::Summary;
-use crate::stages::model_files::folder_of;
-use crate::store::Location;
 use crate::store::tables::OnnxCheckRow;
 
-/// The account of an export.
-pub struct ExportSummary {
-    card: ModelCard,
-    place: String,
-    checks: Vec<OnnxCheckRow>,
-    is_up_to_date: bool,
-}
+/// What the account of an export tells of a card of one family.
+pub trait ExportedCard: FamilyCard + Serialize + Clone + Send {
+    /// Returns the number of parameters, for a sentence.
+    fn parameters(&self) -> String;
 
-impl ExportSummary {
-    pub fn written(
-        params: &Params,
-        store: &Location,
-        files: &ExportedFiles,
-        results: CheckResults,
-    ) -> Self {
-        Self {
-            checks: results.rows,
-            is_up_to_date: false,
-            ..Self::up_to_date(params, store, files)
-        }
+    /// Returns where the weights come from, for a sentence that begins with `of run`.
+    fn origin(&self) -> String;
+
+    /// Returns where the weights come from and of which kind they are, for the last line of the account.
+    fn kind_and_origin(&self) -> String {
+        self.origin()
     }
 
-    /// A model that is there already, made of the same weights in the same way.
-    pub fn up_to_date(params: &Params, store: &Location, files: &ExportedFiles) -> Self {
-        let place = store.url_of(&folder_of(&params.model));
-        Self { card: files.card.clone(), place, checks: Vec::new(), is_up_to_date: true }
+    /// Returns figures beside those of every family.
+    fn figures(&self) -> Vec<(&'static str, Value)> {
+        Vec::new()
+    }
+}
+
+impl ExportedCard for ModelCard {
+    fn parameters(&self) -> String {
+        format!("{} and {}", self.n_parameters.unet, self.n_parameters.decoder)
+    }
+
+    fn origin(&self) -> String {
+        let from = &self.provenance;
+        format!("{} ({}, step {})", from.run, from.stage, from.unet_step)
+    }
+}
+
+impl ExportedCard for GroupCard {
+    fn parameters(&self) -> String {
+        self.n_parameters.to_string()
+    }
+
+    fn origin(&self) -> String {
+        let GroupProvenance { run, step, .. } = &self.provenance;
+        format!("{run} (step {step})")
+    }
+
+    fn kind_and_origin(&self) -> String {
+        let GroupProvenance { run, step, .. } = &self.provenance;
+        format!("{run} (family {}, step {step})", self.family.name())
+    }
+}
+
+impl ExportedCard for TokensCard {
+    fn parameters(&self) -> String {
+        (self.n_parameters.tokenizer + self.n_parameters.planner).to_string()
+    }
+
+    fn origin(&self) -> String {
+        let TokensProvenance { run, tokenizer, step, .. } = &self.provenance;
+        format!("{run} (step {step}) and its tokenizer {tokenizer}")
+    }
+
+    fn kind_and_origin(&self) -> String {
+        let TokensProvenance { run, tokenizer, step, .. } = &self.provenance;
+        format!(
+            "{run} (family {}, {}, step {step}) and its tokenizer {tokenizer}",
+            self.family.name(),
+            self.planner.kind.name()
+        )
+    }
+
+    fn figures(&self) -> Vec<(&'static str, Value)> {
+        vec![
+            ("tokenizer", self.provenance.tokenizer.clone().into()),
+            ("planner", self.planner.kind.name().into()),
+        ]
+    }
+}
+
+/// The account of an export.
+pub struct ExportSummary<C> {
+    card: C,
+    place: String,
+    pub checks: Vec<OnnxCheckRow>,
+    /// The model was there already, made of the same weights in the same way.
+    pub is_up_to_date: bool,
+    pub is_dry_run: bool,
+}
+
+impl<C> ExportSummary<C> {
+    /// Begins the account of a model that goes to a place.
+    pub fn new(card: C, place: String) -> Self {
+        Self { card, place, checks: Vec::new(), is_up_to_date: false, is_dry_run: false }
     }
 }
 
 /// Writes the table of checks; nothing where there are none.
-pub(super) fn write_checks(out: &mut dyn Write, checks: &[OnnxCheckRow]) -> io::Result<()> {
+fn write_checks(out: &mut dyn Write, checks: &[OnnxCheckRow]) -> io::Result<()> {
     if !checks.is_empty() {
         writeln!(
             out,
@@ -71,7 +131,7 @@ pub(super) fn write_checks(out: &mut dyn Write, checks: &[OnnxCheckRow]) -> io::
 }
 
 /// Writes a line for each file of a model.
-pub(super) fn write_files(out: &mut dyn Write, files: &[FileEntry]) -> io::Result<()> {
+fn write_files(out: &mut dyn Write, files: &[FileEntry]) -> io::Result<()> {
     for file in files {
         let mb = file.n_bytes as f64 / 1e6;
         writeln!(out, "  {:<20} {mb:>8.1} MB  {}", file.name, &file.sha256[..16])?;
@@ -80,37 +140,35 @@ pub(super) fn write_files(out: &mut dyn Write, files: &[FileEntry]) -> io::Resul
 }
 
 /// Returns the names and sizes of files, for a sentence.
-pub(super) fn sizes(files: &[FileEntry]) -> String {
+fn sizes(files: &[FileEntry]) -> String {
     let size = |file: &FileEntry| format!("{} ({:.1} MB)", file.name, file.n_bytes as f64 / 1e6);
     files.iter().map(size).collect::<Vec<_>>().join(" and ")
 }
 
 /// Returns the files of a model as programs see them.
-pub(super) fn file_figures(files: &[FileEntry]) -> Vec<serde_json::Value> {
+fn file_figures(files: &[FileEntry]) -> Vec<serde_json::Value> {
     let figures = |file: &FileEntry| json!({ "name": file.name, "n_bytes": file.n_bytes, "sha256": file.sha256 });
     files.iter().map(figures).collect()
 }
 
-impl Summary for ExportSummary {
+impl<C: ExportedCard> Summary for ExportSummary<C> {
     fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        let Self { card, place, checks, is_up_to_date } = self;
+        let Self { card, place, checks, is_up_to_date, is_dry_run } = self;
+        let fields = card.shared();
+        if *is_dry_run {
+            let (sizes, origin) = (sizes(fields.files), card.origin());
+            return writeln!(out, "would check and write {sizes} of run {origin} to {place}");
+        }
         write_checks(out, checks)?;
+        let note = if *is_up_to_date { ", up to date" } else { "" };
+        writeln!(out, "model {}{note} → {place}", fields.name)?;
+        write_files(out, fields.files)?;
         writeln!(
             out,
-            "model {}{} → {place}",
-            card.name,
-            if *is_up_to_date { ", up to date" } else { "" }
-        )?;
-        write_files(out, &card.files)?;
-        writeln!(
-            out,
-            "  {} and {} parameters, {}, of run {} ({}, step {})",
-            card.n_parameters.unet,
-            card.n_parameters.decoder,
-            card.precision.name(),
-            card.provenance.run,
-            card.provenance.stage,
-            card.provenance.unet_step
+            "  {} parameters, {}, of run {}",
+            card.parameters(),
+            fields.precision.name(),
+            card.kind_and_origin()
         )
     }
 
@@ -118,58 +176,31 @@ impl Summary for ExportSummary {
         0
     }
 
-    fn figures(&mut self) -> serde_json::Value {
-        let mut figures = of_card(&self.card, &self.place);
-        figures["is_up_to_date"] = self.is_up_to_date.into();
-        figures["n_checks"] = self.checks.len().into();
-        figures
-    }
-}
-
-/// Returns what is told of a model in either case.
-fn of_card(card: &ModelCard, place: &str) -> serde_json::Value {
-    json!({
-        "model": card.name,
-        "to": place,
-        "run": card.provenance.run,
-        "precision": card.precision.name(),
-        "files": file_figures(&card.files),
-    })
-}
-
-/// The summary of a dry run.
-pub struct ExportDryRun {
-    place: String,
-    card: ModelCard,
-}
-
-impl ExportDryRun {
-    pub fn new(params: &Params, files: &ExportedFiles, store: &Location) -> Self {
-        Self { place: store.url_of(&folder_of(&params.model)), card: files.card.clone() }
-    }
-}
-
-impl Summary for ExportDryRun {
-    fn write(&mut self, out: &mut dyn Write) -> io::Result<()> {
-        let provenance = &self.card.provenance;
-        writeln!(
-            out,
-            "would check and write {} of run {} ({}, step {}) to {}",
-            sizes(&self.card.files),
-            provenance.run,
-            provenance.stage,
-            provenance.unet_step,
-            self.place
-        )
-    }
-
-    fn n_failed(&self) -> u64 {
-        0
-    }
-
-    fn figures(&mut self) -> serde_json::Value {
-        let mut figures = of_card(&self.card, &self.place);
-        figures["dry_run"] = true.into();
+    fn figures(&mut self) -> Value {
+        let Self { card, place, checks, is_up_to_date, is_dry_run } = self;
+        let fields = card.shared();
+        // Figures of the family unet are those of release 0.1.
+        let is_unet = C::FAMILY.is_unet();
+        let mut figures = json!({ "model": fields.name });
+        if !is_unet {
+            figures["family"] = C::FAMILY.name().into();
+        }
+        figures["to"] = place.as_str().into();
+        figures["run"] = fields.run.into();
+        for (name, value) in card.figures() {
+            figures[name] = value;
+        }
+        figures["precision"] = fields.precision.name().into();
+        figures["files"] = file_figures(fields.files).into();
+        if !is_unet || !*is_dry_run {
+            figures["is_up_to_date"] = (*is_up_to_date).into();
+        }
+        if !is_unet || *is_dry_run {
+            figures["dry_run"] = (*is_dry_run).into();
+        }
+        if !is_unet || !*is_dry_run {
+            figures["n_checks"] = checks.len().into();
+        }
         figures
     }
 }

@@ -2,7 +2,6 @@
 //! onnxruntime.
 
 mod checks;
-mod summary;
 mod tuning;
 
 use std::num::NonZeroUsize;
@@ -10,27 +9,26 @@ use std::num::NonZeroUsize;
 use anyhow::{Context as _, ensure};
 use bytes::Bytes;
 
+use super::Params;
+use super::checks::CheckResults;
+use super::family::{CardMeasures, FamilyExport};
 use super::files::{
     ExportedFiles, NetworkFile, alphas_cumprod, encode, entries, program, weights_sha256,
 };
-use super::{Export, MAX_TRAIN_PHRASES, Params, motion_range, named_styles, put_in_place};
 use crate::generation::{
-    FamilyCard as _, MODEL_FORMAT, ModelFileName, PlannerEngine, TokenEngine, TokensCard,
-    TokensNetworks, TokensProvenance, own_channels, own_features,
+    FamilyCard as _, LearnedFrom, MODEL_FORMAT, ModelFileName, PlannerEngine, SamplingDefaults,
+    TokenEngine, TokensCard, TokensNetworks, TokensProvenance, own_channels, own_features,
 };
 use crate::model::{Family, ParameterId, PlannerKind};
 use crate::onnx::{
-    planner, planner_music, planner_step, token_denoiser, token_encoder, token_signal,
+    Runtime, planner, planner_music, planner_step, token_denoiser, token_encoder, token_signal,
 };
-use crate::stages::learned;
-use crate::stages::model_files::folder_of;
-use crate::stages::train::session::{ProgressWatch, read_phrases};
 use crate::stages::trained::{TrainedPlanner, TrainedTokenizer};
-use crate::stages::{Progress, Stage as _, Summary};
+use crate::stages::{Progress, learned};
 use crate::store::Location;
+use crate::training::Dataset;
 use crate::units::FPS;
 use checks::checks;
-use summary::TokensExportSummary;
 
 /// A planner and the tokenizer that it was trained with.
 pub struct TrainedTokens {
@@ -64,96 +62,104 @@ impl TrainedTokens {
     }
 }
 
-/// Runs the stage.
-///
-/// # Errors
-/// What export says of a run of any family.
-pub fn run(
-    params: &Params,
-    store: &Location,
-    progress: &dyn Progress,
-) -> anyhow::Result<Box<dyn Summary>> {
-    let trained = TrainedTokens::read(store, &params.run)?;
-    let machine = &params.machine;
-    let watch = ProgressWatch(progress);
-    let (most, is_dry_run) = (Some(MAX_TRAIN_PHRASES), params.dry_run);
-    let phrases = read_phrases(
-        store,
-        Export::NAME,
-        (machine, Family::Tokens),
-        most,
-        progress,
-        &watch,
-        is_dry_run,
-    )?;
-    let TrainedTokens { tokenizer, planner } = &trained;
-    let config = &planner.state.config;
-    let runs = [
-        (params.run.as_str(), planner.state.data.as_str()),
-        (config.tokenizer.run.as_str(), tokenizer.state.data.as_str()),
-    ];
-    let learned_from = learned::of_planner(store, runs, machine, progress, is_dry_run)?;
-    let dataset = &phrases.dataset;
-    let sampling = tuning::sampling_defaults(&trained, machine.threads, dataset, progress)?;
-    let network = &tokenizer.state.config.network;
-    let scales = &planner.state.scales;
-    let mut card = TokensCard {
-        format: MODEL_FORMAT,
-        family: Family::Tokens,
-        name: params.model.clone(),
-        program: program(),
-        provenance: TokensProvenance {
-            run: params.run.clone(),
-            tokenizer: config.tokenizer.run.clone(),
-            step: planner.step,
-            validation_loss: planner.state.progress.best.map(|best| best.loss),
-            data: planner.state.data.clone(),
-            learned_from,
-        },
-        precision: params.precision,
-        tokens: network.tokens.clone(),
-        planner: config.network.planner.clone(),
-        diffusion: network.diffusion.clone(),
-        alphas_cumprod: alphas_cumprod(&network.diffusion)?,
-        n_parameters: TokensNetworks {
-            tokenizer: tokenizer.parameters.list().n_elements(),
-            planner: planner.parameters.list().n_elements(),
-        },
-        weights_sha256: TokensNetworks {
-            tokenizer: config.tokenizer.weights_sha256.clone(),
-            planner: weights_sha256(&planner.parameters),
-        },
-        window_frames: network.window_frames,
-        fps: FPS,
-        channels: own_channels(),
-        features: own_features(),
-        normalizer: scales.motion.clone(),
-        feature_scale: scales.features.clone(),
-        motion_range: motion_range(dataset)?,
-        styles: named_styles(dataset, config.network.planner.style_dim)?,
-        sampling,
-        licence: params.licence.clone(),
-        files: Vec::new(),
-    };
-    let bytes = files(&trained, params, &card)?;
-    card.files = entries(&bytes);
-    let files = ExportedFiles::new(card, bytes)?;
-    let place = store.url_of(&folder_of(&params.model));
-    let summary = |is_up_to_date, checks| {
-        let (card, place) = (files.card.clone(), place.clone());
-        Box::new(TokensExportSummary { card, place, checks, is_up_to_date, is_dry_run })
-    };
-    if is_dry_run {
-        return Ok(summary(false, Vec::new()));
+impl FamilyExport for TrainedTokens {
+    type Card = TokensCard;
+
+    const FAMILY: Family = Family::Tokens;
+
+    fn of_run(store: &Location, params: &Params) -> anyhow::Result<Self> {
+        Self::read(store, &params.run)
     }
-    let results =
-        put_in_place(params, store, (&files.bytes, &files.card_text), progress, |runtime| {
-            checks(&files.card, params, &files.bytes, runtime)
-        })?;
-    Ok(match results {
-        Some(results) => summary(false, results.rows),
-        None => summary(true, Vec::new()),
-    })
+
+    fn learned_from(
+        &self,
+        store: &Location,
+        params: &Params,
+        progress: &dyn Progress,
+    ) -> anyhow::Result<Option<LearnedFrom>> {
+        let Params { run, machine, dry_run, .. } = params;
+        let (planner, tokenizer) = (&self.planner.state, &self.tokenizer.state);
+        let runs = [
+            (run.as_str(), planner.data.as_str()),
+            (planner.config.tokenizer.run.as_str(), tokenizer.data.as_str()),
+        ];
+        learned::of_planner(store, runs, machine, progress, *dry_run)
+    }
+
+    fn style_dim(&self) -> usize {
+        self.planner.state.config.network.planner.style_dim
+    }
+
+    fn sampling(
+        &self,
+        dataset: &Dataset,
+        params: &Params,
+        progress: &dyn Progress,
+    ) -> anyhow::Result<Option<SamplingDefaults>> {
+        tuning::sampling_defaults(self, params.machine.threads, dataset, progress)
+    }
+
+    fn files(
+        &mut self,
+        params: &Params,
+        CardMeasures { learned_from, motion_range, styles, sampling }: CardMeasures,
+    ) -> anyhow::Result<ExportedFiles<TokensCard>> {
+        let Self { tokenizer, planner } = &*self;
+        let config = &planner.state.config;
+        let network = &tokenizer.state.config.network;
+        let scales = &planner.state.scales;
+        let mut card = TokensCard {
+            format: MODEL_FORMAT,
+            family: Family::Tokens,
+            name: params.model.clone(),
+            program: program(),
+            provenance: TokensProvenance {
+                run: params.run.clone(),
+                tokenizer: config.tokenizer.run.clone(),
+                step: planner.step,
+                validation_loss: planner.state.progress.best.map(|best| best.loss),
+                data: planner.state.data.clone(),
+                learned_from,
+            },
+            precision: params.precision,
+            tokens: network.tokens.clone(),
+            planner: config.network.planner.clone(),
+            diffusion: network.diffusion.clone(),
+            alphas_cumprod: alphas_cumprod(&network.diffusion)?,
+            n_parameters: TokensNetworks {
+                tokenizer: tokenizer.parameters.list().n_elements(),
+                planner: planner.parameters.list().n_elements(),
+            },
+            weights_sha256: TokensNetworks {
+                tokenizer: config.tokenizer.weights_sha256.clone(),
+                planner: weights_sha256(&planner.parameters),
+            },
+            window_frames: network.window_frames,
+            fps: FPS,
+            channels: own_channels(),
+            features: own_features(),
+            normalizer: scales.motion.clone(),
+            feature_scale: scales.features.clone(),
+            motion_range,
+            styles,
+            sampling,
+            licence: params.licence.clone(),
+            files: Vec::new(),
+        };
+        let bytes = files(self, params, &card)?;
+        card.files = entries(&bytes);
+        ExportedFiles::new(card, bytes)
+    }
+
+    fn checks(
+        &self,
+        files: &ExportedFiles<TokensCard>,
+        _dataset: &Dataset,
+        params: &Params,
+        (runtime, _): (&Runtime, &dyn Progress),
+    ) -> anyhow::Result<CheckResults> {
+        checks(&files.card, params, &files.bytes, runtime)
+    }
 }
 
 /// Makes the engines of a model that is being exported.

@@ -44,7 +44,7 @@ pub(super) const SEED: u64 = 17;
 /// reaches it.
 ///
 /// # Errors
-/// When the frames cannot be read, or what the engine says.
+/// When the frames cannot be read, or errors of the engine.
 pub fn sampling_defaults(
     engine: &dyn Engine,
     network: &NetworkConfig,
@@ -150,7 +150,7 @@ fn rounded(x: f64, n_digits: i32) -> f64 {
 /// As [`sampling_defaults`], dancer by dancer.
 ///
 /// # Errors
-/// When the frames cannot be read, or what the engine says.
+/// When the frames cannot be read, or errors of the engine.
 pub fn group_sampling_defaults(
     engine: &GroupEngine,
     network: &GroupNetworkConfig,

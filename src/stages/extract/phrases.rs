@@ -4,6 +4,9 @@
 //! every process, at any time, writes the same bytes under the same name. Files of a batch are done
 //! side by side, the longest first, and the batch is committed when its last file is done.
 
+mod inputs;
+mod writer;
+
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Mutex;
@@ -11,18 +14,20 @@ use std::sync::Mutex;
 use super::one::{ExtractedFeatures, Origin, extract, needed_bytes};
 use super::{Extract, ExtractJob, ExtractTally, params_hash};
 use crate::stages::Stage as _;
-use crate::stages::batch::{BatchCommit, BatchJob, n_batches};
+use crate::stages::batch::{BatchJob, n_batches};
 use crate::stages::beats::{self, BeatSource};
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::ingest::content_hash_of_audio;
 use crate::stages::item_state::{ItemState, last_params_hash};
 use crate::stages::pool::{self, Budget, lock};
-use crate::store::tables::{self, BeatRow, ExtractionRow, PhraseRow};
+use crate::store::tables::PhraseRow;
 use crate::store::{
-    ClientOptions, Content, Item, Ledger, Location, OrderedContents, Row as _, Shard, Source,
-    SourceFile, StoreError, StoreSnapshot, batch_of, checkpoint,
+    ClientOptions, Ledger, Location, Row as _, Shard, StoreError, StoreSnapshot, batch_of,
+    checkpoint,
 };
 use crate::units::frames_to_s;
+use inputs::{PhraseInput, PhraseInputs};
+use writer::BatchWriter;
 
 /// Where the items of this stage come from, as its commits name it.
 const ITEMS_FROM: &str = "phrases";
@@ -312,7 +317,7 @@ fn work_off(
             Some((task, input))
         },
         |(task, input): (PhraseTask, PhraseInput)| -> anyhow::Result<()> {
-            let PhraseInput { file, content, _permit } = input;
+            let PhraseInput { file, content, permit: _permit } = input;
             let outcome = {
                 let _share = budget.take(needed_bytes(task.row.duration_s, task.size_bytes));
                 extract(task.origin, &file, content, |hash| is_as_recorded(&task, hash), &job.rules)
@@ -334,159 +339,4 @@ fn work_off(
             Ok(())
         },
     )
-}
-
-/// The files of the tasks, read in the tasks' order.
-struct PhraseInputs {
-    /// `None` for a source that cannot be opened.
-    sources: HashMap<String, Option<(Source, OrderedContents)>>,
-    options: ClientOptions,
-}
-
-struct PhraseInput {
-    file: SourceFile,
-    content: Result<Content, StoreError>,
-    /// The read-ahead budget of the file, given back when the phrase is done.
-    _permit: Option<Box<dyn Send>>,
-}
-
-impl PhraseInputs {
-    fn open(tasks: &[PhraseTask], options: &ClientOptions) -> Self {
-        let mut files: BTreeMap<&str, Vec<&PhraseTask>> = BTreeMap::new();
-        for task in tasks {
-            files.entry(&task.row.source).or_default().push(task);
-        }
-        let open = |url: &str, tasks: Vec<&PhraseTask>| {
-            // What is read is held against the digest that ingest recorded, wherever it lies.
-            let source = Source::open(url, options, None).ok()?.following_links(true);
-            let wanted = tasks.iter().filter_map(|task| Self::file(&source, task)).collect();
-            let reader = source.read_in_order(wanted);
-            Some((source, reader))
-        };
-        let sources = files.into_iter().map(|(url, tasks)| (url.to_owned(), open(url, tasks)));
-        Self { sources: sources.collect(), options: options.clone() }
-    }
-
-    /// Returns why a task has no input.
-    fn error(&self, task: &PhraseTask) -> StoreError {
-        let source = Source::open(&task.row.source, &self.options, None);
-        source.err().unwrap_or_else(|| StoreError::NotFound { place: task.url.clone(), hint: "" })
-    }
-
-    fn file(source: &Source, task: &PhraseTask) -> Option<SourceFile> {
-        source.recorded(&task.url, task.size_bytes, &task.row.content_hash)
-    }
-
-    fn next(&mut self, task: &PhraseTask) -> PhraseInput {
-        let unknown = SourceFile {
-            path: task.url.clone(),
-            size_bytes: task.size_bytes,
-            fingerprint: String::new(),
-        };
-        let found = match self.sources.get_mut(&task.row.source) {
-            Some(Some((source, reader))) => {
-                Self::file(source, task).and_then(|file| Some((file, reader.next()?)))
-            }
-            Some(None) | None => None,
-        };
-        match found {
-            Some((file, (content, permit))) => {
-                let permit = permit.map(|permit| Box::new(permit) as Box<dyn Send>);
-                PhraseInput { file, content, _permit: permit }
-            }
-            None => PhraseInput { file: unknown, content: Err(self.error(task)), _permit: None },
-        }
-    }
-}
-
-/// Writes finished batches.
-struct BatchWriter<'a> {
-    job: BatchJob<'a>,
-    force: bool,
-}
-
-impl BatchWriter<'_> {
-    fn commit(&self, batch: PhraseBatch) -> Result<(), StoreError> {
-        let mut commit = self.job.start();
-        let (mut extractions, mut beats) = (Vec::new(), Vec::new());
-        for (id, (task, outcome)) in batch.outcomes {
-            let id = self.name_for(id, &outcome, &mut commit);
-            let failure = outcome.as_ref().err().map(Failure::digest);
-            let input_hash = task.row.content_hash.clone();
-            let fingerprint = task.fingerprint();
-            let unchanged = self.job.known(&id).is_some_and(|known| {
-                known.item.input_hash == input_hash
-                    && known.item.fingerprint == fingerprint
-                    && known.item.failure == failure
-            });
-            if unchanged && !(self.force && failure.is_none()) {
-                continue;
-            }
-            match outcome {
-                Ok(extracted) => {
-                    let part = commit.part(tables::FEATURES, tables::features)?;
-                    part.write_frames(&id, extracted.frames.view())?;
-                    extractions.push(extraction_row(&id, &task, &extracted));
-                    if !task.has_listed_beats {
-                        beats.extend(beat_rows(&id, &extracted));
-                    }
-                }
-                Err(failure) => commit.list_failure(&id, &task.url, &failure),
-            }
-            commit.settle(Item { id, fingerprint, input_hash, failure });
-        }
-        commit.rows(&extractions)?;
-        commit.rows::<BeatRow>(&beats)?;
-        commit.publish()
-    }
-
-    /// Returns the name to settle: the phrase's own, or one beside it when a file that cannot be
-    /// read just now says nothing against the rows that are there.
-    fn name_for(
-        &self,
-        id: String,
-        outcome: &PhraseOutcome,
-        commit: &mut BatchCommit<'_>,
-    ) -> String {
-        let beside = beside(&id);
-        let is_out_of_reach =
-            outcome.as_ref().is_err_and(|failure| failure.kind == FailureKind::Unreadable);
-        if is_out_of_reach && self.job.has_rows(&id) {
-            return beside;
-        }
-        if self.job.has_failed(&beside) {
-            commit.forget(&beside);
-        }
-        id
-    }
-}
-
-fn extraction_row(id: &str, task: &PhraseTask, extracted: &ExtractedFeatures) -> ExtractionRow {
-    let heard = extracted.audio;
-    ExtractionRow {
-        phrase_id: id.to_owned(),
-        origin: extracted.origin.name().to_owned(),
-        source_url: task.url.clone(),
-        n_frames: extracted.frames.nrows() as i64,
-        n_samples: heard.map(|h| h.n_samples as i64),
-        duration_s: extracted.duration_s(),
-        tuning: heard.map(|h| h.tuning.bins()),
-        tuning_source: heard.map(|h| h.tuning_source.to_owned()),
-        tempo_bpm: extracted.tempo_bpm,
-        n_beats: extracted.beats.len() as i32,
-        audio_codec: heard.map(|h| h.encoding.codec.to_owned()),
-        sample_rate_hz: heard.map(|h| h.encoding.sample_rate_hz as i32),
-        n_channels: heard.map(|h| i32::from(h.encoding.n_channels)),
-        content_hash: Some(task.row.content_hash.clone()),
-        truncated: heard.map(|h| h.loss.is_truncated),
-        lost_s: heard.map(|h| h.loss.lost_s),
-    }
-}
-
-fn beat_rows<'a>(
-    id: &'a str,
-    extracted: &'a ExtractedFeatures,
-) -> impl Iterator<Item = BeatRow> + 'a {
-    let beats = extracted.pulse.iter().copied();
-    beats::rows(id, beats, extracted.frames.nrows(), extracted.origin.beat_source())
 }

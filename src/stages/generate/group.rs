@@ -7,15 +7,16 @@ use anyhow::{Context as _, bail, ensure};
 use ndarray::{Array2, Array3, ArrayView2, Axis, concatenate};
 use serde::{Deserialize, Serialize};
 
-use super::maker::{GeneratedMotion, MotionMaker, generation_id, seed_of};
+use super::identity::{RunIdentity, SampledMotion};
+use super::maker::{GeneratedMotion, MotionMaker, seed_of};
 use super::music::PhraseMusic;
 use super::params::{Params, SamplingSettings};
 use super::report::GenerateSummary;
 use super::settings::OUTPUT_VERSION;
-use super::{make_all, name_of_model};
+use super::{make_all, n_workers, name_of_model, run_name};
 use crate::autodiff::Parameters;
 use crate::diffusion::{SamplerConfig, Schedule};
-use crate::evaluation::{derivative_error, score};
+use crate::evaluation::{Score, derivative_error, score};
 use crate::generation::{
     ConsistencyForm, EngineError, FamilyCard as _, GroupCard, GroupEngine, GroupEstimator as _,
     GroupGenerator, GroupTrack, ModelFileName,
@@ -28,11 +29,9 @@ use crate::onnx::{Model, values_of};
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::model_folder::ModelFolder;
 use crate::stages::pretrained::ShippedModel;
-use crate::stages::train::session::check_run_name;
 use crate::stages::{Progress, Summary};
+use crate::store::Location;
 use crate::store::tables::GenerationRow;
-use crate::store::{Location, TimestampUs, digest};
-use crate::units::frames_to_s;
 
 /// Dancers, unless the user says otherwise.
 const DEFAULT_DANCERS: usize = 3;
@@ -161,15 +160,6 @@ impl GroupSettings {
         }
         if self.separation { separate(frames.view(), RADIUS_M) } else { Ok(frames) }
     }
-
-    /// Returns the settings as JSON in the order of these fields, the same in every build.
-    fn text(&self) -> String {
-        serde_json::to_string(self).expect("invariant: numbers and texts become JSON")
-    }
-
-    fn to_json(&self) -> serde_json::Value {
-        serde_json::to_value(self).expect("invariant: numbers and texts become JSON")
-    }
 }
 
 /// Runs the stage with a model of groups.
@@ -186,11 +176,8 @@ pub fn run(
     let card = GroupCard::read(files.card_bytes(), files.card_place())?;
     let settings = GroupSettings::new(params, &card)?;
     let name = name_of_model(params, &card.name);
-    let run = params.run.clone().unwrap_or_else(|| name.clone());
-    check_run_name(&run)?;
-    let is_single = params.audio.len() == 1 || params.phrase.len() == 1;
-    let threads = params.engine.threads;
-    let n_workers = if is_single { NonZeroUsize::MIN } else { threads };
+    let run = run_name(params, &name)?;
+    let (threads, n_workers) = (params.engine.threads, n_workers(params));
     let n_threads = NonZeroUsize::new(threads.get() / n_workers.get()).unwrap_or(NonZeroUsize::MIN);
     let parameters = parameters(&files, &card)?;
     let workers = (n_workers, n_threads);
@@ -210,9 +197,7 @@ pub fn run(
             overlap_frames: settings.overlap_frames,
         },
         card: &card,
-        model: &name,
-        run: &run,
-        seed: params.seed,
+        identity: RunIdentity::new((&name, &card.weights_sha256, &run), params.seed, &settings),
         settings: &settings,
     };
     let (place, done) = make_all(params, store, &maker, engine.n_workers(), progress)?;
@@ -233,7 +218,7 @@ pub fn run(
 /// Reads the weights of both networks of a model of groups.
 ///
 /// # Errors
-/// When a file is not what the card says.
+/// When a file is not the one that the card lists.
 pub(in crate::stages) fn parameters(
     files: &ModelFolder,
     card: &GroupCard,
@@ -261,36 +246,13 @@ pub(in crate::stages) fn parameters(
 struct GroupMaker<'a> {
     generator: GroupGenerator<'a>,
     card: &'a GroupCard,
-    model: &'a str,
-    run: &'a str,
-    seed: u64,
+    identity: RunIdentity,
     settings: &'a GroupSettings,
 }
 
 impl MotionMaker for GroupMaker<'_> {
-    fn model(&self) -> &str {
-        self.model
-    }
-
-    fn weights(&self) -> &str {
-        &self.card.weights_sha256
-    }
-
-    fn run(&self) -> &str {
-        self.run
-    }
-
-    fn seed(&self) -> u64 {
-        self.seed
-    }
-
-    fn settings(&self) -> serde_json::Value {
-        self.settings.to_json()
-    }
-
-    fn settings_digest(&self) -> String {
-        let text = format!("{}\n{}\n{}", self.settings.text(), self.weights(), self.seed);
-        digest(text.as_bytes())
+    fn identity(&self) -> &RunIdentity {
+        &self.identity
     }
 
     fn make(
@@ -308,7 +270,7 @@ impl GroupMaker<'_> {
         let started = Instant::now();
         let heard = music.heard_by(self.card.group.condition(), self.settings.no_clock);
         let bars = heard.bars();
-        let seed = seed_of(self.seed, music.phrase_id, sample, 0);
+        let seed = seed_of(self.identity.seed, music.phrase_id, sample, 0);
         let track = GroupTrack {
             condition: heard.condition.view(),
             phase: heard.clock_phase(),
@@ -356,40 +318,28 @@ impl GroupMaker<'_> {
             let values: Option<Vec<f64>> = values.into_iter().collect();
             values.map(|values| values.iter().sum::<f64>() / n_dancers as f64)
         };
-        let sum = |of: fn(&crate::evaluation::Score) -> usize| scores.iter().map(of).sum::<usize>();
-        GenerationRow {
-            generation: generation_id(self.run, music.phrase_id, sample),
-            run: self.run.to_owned(),
-            phrase_id: music.phrase_id.to_owned(),
-            sample: sample as i32,
-            candidate: 0,
-            selected: true,
-            seed: seed as i64,
-            model: self.model.to_owned(),
-            weights: self.card.weights_sha256.clone(),
-            engine: self.generator.engine.name().to_owned(),
-            sampler: settings.sampler.sampler.name().to_owned(),
-            n_steps: settings.sampler.n_steps as i32,
-            guidance: settings.guidance,
-            eta: settings.sampler.sampler.eta(),
-            primed_by: None,
-            n_frames: n_frames as i64,
-            n_windows: self.generator.windows(n_frames).len() as i32,
-            score: mean(scores.iter().map(|score| score.total).collect()),
-            checks_passed: sum(|score| score.n_passed) as i32,
-            n_checks: sum(|score| score.n_checks) as i32,
+        let sum = |of: fn(&Score) -> usize| scores.iter().map(of).sum::<usize>();
+        let score = Score {
+            total: mean(scores.iter().map(|score| score.total).collect()),
+            n_passed: sum(|score| score.n_passed),
+            n_checks: sum(|score| score.n_checks),
             locking: mean(scores.iter().map(|score| score.locking).collect()),
+        };
+        let made = SampledMotion {
+            sample,
+            candidate: 0,
+            seed,
+            engine: self.generator.engine.name(),
+            sampler: &settings.sampler,
+            guidance: settings.guidance,
+            n_dancers,
+            n_frames,
+            n_windows: self.generator.windows(n_frames).len(),
+            score: &score,
             velocity_error,
-            control_error_mm: None,
-            control_error_deg: None,
-            constraints: None,
             generate_s,
-            real_time_factor: generate_s / frames_to_s(n_frames).max(f64::MIN_POSITIVE),
-            settings: Some(settings.text()),
-            content_hash: Some(music.content_hash.to_owned()),
-            n_dancers: Some(n_dancers as i32),
-            consistency: Some(settings.consistency),
-            time: TimestampUs::now(),
-        }
+        };
+        let row = self.identity.row(music, &made);
+        GenerationRow { consistency: Some(settings.consistency), ..row }
     }
 }

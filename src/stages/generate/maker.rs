@@ -5,6 +5,7 @@ use std::time::Instant;
 use ndarray::{Array2, Array3, ArrayView2, Axis, concatenate};
 
 use super::constraints_text::text_of;
+use super::identity::{RunIdentity, SampledMotion};
 use super::music::{HeardMusic, PhraseMusic};
 use super::params::Settings;
 use crate::evaluation::{Score, derivative_error, score};
@@ -15,9 +16,8 @@ use crate::motion::postprocess::{Displacement, process, process_holding};
 use crate::motion::{Channel, MOTION_DIM};
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::retrieval::{Primer, Priming};
+use crate::store::digest;
 use crate::store::tables::GenerationRow;
-use crate::store::{TimestampUs, digest};
-use crate::units::frames_to_s;
 
 /// A motion that was kept, and what is known of all its candidates.
 #[derive(Debug)]
@@ -41,23 +41,8 @@ impl GeneratedMotion {
 
 /// Makes motions of one model with some settings.
 pub trait MotionMaker: Sync {
-    /// Name of the model, as the user typed it.
-    fn model(&self) -> &str;
-
-    /// Digest of the model's weights.
-    fn weights(&self) -> &str;
-
-    /// Name of the generation.
-    fn run(&self) -> &str;
-
-    /// The user's seed.
-    fn seed(&self) -> u64;
-
-    /// The settings as receipts have them: JSON, of constraints the digest.
-    fn settings(&self) -> serde_json::Value;
-
-    /// Digest of everything but the music that determines motions.
-    fn settings_digest(&self) -> String;
+    /// What all its motions have in common.
+    fn identity(&self) -> &RunIdentity;
 
     /// Makes one sample; `watch` sees the frames of its first candidate as they are final.
     ///
@@ -75,11 +60,7 @@ pub trait MotionMaker: Sync {
 pub struct SoloistMaker<'a> {
     pub generator: Generator<'a>,
     pub card: &'a ModelCard,
-    /// Name of the model, as the user typed it.
-    pub model: &'a str,
-    /// Digest of the model's weights.
-    pub weights: &'a str,
-    pub run: &'a str,
+    pub identity: RunIdentity,
     pub settings: &'a Settings,
     /// The library that sampling begins from.
     pub primer: Option<&'a Primer>,
@@ -98,29 +79,8 @@ pub fn seed_of(seed: u64, phrase_id: &str, sample: usize, candidate: usize) -> u
 }
 
 impl MotionMaker for SoloistMaker<'_> {
-    fn model(&self) -> &str {
-        self.model
-    }
-
-    fn weights(&self) -> &str {
-        self.weights
-    }
-
-    fn run(&self) -> &str {
-        self.run
-    }
-
-    fn seed(&self) -> u64 {
-        self.settings.seed
-    }
-
-    fn settings(&self) -> serde_json::Value {
-        serde_json::to_value(self.settings.to_row())
-            .expect("invariant: numbers and texts become JSON")
-    }
-
-    fn settings_digest(&self) -> String {
-        self.settings.digest(self.weights)
+    fn identity(&self) -> &RunIdentity {
+        &self.identity
     }
 
     fn make(
@@ -274,41 +234,27 @@ impl SoloistMaker<'_> {
         n_frames: usize,
         found: &CandidateFindings,
     ) -> GenerationRow {
-        let settings = self.settings;
-        let n_windows = self.generator.windows(n_frames).len();
-        GenerationRow {
-            generation: generation_id(self.run, music.phrase_id, found.sample),
-            run: self.run.to_owned(),
-            phrase_id: music.phrase_id.to_owned(),
-            sample: found.sample as i32,
-            candidate: found.candidate as i32,
-            selected: false,
-            seed: found.seed as i64,
-            model: self.model.to_owned(),
-            weights: self.weights.to_owned(),
-            engine: self.generator.engine.name().to_owned(),
-            sampler: settings.sampler.sampler.name().to_owned(),
-            n_steps: settings.sampler.n_steps as i32,
-            guidance: settings.guidance,
-            eta: settings.sampler.sampler.eta(),
-            primed_by: found.primed_by.clone(),
-            n_frames: n_frames as i64,
-            n_windows: n_windows as i32,
-            score: found.score.total,
-            checks_passed: found.score.n_passed as i32,
-            n_checks: found.score.n_checks as i32,
-            locking: found.score.locking,
+        let made = SampledMotion {
+            sample: found.sample,
+            candidate: found.candidate,
+            seed: found.seed,
+            engine: self.generator.engine.name(),
+            sampler: &self.settings.sampler,
+            guidance: self.settings.guidance,
+            n_dancers: 1,
+            n_frames,
+            n_windows: self.generator.windows(n_frames).len(),
+            score: found.score,
             velocity_error: found.velocity_error,
+            generate_s: found.generate_s,
+        };
+        GenerationRow {
+            selected: false,
+            primed_by: found.primed_by.clone(),
             control_error_mm: found.control[0],
             control_error_deg: found.control[1],
             constraints: found.constraints.map(text_of),
-            generate_s: found.generate_s,
-            real_time_factor: found.generate_s / frames_to_s(n_frames).max(f64::MIN_POSITIVE),
-            settings: Some(settings.to_row().to_json()),
-            content_hash: Some(music.content_hash.to_owned()),
-            n_dancers: Some(1),
-            consistency: None,
-            time: TimestampUs::now(),
+            ..self.identity.row(music, &made)
         }
     }
 }

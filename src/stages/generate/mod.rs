@@ -4,6 +4,7 @@ mod constraints_file;
 mod constraints_text;
 mod files;
 mod group;
+mod identity;
 mod maker;
 mod music;
 mod outputs;
@@ -35,6 +36,7 @@ use crate::model::Family;
 use crate::store::{Location, Shard};
 use crate::units::frames_to_s;
 
+use identity::RunIdentity;
 use maker::{GeneratedMotion, MotionMaker, SoloistMaker};
 use params::Settings;
 pub use params::{Params, SamplerName, Tracks};
@@ -104,24 +106,20 @@ impl Stage for Generate {
             }
         };
         let name = name_of_model(&params, &model.card.name);
-        let run = params.run.clone().unwrap_or_else(|| name.clone());
-        super::train::session::check_run_name(&run)?;
-        // A single track is fastest with all threads in one worker; many keep a worker each busy.
-        let is_single = params.audio.len() == 1 || params.phrase.len() == 1;
-        let n_workers = if is_single { NonZeroUsize::MIN } else { params.engine.threads };
-        let engine_params = if params.dry_run {
-            // The one engine that keeps no prepared copy of a model.
-            EngineParams { engine: EngineChoice::Eager, ..params.engine.clone() }
-        } else {
-            params.engine.clone()
-        };
-        let (engine, note): (Box<dyn Engine>, _) = model.engine(&engine_params, n_workers)?;
+        let run = run_name(&params, &name)?;
+        let (engine, note): (Box<dyn Engine>, _) =
+            model.engine(&engine_params(&params), n_workers(&params))?;
         if let Some(note) = note {
             progress.note(&note);
         }
         let schedule = Schedule::new(&model.card.diffusion)?;
         let card = &model.card;
         let weights = weights_digest(card);
+        let row = settings.to_row();
+        let identity = RunIdentity {
+            settings_digest: settings.digest(&weights),
+            ..RunIdentity::new((&name, &weights, &run), settings.seed, &row)
+        };
         let sampling = Sampling {
             config: &settings.sampler,
             schedule: &schedule,
@@ -136,9 +134,7 @@ impl Stage for Generate {
                 overlap_frames: settings.overlap_frames,
             },
             card,
-            model: &name,
-            weights: &weights,
-            run: &run,
+            identity,
             settings: &settings,
             primer: primer.as_ref(),
         };
@@ -165,6 +161,31 @@ impl Stage for Generate {
             dry_run: params.dry_run,
             took_s,
         }))
+    }
+}
+
+/// Returns the name of the generation, that of the model unless the user gives one.
+///
+/// # Errors
+/// A name that could not be a folder.
+fn run_name(params: &Params, model: &str) -> anyhow::Result<String> {
+    let run = params.run.clone().unwrap_or_else(|| model.to_owned());
+    super::train::session::check_run_name(&run)?;
+    Ok(run)
+}
+
+/// Returns how many motions are made at once: a single track is fastest with all threads in one worker; many keep a
+/// worker each busy.
+fn n_workers(params: &Params) -> NonZeroUsize {
+    let is_single = params.audio.len() == 1 || params.phrase.len() == 1;
+    if is_single { NonZeroUsize::MIN } else { params.engine.threads }
+}
+
+/// Returns which engine is opened; in a dry run the one that keeps no prepared copy of a model.
+fn engine_params(params: &Params) -> EngineParams {
+    match params.dry_run {
+        true => EngineParams { engine: EngineChoice::Eager, ..params.engine.clone() },
+        false => params.engine.clone(),
     }
 }
 
@@ -195,7 +216,7 @@ fn make_all(
             let target = tracks::TrackTarget {
                 store,
                 shard: Shard::parse(&params.shard, |name| std::env::var(name).ok())?,
-                params_hash: &maker.settings_digest(),
+                params_hash: &maker.identity().settings_digest,
                 force: params.force,
                 dry_run: params.dry_run,
                 tracks: params.tracks,
@@ -204,7 +225,7 @@ fn make_all(
                 n_samples,
                 n_workers: NonZeroUsize::new(n_workers).unwrap_or(NonZeroUsize::MIN),
             };
-            let run = maker.run().to_owned();
+            let run = maker.identity().run.clone();
             let place = GeneratePlace::Store { store: store.to_string(), run };
             Ok((place, tracks::run(maker, &target, progress)?))
         }

@@ -38,17 +38,17 @@ pub struct Receipt {
 impl Receipt {
     /// Returns the receipt of a motion that is not made yet.
     pub fn new(maker: &dyn MotionMaker, stem: &str, song: &str, sample: usize) -> Self {
-        let settings = maker.settings_digest();
+        let identity = maker.identity();
         let number = sample.to_string();
-        let key = [FILES_VERSION, maker.model(), &settings, stem, song, &number];
+        let key = [FILES_VERSION, &identity.model, &identity.settings_digest, stem, song, &number];
         Self {
             key: digest_texts(key),
-            model: maker.model().to_owned(),
-            weights: maker.weights().to_owned(),
-            seed: maker.seed(),
+            model: identity.model.clone(),
+            weights: identity.weights.clone(),
+            seed: identity.seed,
             sample,
             song: song.to_owned(),
-            settings: maker.settings(),
+            settings: identity.settings.clone(),
             files: BTreeMap::new(),
         }
     }

@@ -1,6 +1,5 @@
 //! Motion by tokens: a model of the family `tokens`, its settings, and how its motions are made.
 
-use std::num::NonZeroUsize;
 use std::time::Instant;
 
 use anyhow::{bail, ensure};
@@ -9,14 +8,15 @@ use serde::{Deserialize, Serialize};
 
 use super::constraints_file::ConstraintsRequest;
 use super::constraints_text::text_of;
-use super::maker::{
-    GeneratedMotion, MotionMaker, StopReason, generation_id, seed_of, worst_misses,
-};
+use super::identity::{RunIdentity, SampledMotion};
+use super::maker::{GeneratedMotion, MotionMaker, StopReason, seed_of, worst_misses};
 use super::music::PhraseMusic;
 use super::params::{Params, SamplingSettings, style};
 use super::report::GenerateSummary;
 use super::settings::OUTPUT_VERSION;
-use super::{make_all, name_of_model, weights_digest_of_tokens};
+use super::{
+    engine_params, make_all, n_workers, name_of_model, run_name, weights_digest_of_tokens,
+};
 use crate::diffusion::{SamplerConfig, Schedule, TokenSampling};
 use crate::evaluation::{derivative_error, score};
 use crate::generation::{
@@ -27,13 +27,11 @@ use crate::motion::postprocess::{HeldPoses, PostProcessConfig, process, process_
 use crate::motion::style::STYLE_DIM;
 use crate::motion::{Channel, MOTION_DIM};
 use crate::stages::failure::{Failure, FailureKind, guarded};
-use crate::stages::model_files::{EngineChoice, EngineParams, ModelFolder};
+use crate::stages::model_files::ModelFolder;
 use crate::stages::tokens_model::{OpenTokens, TokenEngines};
-use crate::stages::train::session::check_run_name;
 use crate::stages::{Progress, Summary};
 use crate::store::tables::GenerationRow;
-use crate::store::{Location, TimestampUs, digest};
-use crate::units::frames_to_s;
+use crate::store::{Location, digest};
 
 /// The settings that determine a motion beside its music and its sample: the column `settings` of `generations`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -139,11 +137,6 @@ impl TokensSettings {
             control: constraints.is_some().then_some(control),
         })
     }
-
-    /// Returns the settings as JSON in the order of these fields, the same in every build.
-    fn text(&self) -> String {
-        serde_json::to_string(self).expect("invariant: numbers and texts become JSON")
-    }
 }
 
 /// Runs the stage with a model of tokens.
@@ -162,15 +155,9 @@ pub fn run(
     let constraints = params.constraints_asked()?;
     let settings = TokensSettings::new(params, card, constraints.as_ref())?;
     let name = name_of_model(params, &card.name);
-    let run = params.run.clone().unwrap_or_else(|| name.clone());
-    check_run_name(&run)?;
-    let is_single = params.audio.len() == 1 || params.phrase.len() == 1;
-    let n_workers = if is_single { NonZeroUsize::MIN } else { params.engine.threads };
-    let engine_params = match params.dry_run {
-        true => EngineParams { engine: EngineChoice::Eager, ..params.engine.clone() },
-        false => params.engine.clone(),
-    };
-    let TokenEngines { tokens, planner, note } = opened.engines(&engine_params, n_workers)?;
+    let run = run_name(params, &name)?;
+    let TokenEngines { tokens, planner, note } =
+        opened.engines(&engine_params(params), n_workers(params))?;
     if let Some(note) = note {
         progress.note(&note);
     }
@@ -190,10 +177,11 @@ pub fn run(
             overlap_tokens: settings.overlap_tokens,
         },
         card,
-        weights: weights_digest_of_tokens(card),
-        model: &name,
-        run: &run,
-        seed: params.seed,
+        identity: RunIdentity::new(
+            (&name, &weights_digest_of_tokens(card), &run),
+            params.seed,
+            &settings,
+        ),
         settings: &settings,
         constraints: constraints.as_ref(),
     };
@@ -216,38 +204,14 @@ pub fn run(
 struct TokensMaker<'a> {
     generator: TokenGenerator<'a>,
     card: &'a TokensCard,
-    weights: String,
-    model: &'a str,
-    run: &'a str,
-    seed: u64,
+    identity: RunIdentity,
     settings: &'a TokensSettings,
     constraints: Option<&'a ConstraintsRequest>,
 }
 
 impl MotionMaker for TokensMaker<'_> {
-    fn model(&self) -> &str {
-        self.model
-    }
-
-    fn weights(&self) -> &str {
-        &self.weights
-    }
-
-    fn run(&self) -> &str {
-        self.run
-    }
-
-    fn seed(&self) -> u64 {
-        self.seed
-    }
-
-    fn settings(&self) -> serde_json::Value {
-        serde_json::to_value(self.settings).expect("invariant: numbers and texts become JSON")
-    }
-
-    fn settings_digest(&self) -> String {
-        let text = format!("{}\n{}\n{}", self.settings.text(), self.weights, self.seed);
-        digest(text.as_bytes())
+    fn identity(&self) -> &RunIdentity {
+        &self.identity
     }
 
     fn make(
@@ -281,7 +245,7 @@ impl TokensMaker<'_> {
         let control = self.settings.control.unwrap_or(Control::None);
         let is_kept = control.decodes() && !self.settings.soft;
         let kept = constraints.as_ref().filter(|_| is_kept);
-        let seed = seed_of(self.seed, music.phrase_id, sample, 0);
+        let seed = seed_of(self.identity.seed, music.phrase_id, sample, 0);
         let track = TokenTrack {
             condition: heard.condition.view(),
             phase: heard.clock_phase(),
@@ -336,39 +300,20 @@ impl TokensMaker<'_> {
             Channel::Velocity.columns(),
         );
         let score = score(frames.view(), settings.postprocess.limits, phase, velocity_error);
-        GenerationRow {
-            generation: generation_id(self.run, music.phrase_id, sample),
-            run: self.run.to_owned(),
-            phrase_id: music.phrase_id.to_owned(),
-            sample: sample as i32,
+        let made = SampledMotion {
+            sample,
             candidate: 0,
-            selected: true,
-            seed: seed as i64,
-            model: self.model.to_owned(),
-            weights: self.weights.clone(),
-            engine: self.generator.tokens.name().to_owned(),
-            sampler: settings.sampler.sampler.name().to_owned(),
-            n_steps: settings.sampler.n_steps as i32,
+            seed,
+            engine: self.generator.tokens.name(),
+            sampler: &settings.sampler,
             guidance: settings.guidance,
-            eta: settings.sampler.sampler.eta(),
-            primed_by: None,
-            n_frames: n_frames as i64,
-            n_windows: self.generator.n_windows(n_frames) as i32,
-            score: score.total,
-            checks_passed: score.n_passed as i32,
-            n_checks: score.n_checks as i32,
-            locking: score.locking,
+            n_dancers: 1,
+            n_frames,
+            n_windows: self.generator.n_windows(n_frames),
+            score: &score,
             velocity_error,
-            control_error_mm: None,
-            control_error_deg: None,
-            constraints: None,
             generate_s,
-            real_time_factor: generate_s / frames_to_s(n_frames).max(f64::MIN_POSITIVE),
-            settings: Some(settings.text()),
-            content_hash: Some(music.content_hash.to_owned()),
-            n_dancers: Some(1),
-            consistency: None,
-            time: TimestampUs::now(),
-        }
+        };
+        self.identity.row(music, &made)
     }
 }

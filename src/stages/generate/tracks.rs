@@ -137,8 +137,8 @@ pub fn run(
         return Ok(planned.done);
     }
     let shard = target.shard.to_string().replace('/', "-of-");
-    let name = format!("{}/{}/{shard}", Generate::NAME, maker.run());
-    let what = format!("run {}", maker.run());
+    let name = format!("{}/{}/{shard}", Generate::NAME, maker.identity().run);
+    let what = format!("run {}", maker.identity().run);
     let (lease, has_waited) = lease::take(target.store, &name, &what, &|text| progress.note(text))?;
     if has_waited {
         // The other process may have made some of the motions.
@@ -187,7 +187,8 @@ impl TrackPlan {
         let mut tasks = plan(target, &snapshot)?;
         for task in &mut tasks {
             let is_left = |sample: &usize| {
-                target.force || !task.state(maker.run(), *sample, &ledger, target).is_done()
+                target.force
+                    || !task.state(&maker.identity().run, *sample, &ledger, target).is_done()
             };
             task.samples = (0..target.n_samples).filter(is_left).collect();
             done.n_unchanged += (target.n_samples - task.samples.len()) as u64;
@@ -356,7 +357,7 @@ fn make_batch(
                 None => Err(without_features(&task.row, target.store, ahead.unknown.as_deref())),
             };
             progress.advance(frames_to_s(task.n_frames).round() as u64);
-            lock(&outcomes).insert(generation_id(maker.run(), id, sample), outcome);
+            lock(&outcomes).insert(generation_id(&maker.identity().run, id, sample), outcome);
             Ok(())
         },
     )?;
@@ -404,7 +405,7 @@ fn commit(
         .iter()
         .flat_map(|task| task.samples.iter().map(move |&sample| (task, sample)))
         .map(|(task, sample)| {
-            (generation_id(maker.run(), &task.row.phrase_id, sample), (task, sample))
+            (generation_id(&maker.identity().run, &task.row.phrase_id, sample), (task, sample))
         })
         .collect();
     let mut commit = batches.start();
@@ -424,7 +425,7 @@ fn commit(
         match outcome {
             Ok(made) => {
                 let labels = [
-                    Label::Text(maker.run().to_owned()),
+                    Label::Text(maker.identity().run.clone()),
                     Label::Text(row.phrase_id.clone()),
                     Label::Number(sample as i32),
                 ];

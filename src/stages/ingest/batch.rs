@@ -16,7 +16,7 @@ use crate::stages::batch::{BatchCommit, BatchJob, n_batches};
 use crate::stages::beats::{self, BeatSource};
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::pool::{self, lock};
-use crate::stages::seen::SeenContent;
+use crate::stages::touched::TouchedContent;
 use crate::store::tables::{self, BeatRow, PhraseRow};
 use crate::store::{
     Commit, Content, Item, Shard, Source, SourceFile, StoreError, batch_of, digest, split_of,
@@ -29,7 +29,7 @@ const MAX_BATCH_BYTES: u64 = 256 << 20;
 pub struct IngestJob<'a> {
     pub source: &'a Source,
     pub batches: BatchJob<'a>,
-    pub seen: &'a SeenContent,
+    pub seen: &'a TouchedContent,
     pub rules: &'a IngestRules,
     pub progress: &'a dyn Progress,
     /// Phrases of the store that lack the identity of their music, and have it now.

@@ -21,7 +21,7 @@ use crate::store::{
 use super::batch::BatchJob;
 use super::failure::{Failure, failures_json, write_failures, write_notes};
 use super::item_state::ItemState;
-use super::seen::SeenContent;
+use super::touched::TouchedContent;
 pub(in crate::stages) use crate::audio::formats::is_audio_extension as is_audio;
 pub use layout::{IngestPlan, Layout, PlannedPhrase, Role, plan};
 pub(in crate::stages) use motion::{
@@ -117,7 +117,7 @@ impl Stage for Ingest {
         }
         let snapshot = StoreSnapshot::take(&store)?;
         let ledger = snapshot.ledger(Self::NAME)?;
-        let seen = SeenContent::read(&store, SEEN)?;
+        let seen = TouchedContent::read(&store, SEEN)?;
         let params_hash = params_hash(&params.rules);
 
         // With --force everything is done again anyway, also where old parts cannot be read.
@@ -212,7 +212,7 @@ fn params_hash(rules: &IngestRules) -> String {
 fn state(
     planned: &PlannedPhrase,
     ledger: &Ledger,
-    seen: &SeenContent,
+    seen: &TouchedContent,
     params_hash: &str,
     origin: &str,
 ) -> ItemState {

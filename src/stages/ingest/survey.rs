@@ -7,7 +7,7 @@ use clap::{Args as _, FromArgMatches as _};
 use super::{Ingest, IngestRules, Layout, SEEN, params_hash, plan, state};
 use crate::stages::Stage as _;
 use crate::stages::item_state::{ItemState, last_params_hash};
-use crate::stages::seen::SeenContent;
+use crate::stages::touched::TouchedContent;
 use crate::store::{Source, StoreError, StoreSnapshot};
 
 /// Returns the sources that the store has phrases of, in order.
@@ -38,7 +38,7 @@ pub fn survey(
 ) -> Result<(Vec<(String, ItemState)>, bool), StoreError> {
     let plan = plan(source.list()?, layout);
     let ledger = snapshot.ledger(Ingest::NAME)?;
-    let seen = SeenContent::read(snapshot.store(), SEEN)?;
+    let seen = TouchedContent::read(snapshot.store(), SEEN)?;
     let origin = source.location().url();
     let usual = params_hash(&usual_rules());
     let params_hash = last_params_hash(&ledger, &usual, |known| known.origin == origin)

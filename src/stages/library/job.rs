@@ -7,18 +7,18 @@ use std::sync::mpsc::sync_channel;
 use anyhow::{Context as _, bail};
 
 use super::captures::{Captures, LoadedCaptures};
-use super::known::StoreContents;
 use super::layout::PhraseFolder;
 use super::made::{self, Band, perform};
 use super::report::{LibrarySummary, LibraryTally};
 use super::songs::{Song, SongFiles, SongInput, Songs};
+use super::store_contents::StoreContents;
 use super::write::{Refusal, SongWriter, fingerprint, state};
 use super::{Library, Params, one, params_hash};
 use crate::stages::batch::BatchJob;
 use crate::stages::extract::needed_bytes;
 use crate::stages::failure::{guarded, query_of_failures};
 use crate::stages::pool::{self, Budget, lock};
-use crate::stages::seen::SeenContent;
+use crate::stages::touched::TouchedContent;
 use crate::stages::{Progress, Stage as _};
 use crate::store::{Ledger, Location};
 
@@ -29,7 +29,7 @@ const MEMORY_BYTES: u64 = 2_000_000_000;
 pub struct LibraryJob<'a> {
     pub store: &'a Location,
     pub ledger: Ledger,
-    pub seen: SeenContent,
+    pub seen: TouchedContent,
     pub known: StoreContents,
     pub band: Band,
     pub params: &'a Params,

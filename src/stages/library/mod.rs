@@ -4,7 +4,6 @@
 mod captures;
 mod dancers;
 mod job;
-mod known;
 mod layout;
 mod made;
 mod one;
@@ -12,6 +11,7 @@ mod report;
 mod rows;
 mod songs;
 mod split;
+mod store_contents;
 mod survey;
 mod write;
 
@@ -20,18 +20,18 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use super::failure::{Failure, FailureKind};
-use super::seen::SeenContent;
+use super::touched::TouchedContent;
 use super::{ClientParams, Contract, LinkParams, Progress, RARE, Stage, Summary, all_threads};
 use crate::motion::Axis;
 use crate::store::{Location, Source, StoreError, StoreSnapshot, checkpoint, digest};
 use captures::Captures;
 use dancers::DancerRange;
 use job::LibraryJob;
-use known::StoreContents;
 use made::Band;
 use report::{LibraryPlace, LibrarySummary, LibraryTally};
 use songs::{Song, SongFiles, Songs};
 use split::SongShare;
+use store_contents::StoreContents;
 pub(in crate::stages) use survey::{SurveyedSongs, survey};
 
 /// Raised when library writes something else for the same inputs and parameters.
@@ -147,7 +147,7 @@ impl Stage for Library {
         let snapshot = StoreSnapshot::take(&store)?;
         let mut known = StoreContents::read(&snapshot)?;
         let ledger = snapshot.ledger(Self::NAME)?;
-        let seen = SeenContent::read(&store, SEEN)?;
+        let seen = TouchedContent::read(&store, SEEN)?;
         let open = |url: &str| {
             Source::open(url, &options, None)
                 .map(|source| source.following_links(params.links.follow_links))

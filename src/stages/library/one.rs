@@ -256,7 +256,7 @@ fn danced(
 /// The dance of a take depends on the seed, the song's name and the number of the take.
 ///
 /// # Errors
-/// A [`Failure`] of the song before the first phrase, or what `visit` says.
+/// A [`Failure`] of the song before the first phrase, or errors of `visit`.
 pub fn dance<E: From<Failure>>(
     song: &Song,
     music: &SongMusic,

@@ -3,13 +3,13 @@
 use std::collections::BTreeSet;
 
 use super::captures::Captures;
-use super::known::StoreContents;
 use super::songs::{Song, Songs};
+use super::store_contents::StoreContents;
 use super::write::{fingerprint, state};
 use super::{FROM_STORE, Library, SEEN, split};
 use crate::stages::Stage as _;
 use crate::stages::item_state::{ItemState, last_params_hash};
-use crate::stages::seen::SeenContent;
+use crate::stages::touched::TouchedContent;
 use crate::store::{Source, StoreSnapshot};
 
 /// The songs from one place.
@@ -34,7 +34,7 @@ pub fn survey(
     open: impl Fn(&str) -> anyhow::Result<Source>,
 ) -> anyhow::Result<Vec<SurveyedSongs>> {
     let ledger = snapshot.ledger(Library::NAME)?;
-    let seen = SeenContent::read(snapshot.store(), SEEN)?;
+    let seen = TouchedContent::read(snapshot.store(), SEEN)?;
     let origins: BTreeSet<&str> = ledger
         .iter()
         .filter(|known| known.item.succeeded())

@@ -12,7 +12,7 @@ use crate::motion::choreography::Repertoire;
 use crate::stages::batch::{BatchCommit, BatchJob};
 use crate::stages::failure::{Failure, FailureKind};
 use crate::stages::item_state::ItemState;
-use crate::stages::seen::SeenContent;
+use crate::stages::touched::TouchedContent;
 use crate::store::tables::{self, BeatRow, PhraseRow};
 use crate::store::{Item, Ledger, SettledItem, StoreError, digest};
 
@@ -32,7 +32,7 @@ pub struct SongWriter<'a> {
     pub others: &'a HashMap<String, String>,
     pub output: Option<&'a PhraseFolder>,
     pub force: bool,
-    pub seen: &'a SeenContent,
+    pub seen: &'a TouchedContent,
 }
 
 /// The outcome of a song.
@@ -74,7 +74,7 @@ pub fn fingerprint(song: &Song, captures_fingerprint: &str) -> String {
 pub fn state(
     song: &Song,
     first: Option<&SettledItem>,
-    (ledger, seen): (&Ledger, &SeenContent),
+    (ledger, seen): (&Ledger, &TouchedContent),
     (origin, params_hash): (&str, &str),
     fingerprint: &str,
 ) -> ItemState {

@@ -49,7 +49,7 @@ pub struct TimedWork {
 /// best is what the machine can do.
 ///
 /// # Errors
-/// What the work says.
+/// Errors of the work.
 pub fn least_seconds(mut work: impl FnMut() -> anyhow::Result<()>) -> anyhow::Result<f64> {
     let mut best = f64::INFINITY;
     for i in 0..4 {

@@ -1,8 +1,10 @@
 //! `train`: networks of any family learn from the phrases of a store.
 
 pub mod budget;
+mod family;
 mod group;
 mod judge;
+mod numbers;
 mod params;
 mod planner;
 pub(in crate::stages) mod ranks;
@@ -27,12 +29,16 @@ use crate::training::{
     Windows,
 };
 use budget::{BudgetParams, StageBudget};
+use group::GroupRun;
+use planner::PlannerRun;
 use ranks::{agreed, check_same};
 use session::{
     MachineParams, ProgressWatch, TrainingPhrases, check_run_name, claim, claim_path, lease_of,
     read_phrases,
 };
 pub use summary::{StageSummary, TrainDryRun, TrainSummary};
+use tokens::TokensRun;
+use unet::UnetRun;
 
 /// What this command trains, of any family.
 const STAGES: [&str; 5] = [
@@ -79,7 +85,7 @@ pub struct Params {
 
 impl Stage for Train {
     const NAME: &'static str = "train";
-    const ABOUT: &'static str = "train the UNet and the decoder on the phrases of a store";
+    const ABOUT: &'static str = "train the networks of a model on the phrases of a store";
     const CONTRACT: Contract = Contract {
         reads: "phrases, motion, features",
         writes: "runs/<run>/ (checkpoints), training_log, failures",
@@ -90,12 +96,12 @@ impl Stage for Train {
         ranks::on_all(progress, |ranks, progress| {
             agreed(ranks, check_run_name(&params.run))?;
             match params.config.network.family {
-                Family::Unet => unet::run(&params, ranks, progress),
-                Family::Group => group::run(&params, ranks, progress),
+                Family::Unet => family::run::<UnetRun>(&params, ranks, progress),
+                Family::Group => family::run::<GroupRun>(&params, ranks, progress),
                 Family::Tokens if params.config.tokens.tokenizer.is_some() => {
-                    planner::run(&params, ranks, progress)
+                    family::run::<PlannerRun>(&params, ranks, progress)
                 }
-                Family::Tokens => tokens::run(&params, ranks, progress),
+                Family::Tokens => family::run::<TokensRun>(&params, ranks, progress),
             }
         })
     }
@@ -115,6 +121,7 @@ fn lease(
 }
 
 /// A run of the stage.
+#[derive(Clone, Copy)]
 struct Run<'a> {
     params: &'a Params,
     store: &'a Location,

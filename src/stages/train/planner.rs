@@ -4,37 +4,41 @@ use std::sync::Arc;
 
 use anyhow::{Context as _, ensure};
 
-use super::budget::StageBudget;
-use super::ranks::agreed;
-use super::session::{ProgressWatch, check_run_name, scales};
-use super::{Params, Run, TrainDryRun, TrainSummary, lease, resume_command};
+use super::Params;
+use super::family::{FamilyTraining, of_preset, open};
+use super::numbers::{check_positive, check_share};
+use super::session::check_run_name;
 use crate::model::{Family, Planner};
 use crate::motion::Normalizer;
 use crate::stages::trained::{TrainedPlanner, TrainedTokenizer};
-use crate::stages::{Progress, Summary};
 use crate::store::Location;
 use crate::training::{
-    Augmentation, FrozenTokenizer, Learner as _, PlannerLearner, PlannerTrainConfig, Ranks, Scales,
-    TokenizerSource, TrainingEnd, Windows,
+    Augmentation, FrozenTokenizer, PlannerLearner, PlannerTrainConfig, Scales, TokenizerSource,
+    TrainingError, Windows,
 };
 
-/// Runs the stage.
-///
-/// # Errors
-/// A run that is no tokenizer, settings of which no network can be made, and what the store says.
-pub fn run(
-    params: &Params,
-    ranks: &Arc<Ranks>,
-    progress: &dyn Progress,
-) -> anyhow::Result<Box<dyn Summary>> {
-    let checked = || -> anyhow::Result<_> {
+/// The training of a planner.
+pub struct PlannerRun {
+    config: PlannerTrainConfig,
+    tokenizer: FrozenTokenizer,
+    /// Units of the motion that the tokenizer writes as tokens.
+    normalizer: Normalizer,
+}
+
+impl FamilyTraining for PlannerRun {
+    type Config = PlannerTrainConfig;
+    type Learner = PlannerLearner;
+
+    const FAMILY: Family = Family::Tokens;
+
+    fn prepare(params: &Params) -> anyhow::Result<(Self, Location)> {
         let tokenizer = params.config.tokens.tokenizer.as_deref().unwrap_or_default();
         check_run_name(tokenizer).with_context(|| format!("--tokenizer {tokenizer:?}"))?;
         ensure!(
             tokenizer != params.run,
             "--run and --tokenizer are both {tokenizer}; give the planner a name of its own with --run"
         );
-        let store = Location::open(&params.store, &params.client.options())?;
+        let store = open(params)?;
         ensure!(
             !TrainedPlanner::is_of(&store, tokenizer)?,
             "--tokenizer {tokenizer} is a planner; name the run of the tokenizer that it was trained with"
@@ -46,18 +50,50 @@ pub fn run(
         );
         let trained = TrainedTokenizer::read(&store, tokenizer)?;
         let config = config(params, tokenizer, &trained)?;
-        Ok((config, trained, store))
-    };
-    let (config, trained, store) = agreed(ranks, checked())?;
-    let watch = ProgressWatch(progress);
-    let lease = agreed(ranks, lease(params, &store, ranks, &watch))?;
-    let mut run = Run { params, store: &store, watch: &watch, lease: lease.as_ref(), ranks };
-    agreed(ranks, run.check_resume(PlannerLearner::STAGE))?;
-    if params.dry_run {
-        return run.dry_run_of_planner(&config, progress);
+        let TrainedTokenizer { state, parameters } = trained;
+        let tokenizer = FrozenTokenizer::new(&state.config.network.tokens, parameters);
+        Ok((Self { config, tokenizer, normalizer: state.scales.motion }, store))
     }
-    run.sweep();
-    run.train_planner(&config, trained, progress)
+
+    fn config(&self) -> &PlannerTrainConfig {
+        &self.config
+    }
+
+    fn window_frames(&self) -> usize {
+        self.config.network.window_frames
+    }
+
+    fn batch_size(&self) -> usize {
+        self.config.planner.batch_size
+    }
+
+    fn augmentation(&self) -> &Augmentation {
+        &self.config.planner.augmentation
+    }
+
+    fn description(&self) -> String {
+        let PlannerTrainConfig { network, tokenizer, .. } = &self.config;
+        let n_elements = Planner::new(&network.planner).1.n_elements();
+        format!(
+            "train a planner ({}) of the tokens of {}, {n_elements} parameters",
+            network.planner.kind.name(),
+            tokenizer.run
+        )
+    }
+
+    /// Tokens are those of motion in the units of their tokenizer.
+    fn scales(&self, of_data: Scales) -> Scales {
+        Scales { motion: self.normalizer.clone(), ..of_data }
+    }
+
+    fn adapt(&self, windows: Windows) -> Windows {
+        windows.heard_by(self.config.network.planner.condition())
+    }
+
+    fn learner(&self, windows: &Arc<Windows>, seed: u64) -> Result<PlannerLearner, TrainingError> {
+        let PlannerTrainConfig { network, planner, .. } = &self.config;
+        PlannerLearner::new(network, planner, self.tokenizer.clone(), windows, seed)
+    }
 }
 
 /// Returns the configuration that the flags make for the tokens of a tokenizer.
@@ -71,12 +107,8 @@ fn config(
         run: tokenizer.to_owned(),
         weights_sha256: crate::stages::export::weights_sha256(&trained.parameters),
     };
-    let config = params.config.planner_config(params.seed, source, network).with_context(|| {
-        format!(
-            "--preset {} is none of a planner; give tiny, small or base",
-            params.config.network.preset.name()
-        )
-    })?;
+    let config = params.config.planner_config(params.seed, source, network);
+    let config = of_preset(params, config, "a planner")?;
     let asked = params.config.network.window_frames;
     let of_tokenizer = network.window_frames;
     ensure!(
@@ -106,86 +138,7 @@ fn check_numbers(config: &PlannerTrainConfig) -> anyhow::Result<()> {
         ("--constraint-dropout", training.constraint_dropout),
         ("--time-stretch", training.augmentation.stretch),
     ] {
-        ensure!((0.0..1.0).contains(&x), "{flag} {x} is no share; give a number from 0 to below 1");
+        check_share(flag, x)?;
     }
-    let peak = training.learning_rate.peak;
-    ensure!(
-        peak > 0.0 && peak.is_finite(),
-        "--learning-rate {peak} is not above 0; give a positive number"
-    );
-    Ok(())
-}
-
-impl Run<'_> {
-    fn dry_run_of_planner(
-        &self,
-        config: &PlannerTrainConfig,
-        progress: &dyn Progress,
-    ) -> anyhow::Result<Box<dyn Summary>> {
-        let phrases = self.phrases(Family::Tokens, progress)?;
-        let windows = Windows::new(
-            phrases.dataset,
-            Normalizer::identity(),
-            Augmentation::default(),
-            config.network.window_frames,
-            0,
-        );
-        let n_elements = Planner::new(&config.network.planner).1.n_elements();
-        Ok(Box::new(TrainDryRun {
-            run: self.params.run.clone(),
-            what: format!(
-                "train a planner ({}) of the tokens of {}, {n_elements} parameters",
-                config.network.planner.kind.name(),
-                config.tokenizer.run
-            ),
-            n_train: windows.n_train(),
-            n_validation: windows.n_validation(),
-            n_left_out: phrases.left_out.len(),
-            steps_per_epoch: windows.n_train().div_ceil(config.planner.batch_size),
-        }))
-    }
-
-    fn train_planner(
-        &mut self,
-        config: &PlannerTrainConfig,
-        trained: TrainedTokenizer,
-        progress: &dyn Progress,
-    ) -> anyhow::Result<Box<dyn Summary>> {
-        let params = self.params;
-        let machine = &params.machine;
-        let phrases = self.phrases(Family::Tokens, progress)?;
-        let threads = Arc::new(machine.start_threads()?);
-        let n_frames = config.network.window_frames;
-        let features = scales(&phrases.dataset, n_frames, self.watch)?.features;
-        // Tokens are those of motion in the units of their tokenizer.
-        let scales = Scales { motion: trained.state.scales.motion.clone(), features };
-        let windows = Windows::new(
-            Arc::clone(&phrases.dataset),
-            scales,
-            config.planner.augmentation.clone(),
-            n_frames,
-            params.seed,
-        );
-        let windows = Arc::new(windows.heard_by(config.network.planner.condition()));
-        let tokenizer =
-            FrozenTokenizer::new(&trained.state.config.network.tokens, trained.parameters);
-        let mut account = TrainSummary::new(&params.run, self.store, phrases.left_out.clone());
-        let learner = PlannerLearner::new(
-            &config.network,
-            &config.planner,
-            tokenizer,
-            &windows,
-            params.seed,
-        )?
-        .on(&threads);
-        let mut learner = agreed(self.ranks, learner.among(self.ranks).map_err(Into::into))?;
-        self.begin(config)?;
-        let steps =
-            StageBudget { share: 1.0, ..params.budget.of_denoiser(config.planner.batch_size) };
-        let end = self.stage(config, steps, &mut learner, &windows, &mut account)?;
-        if end == TrainingEnd::Interrupted {
-            return Ok(Box::new(account.interrupted(&resume_command(params))));
-        }
-        Ok(Box::new(account))
-    }
+    check_positive("--learning-rate", training.learning_rate.peak)
 }

@@ -109,10 +109,10 @@ fn take_leave(ranks: &Ranks) {
 #[error("the first rank says why")]
 struct SaidByFirst;
 
-/// Returns what a process did, unless one of them could not; then the first says which, and why.
+/// Returns the outcome of a process, unless one of them failed; then the first says which, and why.
 ///
 /// # Errors
-/// What the first of them says that has something to say.
+/// The error of the first process that has one.
 pub fn agreed<T>(ranks: &Ranks, outcome: anyhow::Result<T>) -> anyhow::Result<T> {
     if ranks.is_alone() {
         return outcome;
@@ -156,7 +156,7 @@ pub fn check_same(ranks: &Ranks, what: &str, own: &str) -> anyhow::Result<()> {
 /// Runs training on all processes: the first tells of it, the others are silent.
 ///
 /// # Errors
-/// What `run` says.
+/// Errors of `run`.
 pub fn on_all(
     progress: &dyn Progress,
     run: impl FnOnce(&Arc<Ranks>, &dyn Progress) -> anyhow::Result<Box<dyn Summary>>,
@@ -187,7 +187,7 @@ pub fn on_all(
     }
 }
 
-/// The progress of a process that is not the first: heard by nobody, but it may be asked to end.
+/// The progress of a process that is not the first: it shows nothing, but may be interrupted.
 struct Unheard<'a>(&'a dyn Progress);
 
 impl Progress for Unheard<'_> {

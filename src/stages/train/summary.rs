@@ -50,7 +50,7 @@ impl TrainSummary {
         self.stages.push(stage);
     }
 
-    /// Holds the last stage's validation loss against what is lost without looking.
+    /// Compares the last stage's validation loss with those of predictors that ignore their input.
     pub fn beside(&mut self, baselines: Baselines) {
         if let Some(stage) = self.stages.last_mut() {
             stage.baselines = Some(baselines);

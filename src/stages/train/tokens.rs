@@ -2,149 +2,86 @@
 
 use std::sync::Arc;
 
-use anyhow::{Context as _, ensure};
+use anyhow::ensure;
 
-use super::budget::StageBudget;
-use super::ranks::agreed;
-use super::session::{ProgressWatch, scales};
-use super::{Params, Run, TrainDryRun, TrainSummary, lease, resume_command};
+use super::family::{FamilyTraining, of_preset, open};
+use super::numbers::{check_positive, check_share, check_weight};
+use super::{Params, Run};
 use crate::model::{Family, Tokenizer};
-use crate::motion::Normalizer;
 use crate::stages::trained::TrainedPlanner;
-use crate::stages::{Progress, Summary};
 use crate::store::Location;
 use crate::training::{
-    Augmentation, ChannelWeights, Learner as _, Ranks, TokensLearner, TokensTrainConfig,
-    TrainingEnd, Windows,
+    Augmentation, ChannelWeights, TokensLearner, TokensTrainConfig, TrainingError, Windows,
 };
 
-/// Runs the stage.
-///
-/// # Errors
-/// Settings of which no network can be made, and what the store says.
-pub fn run(
-    params: &Params,
-    ranks: &Arc<Ranks>,
-    progress: &dyn Progress,
-) -> anyhow::Result<Box<dyn Summary>> {
-    let checked = || -> anyhow::Result<_> {
-        let config = params.config.tokens_config(params.seed).with_context(|| {
-            format!(
-                "--preset {} is none of the family tokens; give tiny, small or base",
-                params.config.network.preset.name()
-            )
-        })?;
+/// The training of a tokenizer.
+pub struct TokensRun(TokensTrainConfig);
+
+impl FamilyTraining for TokensRun {
+    type Config = TokensTrainConfig;
+    type Learner = TokensLearner;
+
+    const FAMILY: Family = Family::Tokens;
+
+    fn prepare(params: &Params) -> anyhow::Result<(Self, Location)> {
+        let config = params.config.tokens_config(params.seed);
+        let config = of_preset(params, config, "the family tokens")?;
         config.network.check()?;
         check_numbers(&config)?;
-        Ok((config, Location::open(&params.store, &params.client.options())?))
-    };
-    let (config, store) = agreed(ranks, checked())?;
-    let watch = ProgressWatch(progress);
-    let lease = agreed(ranks, lease(params, &store, ranks, &watch))?;
-    let mut run = Run { params, store: &store, watch: &watch, lease: lease.as_ref(), ranks };
-    agreed(ranks, run.check_resume(TokensLearner::STAGE))?;
-    if params.dry_run {
-        return run.dry_run_of_tokens(&config, progress);
+        Ok((Self(config), open(params)?))
     }
-    let is_free = || -> anyhow::Result<()> {
+
+    fn config(&self) -> &TokensTrainConfig {
+        &self.0
+    }
+
+    fn window_frames(&self) -> usize {
+        self.0.network.window_frames
+    }
+
+    fn batch_size(&self) -> usize {
+        self.0.tokens.batch_size
+    }
+
+    fn augmentation(&self) -> &Augmentation {
+        &self.0.tokens.augmentation
+    }
+
+    fn description(&self) -> String {
+        let config = &self.0.network.tokens;
+        let n_elements = Tokenizer::new(config).1.n_elements();
+        format!("train a tokenizer of {} codes, {n_elements} parameters", config.codes)
+    }
+
+    fn check_run(&self, run: &Run) -> anyhow::Result<()> {
         ensure!(
-            !TrainedPlanner::is_of(&store, &params.run)?,
+            !TrainedPlanner::is_of(run.store, &run.params.run)?,
             "run {} is a planner; give the tokenizer a name of its own with --run",
-            params.run
+            run.params.run
         );
         Ok(())
-    };
-    agreed(ranks, is_free())?;
-    run.sweep();
-    run.train_tokens(&config, progress)
+    }
+
+    fn adapt(&self, windows: Windows) -> Windows {
+        windows
+    }
+
+    fn learner(&self, windows: &Arc<Windows>, seed: u64) -> Result<TokensLearner, TrainingError> {
+        TokensLearner::new(&self.0.network, &self.0.tokens, windows, seed)
+    }
 }
 
 fn check_numbers(config: &TokensTrainConfig) -> anyhow::Result<()> {
     let training = &config.tokens;
     let codebook = &training.codebook;
-    for (flag, x) in
-        [("--time-stretch", training.augmentation.stretch), ("--codebook-decay", codebook.decay)]
-    {
-        ensure!((0.0..1.0).contains(&x), "{flag} {x} is no share; give a number from 0 to below 1");
-    }
+    check_share("--time-stretch", training.augmentation.stretch)?;
+    check_share("--codebook-decay", codebook.decay)?;
+    check_weight("--commitment-loss", training.commitment)?;
+    check_weight("--draft-loss", training.draft)?;
     let ChannelWeights { style, vertical, pose } = training.channels;
-    for (flag, weight) in [
-        ("--commitment-loss", training.commitment),
-        ("--draft-loss", training.draft),
-        ("--style-weight", style),
-        ("--vertical-weight", vertical),
-        ("--pose-weight", pose),
-    ] {
-        ensure!(
-            weight.is_finite() && weight >= 0.0,
-            "{flag} {weight} is no weight; give 0 or more"
-        );
-    }
-    for (flag, x) in
-        [("--learning-rate", training.learning_rate.peak), ("--least-usage", codebook.least_usage)]
-    {
-        ensure!(x > 0.0 && x.is_finite(), "{flag} {x} is not above 0; give a positive number");
-    }
-    Ok(())
-}
-
-impl Run<'_> {
-    fn dry_run_of_tokens(
-        &self,
-        config: &TokensTrainConfig,
-        progress: &dyn Progress,
-    ) -> anyhow::Result<Box<dyn Summary>> {
-        let phrases = self.phrases(Family::Tokens, progress)?;
-        let windows = Windows::new(
-            phrases.dataset,
-            Normalizer::identity(),
-            Augmentation::default(),
-            config.network.window_frames,
-            0,
-        );
-        let n_elements = Tokenizer::new(&config.network.tokens).1.n_elements();
-        Ok(Box::new(TrainDryRun {
-            run: self.params.run.clone(),
-            what: format!(
-                "train a tokenizer of {} codes, {n_elements} parameters",
-                config.network.tokens.codes
-            ),
-            n_train: windows.n_train(),
-            n_validation: windows.n_validation(),
-            n_left_out: phrases.left_out.len(),
-            steps_per_epoch: windows.n_train().div_ceil(config.tokens.batch_size),
-        }))
-    }
-
-    fn train_tokens(
-        &mut self,
-        config: &TokensTrainConfig,
-        progress: &dyn Progress,
-    ) -> anyhow::Result<Box<dyn Summary>> {
-        let params = self.params;
-        let machine = &params.machine;
-        let phrases = self.phrases(Family::Tokens, progress)?;
-        let threads = Arc::new(machine.start_threads()?);
-        let n_frames = config.network.window_frames;
-        let scales = scales(&phrases.dataset, n_frames, self.watch)?;
-        let windows = Arc::new(Windows::new(
-            Arc::clone(&phrases.dataset),
-            scales,
-            config.tokens.augmentation.clone(),
-            n_frames,
-            params.seed,
-        ));
-        let mut account = TrainSummary::new(&params.run, self.store, phrases.left_out.clone());
-        let learner = TokensLearner::new(&config.network, &config.tokens, &windows, params.seed)?
-            .on(&threads);
-        let mut learner = agreed(self.ranks, learner.among(self.ranks).map_err(Into::into))?;
-        self.begin(config)?;
-        let steps =
-            StageBudget { share: 1.0, ..params.budget.of_denoiser(config.tokens.batch_size) };
-        let end = self.stage(config, steps, &mut learner, &windows, &mut account)?;
-        if end == TrainingEnd::Interrupted {
-            return Ok(Box::new(account.interrupted(&resume_command(params))));
-        }
-        Ok(Box::new(account))
-    }
+    check_weight("--style-weight", style)?;
+    check_weight("--vertical-weight", vertical)?;
+    check_weight("--pose-weight", pose)?;
+    check_positive("--learning-rate", training.learning_rate.peak)?;
+    check_positive("--least-usage", codebook.least_usage)
 }

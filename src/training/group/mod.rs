@@ -8,17 +8,18 @@ mod negatives;
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use crate::autodiff::{Eager, Parameters, Tape, Threads};
+use crate::autodiff::{Eager, Parameters, Tape};
 use crate::diffusion::Schedule;
 use crate::model::{GroupConfig, GroupNetworks};
 
-use super::averaged::{NetworkState, keeps_network};
+use super::averaged::NetworkState;
 use super::batch::{Batch, PAIR, order_by_dancers};
 use super::diffusion::tape_seed;
 use super::error::TrainingError;
-use super::learner::{Learner, Losses, Ownership, StepResult, Validation};
+use super::learner::{
+    CheckpointState, Learner, Losses, Ownership, PartedLearner, StepResult, Validation,
+};
 use super::parts::Parts;
-use super::ranks::Ranks;
 use super::window::Windows;
 pub use config::{GroupLosses, GroupNetworkConfig, GroupTrainConfig, GroupTraining};
 use inputs::{GroupBatch, WithholdAll};
@@ -68,22 +69,6 @@ impl GroupLearner {
             seed,
             windows: Arc::clone(windows),
         })
-    }
-
-    /// Has steps run on threads; the results are the same on any.
-    pub fn on(mut self, threads: &Arc<Threads>) -> Self {
-        self.parts.on(threads);
-        self
-    }
-
-    /// Trains together with other processes.
-    ///
-    /// # Errors
-    /// When the parts of a batch cannot be shared out evenly.
-    pub fn among(mut self, ranks: &Arc<Ranks>) -> Result<Self, TrainingError> {
-        self.parts.among(ranks)?;
-        self.network.among(ranks);
-        Ok(self)
     }
 
     /// Computes the gradients of a batch, part by part; returns its losses.
@@ -161,12 +146,7 @@ impl Learner for GroupLearner {
         n_steps: u64,
     ) -> Result<StepResult, TrainingError> {
         let losses = self.differentiate(batch, step)?;
-        let learning_rate = self.config.learning_rate.at(step, n_steps);
-        let Self { network, parts, .. } = self;
-        let threads = Arc::clone(parts.threads());
-        let gradient_norm =
-            threads.run(|| network.step(parts.gradients(), losses.total, learning_rate, step))?;
-        Ok(StepResult { losses, gradient_norm, learning_rate, lr_decoder: None })
+        self.take_step(losses, self.config.learning_rate.at(step, n_steps), step)
     }
 
     fn rehearse(&mut self, batch: &Batch) -> Result<(), TrainingError> {
@@ -190,5 +170,17 @@ impl Learner for GroupLearner {
         })
     }
 
-    keeps_network!(network);
+    fn state(&self) -> Vec<&dyn CheckpointState> {
+        vec![&self.network]
+    }
+
+    fn state_mut(&mut self) -> Vec<&mut dyn CheckpointState> {
+        vec![&mut self.network]
+    }
+}
+
+impl PartedLearner for GroupLearner {
+    fn parts_and_network(&mut self) -> (&mut Parts, &mut NetworkState) {
+        (&mut self.parts, &mut self.network)
+    }
 }

@@ -9,6 +9,7 @@ use crate::model::{Activation, Graph as _, Init, ParameterList, Role, Scope};
 use crate::training::averaged::NetworkState;
 use crate::training::config::OptimizerConfig;
 use crate::training::ema::EmaConfig;
+use crate::training::learner::CheckpointState as _;
 use crate::training::ranks::{EXCHANGED_CHUNKS, together};
 
 /// Windows of a batch and numbers of each.
@@ -86,9 +87,9 @@ fn differentiate(
 
 /// What one process has after some steps: values of parts, norms of gradients, and the bits of weights, average and
 /// moments.
-type Found = (Vec<f64>, Vec<f64>, Vec<Vec<u32>>);
+type TrainedNumbers = (Vec<f64>, Vec<f64>, Vec<Vec<u32>>);
 
-fn train(ranks: &Arc<Ranks>, (accumulate, side_by_side): (usize, usize)) -> Found {
+fn train(ranks: &Arc<Ranks>, (accumulate, side_by_side): (usize, usize)) -> TrainedNumbers {
     let (list, ids) = network();
     let parameters = Parameters::<f32>::new(list, 7);
     let mut parts = Parts::new(&parameters, accumulate, side_by_side);

@@ -16,7 +16,7 @@ use ::mpi::{Rank, Threading, initialize_with_threading};
 
 use super::{Link, Message, RanksError};
 
-/// How long answers that are expected at once are asked for often: from the beginning, and without a pause once another
+/// How long a message that is expected at once is polled for without a pause: from the beginning, and without a pause once another
 /// process is seen to be there. Large messages move a little with each question.
 const BRISK: Duration = Duration::from_millis(20);
 /// Pauses between two questions: then, and later.
@@ -32,7 +32,7 @@ pub struct MpiLink {
 }
 
 impl MpiLink {
-    /// Starts MPI; `told` is the number of processes that the launcher told of.
+    /// Starts MPI; `told` is the number of processes in the launcher's environment.
     ///
     /// # Errors
     /// [`RanksError`], where MPI does not start or is another one than the launcher's.

@@ -1,12 +1,12 @@
-//! A network that is too small to be shared out: the first process trains it, the others hear how it goes.
+//! A network that is too small to be shared out: the first process trains it, the others receive its losses.
 
 use std::sync::Arc;
 
 use crate::training::TrainingError;
 use crate::training::batch::Batch;
-use crate::training::checkpoint::Progress;
-use crate::training::learner::{Learner, Losses, Ownership, StepResult, Validation};
-use crate::weights::{Archive, Section};
+use crate::training::learner::{
+    CheckpointState, Learner, Losses, Ownership, StepResult, Validation,
+};
 
 use super::Ranks;
 
@@ -17,10 +17,10 @@ pub struct ByOne<L> {
 }
 
 impl<L> ByOne<L> {
-    /// Has the first process learn, the only one that has what a learner is made of.
+    /// Makes the learner on the first process, where `of` is given; on others there is none.
     ///
     /// # Errors
-    /// What making the learner says.
+    /// Errors of `learner`.
     pub fn new<T, E>(
         ranks: &Arc<Ranks>,
         of: Option<T>,
@@ -70,24 +70,11 @@ impl<L: Learner> Learner for ByOne<L> {
         Arc::new(move |n_dancers| vec![is_first; n_dancers.len()])
     }
 
-    fn sections(&self) -> Vec<Section<'_, f32>> {
-        self.learner.as_ref().map_or_else(Vec::new, L::sections)
+    fn state(&self) -> Vec<&dyn CheckpointState> {
+        self.learner.as_ref().map_or_else(Vec::new, L::state)
     }
 
-    fn best(&self) -> Vec<Section<'_, f32>> {
-        self.learner.as_ref().map_or_else(Vec::new, L::best)
-    }
-
-    fn n_updates(&self) -> (u64, u64) {
-        self.learner.as_ref().map_or((0, 0), L::n_updates)
-    }
-
-    fn restore(
-        &mut self,
-        archive: &Archive,
-        place: &str,
-        at: &Progress,
-    ) -> Result<(), TrainingError> {
-        self.learner.as_mut().map_or(Ok(()), |learner| learner.restore(archive, place, at))
+    fn state_mut(&mut self) -> Vec<&mut dyn CheckpointState> {
+        self.learner.as_mut().map_or_else(Vec::new, L::state_mut)
     }
 }

@@ -7,7 +7,9 @@ use crate::model::{Init, ParameterId, ParameterList, Role, Scope};
 use crate::weights::{Archive, Section};
 
 use crate::training::averaged::section;
+use crate::training::checkpoint::Progress;
 use crate::training::error::TrainingError;
+use crate::training::learner::CheckpointState;
 
 /// Name of the section of what a codebook has seen.
 const CODEBOOK: &str = "codebook.";
@@ -132,17 +134,18 @@ impl<E: Element> Codebook<E> {
     }
 }
 
-impl Codebook<f32> {
-    /// Returns N and m, to go on from.
-    pub fn section(&self) -> Section<'_, f32> {
-        Section { prefix: CODEBOOK, plan: self.state.plan(), values: self.state.all() }
+/// A checkpoint keeps N and m.
+impl CheckpointState for Codebook<f32> {
+    fn sections(&self) -> Vec<Section<'_, f32>> {
+        vec![Section { prefix: CODEBOOK, plan: self.state.plan(), values: self.state.all() }]
     }
 
-    /// Takes up the numbers of [`Codebook::section`].
-    ///
-    /// # Errors
-    /// When they are not those of this codebook.
-    pub fn restore(&mut self, archive: &Archive, place: &str) -> Result<(), TrainingError> {
+    fn restore(
+        &mut self,
+        archive: &Archive,
+        place: &str,
+        _at: &Progress,
+    ) -> Result<(), TrainingError> {
         self.state = section(archive, CODEBOOK, &self.state, place)?;
         Ok(())
     }

@@ -8,20 +8,17 @@ mod planner;
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use crate::autodiff::{Eager, Interpreter as _, Parameters, Stream, Tape, Threads};
+use crate::autodiff::{Eager, Interpreter as _, Parameters, Stream, Tape};
 use crate::diffusion::Schedule;
 use crate::model::{Tokenizer, TokensConfig};
 use crate::motion::MOTION_DIM;
-use crate::weights::{Archive, Section};
 
 use super::averaged::NetworkState;
 use super::batch::Batch;
-use super::checkpoint::Progress;
 use super::diffusion::tape_seed;
 use super::error::TrainingError;
-use super::learner::{Learner, Losses, StepResult, Validation};
+use super::learner::{CheckpointState, Learner, Losses, PartedLearner, StepResult, Validation};
 use super::parts::Parts;
-use super::ranks::Ranks;
 use super::window::Windows;
 pub use codebook::{Codebook, CodebookConfig, perplexity};
 use codebook::{candidates, counts};
@@ -84,22 +81,6 @@ impl TokensLearner {
             seed,
             windows: Arc::clone(windows),
         })
-    }
-
-    /// Has steps run on threads; the results are the same on any.
-    pub fn on(mut self, threads: &Arc<Threads>) -> Self {
-        self.parts.on(threads);
-        self
-    }
-
-    /// Trains together with other processes.
-    ///
-    /// # Errors
-    /// When the parts of a batch cannot be shared out evenly.
-    pub fn among(mut self, ranks: &Arc<Ranks>) -> Result<Self, TrainingError> {
-        self.parts.among(ranks)?;
-        self.network.among(ranks);
-        Ok(self)
     }
 
     /// Computes the gradients of a batch, part by part; returns its losses and its latents.
@@ -206,19 +187,15 @@ impl Learner for TokensLearner {
             self.begin_codebook(batch, step)?;
         }
         let (losses, latents) = self.differentiate(batch, step)?;
-        let learning_rate = self.config.learning_rate.at(step, n_steps);
-        let Self { network, parts, .. } = self;
-        let threads = Arc::clone(parts.threads());
-        let gradient_norm =
-            threads.run(|| network.step(parts.gradients(), losses.total, learning_rate, step))?;
-        if gradient_norm.is_finite() {
+        let taken = self.take_step(losses, self.config.learning_rate.at(step, n_steps), step)?;
+        if taken.gradient_norm.is_finite() {
             // The draw of the first step was for the first places.
             let candidates = self.candidates(&latents, step + 1);
             let (id, Self { network, codebook, .. }) = (self.tokenizer.codebook(), self);
             let codes = codes_of(network.live_mut(), id);
             codebook.update(codes, &latents.values, &latents.tokens, &candidates);
         }
-        Ok(StepResult { losses, gradient_norm, learning_rate, lr_decoder: None })
+        Ok(taken)
     }
 
     fn rehearse(&mut self, batch: &Batch) -> Result<(), TrainingError> {
@@ -231,39 +208,17 @@ impl Learner for TokensLearner {
         Ok(Validation { losses, live: Some(live.total), distance: None })
     }
 
-    fn collect_average(&mut self) -> Result<(), TrainingError> {
-        self.network.collect_average()
+    fn state(&self) -> Vec<&dyn CheckpointState> {
+        vec![&self.network, &self.codebook]
     }
 
-    fn collect(&mut self) -> Result<(), TrainingError> {
-        self.network.collect()
+    fn state_mut(&mut self) -> Vec<&mut dyn CheckpointState> {
+        vec![&mut self.network, &mut self.codebook]
     }
+}
 
-    fn release(&mut self) {
-        self.network.release();
-    }
-
-    fn sections(&self) -> Vec<Section<'_, f32>> {
-        let mut sections = self.network.sections();
-        sections.push(self.codebook.section());
-        sections
-    }
-
-    fn best(&self) -> Vec<Section<'_, f32>> {
-        self.network.best()
-    }
-
-    fn n_updates(&self) -> (u64, u64) {
-        self.network.n_updates()
-    }
-
-    fn restore(
-        &mut self,
-        archive: &Archive,
-        place: &str,
-        at: &Progress,
-    ) -> Result<(), TrainingError> {
-        self.network.restore(archive, place, at)?;
-        self.codebook.restore(archive, place)
+impl PartedLearner for TokensLearner {
+    fn parts_and_network(&mut self) -> (&mut Parts, &mut NetworkState) {
+        (&mut self.parts, &mut self.network)
     }
 }

@@ -56,7 +56,7 @@ pub struct PlannerConfig {
     pub clock: bool,
     /// Numbers of a style that is given as a condition; 0 for a network without.
     pub style_dim: usize,
-    /// Channels of what is asked of a frame, [`CONSTRAINT_DIM`]; 0 for a network that knows nothing of constraints, as
+    /// Channels of the constraints of a frame, [`CONSTRAINT_DIM`]; 0 for a network that takes none, as
     /// those of release 0.2.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub constraint_dim: usize,
@@ -98,7 +98,7 @@ impl PlannerConfig {
         })
     }
 
-    /// Returns what the network hears of the music.
+    /// Returns the condition that the network takes: features, and the clock.
     pub fn condition(&self) -> ConditionConfig {
         ConditionConfig { audio_cond_dim: self.audio_cond_dim, clock: self.clock }
     }

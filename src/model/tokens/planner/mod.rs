@@ -5,7 +5,7 @@
 //! every position sees all others, and says what stands behind \[MASK\] (Guo et al., "MoMask", CVPR 2024); of the
 //! autoregressive kind it sees those before it, and says which token comes next (Zhang et al., "T2M-GPT", CVPR 2023).
 //!
-//! What is asked of the motion comes to the same positions through an encoder of its own, and is added to the music.
+//! Constraints on the motion come to the same positions through an encoder of its own, and is added to the music.
 //!
 //! The paper adds a learned vector to each position. Here queries and keys are turned by it (RoFormer), so that no
 //! number of positions is the last.
@@ -16,7 +16,7 @@ mod layer;
 mod step;
 
 pub use self::config::{PlannerConfig, PlannerKind};
-pub use self::constraint::{AskedPose, CONSTRAINT_DIM};
+pub use self::constraint::{CONSTRAINT_DIM, PoseConstraint};
 pub use self::layer::KeysAndValues;
 use self::layer::PlannerLayer;
 pub use self::step::{PlanConditions, PlannerStep, PlannerStepInputs};
@@ -43,7 +43,7 @@ pub struct Planner {
     out: Linear,
 }
 
-/// E_c: what is asked of frames to the positions of tokens, and what stands there where nothing is asked.
+/// E_c: constraints of frames to the positions of tokens, and the learned vector of positions without constraints.
 #[derive(Clone, Debug)]
 struct ConstraintEncoder {
     encoder: Encoder,
@@ -61,7 +61,7 @@ pub struct PlannerInputs<'a, T> {
     pub drop_audio: Option<&'a T>,
     /// Style of each window, \[B, style_dim\], of a network that takes one.
     pub style: Option<&'a T>,
-    /// What is asked of the motion, \[B, T, 12\] ([`AskedPose::channels`]), of a network that takes it; nothing where
+    /// Constraints on the motion, \[B, T, 12\] ([`PoseConstraint::channels`]), of a network that takes it; nothing where
     /// absent.
     pub constraints: Option<&'a T>,
     /// Windows that go without constraints, \[B\], 1 where the learned null takes their place.
@@ -70,7 +70,7 @@ pub struct PlannerInputs<'a, T> {
     pub mask: Option<&'a T>,
 }
 
-/// What a planner is told of B windows beside their tokens; see [`PlannerInputs`].
+/// The conditions of B windows, beside their tokens; see [`PlannerInputs`].
 pub struct ConditionInputs<'a, T> {
     pub audio: &'a T,
     pub drop_audio: Option<&'a T>,
@@ -162,7 +162,7 @@ impl Planner {
         self.out.forward(g, &h)
     }
 
-    /// Returns what the positions of windows are told, l and g of [`Planner::forward`].
+    /// Returns the conditions of the positions of windows, l and g of [`Planner::forward`].
     ///
     /// # Shapes
     /// See [`PlannerInputs`].

@@ -1,14 +1,14 @@
-//! An autoregressive planner position by position: what a window hears is computed once, and of the positions that are
-//! done their keys and values are kept. N tokens thus take N positions of the transformer, instead of N (N + 1) / 2.
+//! An autoregressive planner position by position: the conditions of a window are computed once, and the keys and
+//! values of the positions that are done are kept. N tokens thus take N positions of the transformer, instead of N (N + 1) / 2.
 
 use super::Planner;
 use super::layer::KeysAndValues;
 use crate::model::graph::{Graph, Result};
 
-/// What the positions of a window hear beside its tokens.
+/// The conditions of the positions of a window, beside its tokens.
 #[derive(Clone, Debug)]
 pub struct PlanConditions<T> {
-    /// The music and what is asked at each token, \[B, N, d\].
+    /// Music and constraints at each token, \[B, N, d\].
     pub local: T,
     /// That of the window as a whole, \[B, d\].
     pub global: T,
@@ -24,7 +24,7 @@ pub struct PlannerStepInputs<'a, T> {
     pub past: Option<&'a [KeysAndValues<T>]>,
 }
 
-/// What a step found.
+/// The outputs of a step.
 #[derive(Clone, Debug)]
 pub struct PlannerStep<T> {
     /// ln p of each token at the positions P + 1 to M, up to a constant, \[B, M − P, K\].
@@ -34,7 +34,7 @@ pub struct PlannerStep<T> {
 }
 
 impl Planner {
-    /// What [`Planner::forward`] says at the positions P + 1 to M, of a network whose positions see none behind them.
+    /// Returns the outputs of [`Planner::forward`] at the positions P + 1 to M, of a network whose positions see none behind them.
     ///
     /// # Shapes
     /// See [`PlannerStepInputs`] and [`PlannerStep`].

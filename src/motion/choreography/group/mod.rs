@@ -88,7 +88,7 @@ pub struct GroupPhrase {
 ///
 /// Dancer 0 has the steps that [`super::choreograph`] chooses with the same seed. Poses are made for the song
 /// and two frames more, and every other channel follows from them. Any two dancers are at least
-/// `2 ·` [`RADIUS_M`](super::super::group::RADIUS_M) apart on the floor at every frame.
+/// `2 ·` [`RADIUS_M`](crate::motion::group::RADIUS_M) apart on the floor at every frame.
 ///
 /// # Panics
 /// When the number of dancers is outside [`GROUP_SIZES`].

@@ -4,7 +4,7 @@ use ndarray::Array2;
 
 use super::*;
 use crate::motion::choreography::choreograph;
-use crate::motion::choreography::tests::{Music, SONGS, check_identities, column, repertoire};
+use crate::motion::choreography::tests::{SONGS, SteadySong, check_identities, column, repertoire};
 use crate::motion::group::RADIUS_M;
 use crate::motion::locking::bar_locking;
 use crate::units::FPS;
@@ -43,13 +43,13 @@ fn settled(dance: &GroupDance, span: &GroupSpan, n_before: usize) -> std::ops::R
 fn visit(
     unison: Unison,
     sizes: &[usize],
-    mut check: impl FnMut(&Music, &GroupDance, &GroupSpan, std::ops::Range<usize>),
+    mut check: impl FnMut(&SteadySong, &GroupDance, &GroupSpan, std::ops::Range<usize>),
 ) -> usize {
     let repertoire = repertoire();
     let mut n_frames = 0;
     // Bars of whole frames: 60, 54 and 72.
     for (tempo_bpm, beats_per_bar) in [(120.0, 4), (100.0, 3), (100.0, 4)] {
-        let music = Music::new(tempo_bpm, beats_per_bar, 100.0);
+        let music = SteadySong::new(tempo_bpm, beats_per_bar, 100.0);
         for (seed, &n) in sizes.iter().enumerate() {
             let dance = choreograph_group(&music.song(), &repertoire, &rules(n, seed as u64));
             for span in dance.spans.iter().filter(|span| span.unison == unison) {
@@ -76,7 +76,7 @@ fn no_two_dancers_touch() {
     let repertoire = repertoire();
     let mut n_dances = 0;
     for (s, (tempo_bpm, beats_per_bar)) in SONGS.into_iter().enumerate() {
-        let music = Music::new(tempo_bpm, beats_per_bar, 80.0);
+        let music = SteadySong::new(tempo_bpm, beats_per_bar, 80.0);
         let song = music.song();
         for n in [1, 2, 3, 5, 16] {
             for seed in 0..4 {
@@ -196,7 +196,7 @@ fn free_dancers_have_steps_of_their_own() {
 fn every_frame_of_every_dancer_obeys_the_identities() {
     let repertoire = repertoire();
     for (tempo_bpm, beats_per_bar) in SONGS {
-        let music = Music::new(tempo_bpm, beats_per_bar, 60.0);
+        let music = SteadySong::new(tempo_bpm, beats_per_bar, 60.0);
         let dance = choreograph_group(&music.song(), &repertoire, &rules(5, 8));
         (0..5).for_each(|k| check_identities(&dancer(&dance, k), &music));
     }
@@ -206,7 +206,7 @@ fn every_frame_of_every_dancer_obeys_the_identities() {
 fn every_dancer_keeps_the_bar_as_a_soloist_does() {
     let repertoire = repertoire();
     for (tempo_bpm, beats_per_bar) in SONGS {
-        let music = Music::new(tempo_bpm, beats_per_bar, 80.0);
+        let music = SteadySong::new(tempo_bpm, beats_per_bar, 80.0);
         let song = music.song();
         let locked = |frames: &Array2<f32>| bar_locking(&column(frames, 4), &column(frames, 16));
         let solo = locked(&choreograph(&song, &repertoire, 6).frames);
@@ -226,7 +226,7 @@ fn every_dancer_keeps_the_bar_as_a_soloist_does() {
 
 #[test]
 fn dancers_face_as_their_formation_says() {
-    let (music, repertoire) = (Music::new(120.0, 4, 100.0), repertoire());
+    let (music, repertoire) = (SteadySong::new(120.0, 4, 100.0), repertoire());
     let mut squares = Vec::new();
     for seed in 0..6 {
         let dance = choreograph_group(&music.song(), &repertoire, &rules(4, seed));
@@ -248,7 +248,7 @@ fn dancers_face_as_their_formation_says() {
 
 #[test]
 fn phrases_lie_about_the_origin_and_tell_their_kinds() {
-    let (music, repertoire) = (Music::new(120.0, 4, 60.0), repertoire());
+    let (music, repertoire) = (SteadySong::new(120.0, 4, 60.0), repertoire());
     let asked = GroupRules { min_span_s: 12.0, ..rules(3, 2) };
     let dance = choreograph_group(&music.song(), &repertoire, &asked);
     let (a, b) = (&dance.spans[0], &dance.spans[1]);
@@ -294,7 +294,7 @@ fn every_size_of_a_range_is_drawn_alike() {
 
 #[test]
 fn a_dance_depends_on_its_rules_alone() {
-    let (music, repertoire) = (Music::new(110.0, 4, 30.0), repertoire());
+    let (music, repertoire) = (SteadySong::new(110.0, 4, 30.0), repertoire());
     let song = music.song();
     let dance = |n: usize, seed: u64| choreograph_group(&song, &repertoire, &rules(n, seed));
     assert_eq!(dance(3, 1), dance(3, 1));

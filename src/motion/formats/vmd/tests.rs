@@ -82,7 +82,7 @@ fn a_camera_looks_at_its_target() {
     for (got, want) in track.position_m[0].iter().zip([36.0 * 0.08, 12.0 * 0.08, -3.0 * 0.08]) {
         assert!((got - want).abs() < 1e-6, "{:?}", track.position_m);
     }
-    let sight = super::super::super::quaternion::rotate(track.orientation[0], [0.0, 0.0, 1.0]);
+    let sight = crate::motion::quaternion::rotate(track.orientation[0], [0.0, 0.0, 1.0]);
     for (got, want) in sight.iter().zip([-1.0, 0.0, 0.0]) {
         assert!((got - want).abs() < 1e-6, "{sight:?}");
     }

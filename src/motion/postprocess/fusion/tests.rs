@@ -1,12 +1,12 @@
 use ndarray::Array2;
 
-use super::super::noise::{
-    NONE, Noise, VARIANCES, exact, farthest, frames, fused, mean_square, noisy, truth,
-};
 use super::*;
 use crate::motion::channels::{BODY, Channel, MOTION_DIM};
 use crate::motion::kinematics::{Poses, forward_differences, frames_of};
 use crate::motion::npy;
+use crate::motion::postprocess::noise::{
+    NONE, Noise, VARIANCES, exact, farthest, frames, fused, mean_square, noisy, truth,
+};
 use crate::motion::postprocess::{
     AxisVariances, Coherence, PostProcessConfig, SavitzkyGolay, process, process_holding,
 };

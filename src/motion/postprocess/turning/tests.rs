@@ -1,8 +1,8 @@
-use super::super::fusion::Displacement;
-use super::super::noise::{
+use super::*;
+use crate::motion::postprocess::fusion::Displacement;
+use crate::motion::postprocess::noise::{
     NONE, Noise, VARIANCES, exact, farthest, fused, mean_square, noisy, truth,
 };
-use super::*;
 use crate::motion::quaternion::from_axis_angle;
 
 /// About one axis rotations add like numbers, so that the definition for positions, without accelerations,

@@ -1,5 +1,5 @@
-use super::super::noise::VARIANCES;
 use super::*;
+use crate::motion::postprocess::noise::VARIANCES;
 
 #[test]
 fn variances_are_written_by_name_and_must_be_above_nothing() {

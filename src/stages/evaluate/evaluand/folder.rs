@@ -5,14 +5,14 @@ use std::path::Path;
 
 use anyhow::{Context as _, bail, ensure};
 
-use super::super::foreign::{self, RefusedFile};
-use super::super::job::EvaluationMotion;
-use super::super::motions::{self, PhraseIndex};
-use super::super::params::Params;
-use super::super::splits::MusicSplit;
 use super::{Evaluand, MAX_NOTES};
 use crate::motion::group::MAX_DANCERS;
 use crate::motion::postprocess::PostProcessConfig;
+use crate::stages::evaluate::foreign::{self, RefusedFile};
+use crate::stages::evaluate::job::EvaluationMotion;
+use crate::stages::evaluate::motions::{self, PhraseIndex};
+use crate::stages::evaluate::params::Params;
+use crate::stages::evaluate::splits::MusicSplit;
 use crate::stages::failure::{Failure, FailureKind};
 use crate::store::StoreSnapshot;
 use crate::training::Ensemble;

@@ -5,12 +5,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use anyhow::bail;
 use ndarray::{Array2, Array3, Axis};
 
-use super::super::group::GroupMeasurer;
-use super::super::job::{EvaluatedMotion, EvaluationJob};
-use super::super::measure::{MeasuredMotion, stride_for};
 use super::Evaluand;
 use crate::evaluation::keyframe::{KeyframeMisses, keyframe_misses};
 use crate::stages::Progress;
+use crate::stages::evaluate::group::GroupMeasurer;
+use crate::stages::evaluate::job::{EvaluatedMotion, EvaluationJob};
+use crate::stages::evaluate::measure::{MeasuredMotion, stride_for};
 use crate::store::tables;
 use crate::store::{Location, StoreError};
 

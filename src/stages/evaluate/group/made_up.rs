@@ -5,20 +5,20 @@ use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis};
 use crate::motion::Channel;
 
 /// Mean place of a dancer on the floor, m.
-pub(super) type Place = [f32; 2];
+pub(super) type FloorPoint = [f32; 2];
 
-fn mean_place(dancer: ArrayView2<f32>) -> Place {
+fn mean_place(dancer: ArrayView2<f32>) -> FloorPoint {
     let first = Channel::Position.range().start;
     [first, first + 2].map(|i| dancer.column(i).mean().unwrap_or_default())
 }
 
 /// Returns the mean places of the dancers of a group.
-pub(super) fn places(group: ArrayView3<f32>) -> Vec<Place> {
+pub(super) fn places(group: ArrayView3<f32>) -> Vec<FloorPoint> {
     group.outer_iter().map(mean_place).collect()
 }
 
 /// Moves a dancer so that its mean place is `to`.
-fn moved(dancer: ArrayView2<f32>, to: Place) -> Array2<f32> {
+fn moved(dancer: ArrayView2<f32>, to: FloorPoint) -> Array2<f32> {
     let from = mean_place(dancer);
     let mut dancer = dancer.to_owned();
     let first = Channel::Position.range().start;
@@ -48,7 +48,7 @@ pub(super) fn independent(group: ArrayView3<f32>, strangers: &[ArrayView2<f32>])
 }
 
 /// The dancers of a group in given places; who has none stays.
-pub(super) fn placed(group: ArrayView3<f32>, to: &[Place]) -> Array3<f32> {
+pub(super) fn placed(group: ArrayView3<f32>, to: &[FloorPoint]) -> Array3<f32> {
     let mut group = group.to_owned();
     for (mut dancer, &to) in group.outer_iter_mut().zip(to) {
         let there = moved(dancer.view(), to);

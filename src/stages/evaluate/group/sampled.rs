@@ -7,13 +7,6 @@ use anyhow::Context as _;
 use ndarray::{Array3, Axis, concatenate};
 use serde::Serialize;
 
-use super::super::baselines::{BaselineMotion, MusicWindow, cache};
-use super::super::evaluand::Evaluand;
-use super::super::job::SampledWindow;
-use super::super::params::Params;
-use super::super::sampled::BASELINE_SEED;
-use super::super::splits::MusicSplit;
-use super::super::subjects::Subject;
 use super::{GroupMeasurer, SampledGroup};
 use crate::autodiff::Parameters;
 use crate::diffusion::Schedule;
@@ -21,6 +14,13 @@ use crate::generation::{
     EngineError, FamilyCard as _, GroupCard, GroupEngine, GroupGenerator, GroupTrack,
 };
 use crate::model::{GroupNetworks, condition};
+use crate::stages::evaluate::baselines::{BaselineMotion, MusicWindow, cache};
+use crate::stages::evaluate::evaluand::Evaluand;
+use crate::stages::evaluate::job::SampledWindow;
+use crate::stages::evaluate::params::Params;
+use crate::stages::evaluate::sampled::BASELINE_SEED;
+use crate::stages::evaluate::splits::MusicSplit;
+use crate::stages::evaluate::subjects::Subject;
 use crate::stages::generate::{GroupSettings, group_parameters, seed_of};
 use crate::stages::model_files::{ModelFolder, default_model_cache};
 use crate::stages::pool::{self, lock};
@@ -60,7 +60,7 @@ struct GroupBaselineKey<'a> {
 impl Evaluand {
     /// Samples baselines for windows of the music of a split: gives groups to `measurer`, and returns their dancers; none,
     /// and a note, where the model is not there.
-    pub(in super::super) fn sampled_groups(
+    pub(in crate::stages::evaluate) fn sampled_groups(
         &mut self,
         store: &Location,
         params: &Params,

@@ -1,6 +1,5 @@
 //! The files of a model of groups, held against the interpreter that trained its networks.
 
-use anyhow::Context as _;
 use bytes::Bytes;
 use ndarray::Array3;
 
@@ -13,16 +12,12 @@ use crate::model::{
     ParameterList,
 };
 use crate::motion::{CLOCK_DIM, MOTION_DIM};
-use crate::onnx::{
-    Device, GroupNames, GroupScoreNames, Model, NamedTensor, Numbers, Runtime, Session,
-    SessionOptions, values_of,
-};
+use crate::onnx::{GroupNames, GroupScoreNames, Model, NamedTensor, Numbers, Runtime, values_of};
 use crate::stages::export::Params;
 use crate::stages::export::checks::{
-    CheckResults, Difference, FORWARD_TOLERANCE, difference, timed,
+    CheckResults, Difference, FORWARD_TOLERANCE, check_row, difference, sessions, timed,
 };
 use crate::store::tables::OnnxCheckRow;
-use crate::store::{TimestampUs, write_file};
 
 /// Groups that both engines are asked about.
 #[derive(Clone, Copy)]
@@ -39,20 +34,7 @@ pub fn checks(
     files: &[(ModelFileName, Bytes)],
     runtime: &Runtime,
 ) -> anyhow::Result<CheckResults> {
-    let folder = tempfile::tempdir().context("while making a temporary folder")?;
-    let options = SessionOptions {
-        n_threads: params.machine.threads.get(),
-        is_alone: true,
-        device: Device::Cpu,
-        is_optimized: false,
-    };
-    let mut sessions = Vec::new();
-    for (name, bytes) in files {
-        let path = folder.path().join(name.name());
-        write_file(&path, |out| out.write_all(bytes))
-            .with_context(|| format!("while writing {}", path.display()))?;
-        sessions.push(Session::open(runtime, &path, options)?);
-    }
+    let mut sessions = sessions(files, params, runtime)?;
     let [denoiser, score] = &mut sessions[..] else { unreachable!("two files are written") };
     let network = &trained.state.config.network;
     let (networks, list) = GroupNetworks::new(&network.group);
@@ -84,25 +66,11 @@ pub fn checks(
         }
     }
     let build = runtime.build();
-    let row =
-        |(case, name, apart, onnx_s, eager_s): (Case, &str, Difference, f64, f64)| OnnxCheckRow {
-            model: params.model.clone(),
-            run: params.run.clone(),
-            check: name.to_owned(),
-            precision: params.precision.name().to_owned(),
-            n_samples: (case.n_groups * case.n_dancers) as i32,
-            n_frames: case.n_frames as i32,
-            n_steps: None,
-            guidance: None,
-            max_abs: apart.max_abs,
-            rms: apart.rms,
-            tolerance: FORWARD_TOLERANCE,
-            passed: apart.max_abs <= FORWARD_TOLERANCE,
-            onnx_s: Some(onnx_s),
-            eager_s,
-            runtime: build.clone(),
-            time: TimestampUs::now(),
-        };
+    let row = |(case, check, apart, onnx_s, eager_s): (Case, &str, Difference, f64, f64)| {
+        let shape = (case.n_groups * case.n_dancers, case.n_frames);
+        let row = check_row(params, check, shape, apart, FORWARD_TOLERANCE);
+        OnnxCheckRow { onnx_s: Some(onnx_s), eager_s, runtime: build.clone(), ..row }
+    };
     let rows = rows.into_iter().map(row).collect();
     Ok(CheckResults { rows, runtime: runtime.build() })
 }

@@ -11,15 +11,14 @@ use crate::generation::{ModelFileName, TokensCard, tokens_parameters};
 use crate::model::{Graph as _, Planner, PlannerInputs, Tokenizer, condition_scale};
 use crate::motion::{CLOCK_DIM, MOTION_DIM};
 use crate::onnx::{
-    Device, Model, NamedTensor, Numbers, PlannerMusicNames, PlannerNames, PlannerStepNames,
-    Runtime, Session, SessionOptions, SignalDenoiserNames, SignalNames, TokenEncoderNames,
+    Model, NamedTensor, Numbers, PlannerMusicNames, PlannerNames, PlannerStepNames, Runtime,
+    Session, SignalDenoiserNames, SignalNames, TokenEncoderNames,
 };
 use crate::stages::export::Params;
 use crate::stages::export::checks::{
-    CheckResults, Difference, FORWARD_TOLERANCE, difference, timed,
+    CheckResults, Difference, FORWARD_TOLERANCE, check_row, difference, sessions, timed,
 };
 use crate::store::tables::OnnxCheckRow;
-use crate::store::{TimestampUs, write_file};
 
 /// Windows that both engines are asked about.
 #[derive(Clone, Copy)]
@@ -47,20 +46,7 @@ pub fn checks(
     files: &[(ModelFileName, Bytes)],
     runtime: &Runtime,
 ) -> anyhow::Result<CheckResults> {
-    let folder = tempfile::tempdir().context("while making a temporary folder")?;
-    let options = SessionOptions {
-        n_threads: params.machine.threads.get(),
-        is_alone: true,
-        device: Device::Cpu,
-        is_optimized: false,
-    };
-    let mut sessions = Vec::new();
-    for (name, bytes) in files {
-        let path = folder.path().join(name.name());
-        write_file(&path, |out| out.write_all(bytes))
-            .with_context(|| format!("while writing {}", path.display()))?;
-        sessions.push(Session::open(runtime, &path, options)?);
-    }
+    let mut sessions = sessions(files, params, runtime)?;
     let [encoder, signal, denoiser, planner, of_steps @ ..] = &mut sessions[..] else {
         unreachable!("four files are written at least")
     };
@@ -120,23 +106,9 @@ pub fn checks(
         }
     }
     let build = runtime.build();
-    let row = |(case, name, apart, tolerance, onnx_s, eager_s): CheckRow| OnnxCheckRow {
-        model: params.model.clone(),
-        run: params.run.clone(),
-        check: name.to_owned(),
-        precision: params.precision.name().to_owned(),
-        n_samples: case.n_windows as i32,
-        n_frames: case.n_frames as i32,
-        n_steps: None,
-        guidance: None,
-        max_abs: apart.max_abs,
-        rms: apart.rms,
-        tolerance,
-        passed: apart.max_abs <= tolerance,
-        onnx_s: Some(onnx_s),
-        eager_s,
-        runtime: build.clone(),
-        time: TimestampUs::now(),
+    let row = |(case, check, apart, tolerance, onnx_s, eager_s): CheckRow| {
+        let row = check_row(params, check, (case.n_windows, case.n_frames), apart, tolerance);
+        OnnxCheckRow { onnx_s: Some(onnx_s), eager_s, runtime: build.clone(), ..row }
     };
     let rows = rows.into_iter().map(row).collect();
     Ok(CheckResults { rows, runtime: runtime.build() })

@@ -20,7 +20,7 @@ const N_WINDOWS: usize = 16;
 /// decoder leaves; none without validation phrases as long as a window.
 ///
 /// # Errors
-/// When the frames cannot be read, or what the engines say.
+/// When the frames cannot be read, or errors of the engines.
 pub fn sampling_defaults(
     trained: &TrainedTokens,
     threads: NonZeroUsize,

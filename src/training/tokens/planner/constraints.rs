@@ -4,7 +4,7 @@
 //! or 5 frames, at a quarter of them or at all, each as often. The paper of the planners does not say how it draws.
 
 use crate::autodiff::Stream;
-use crate::model::{AskedPose, CONSTRAINT_DIM};
+use crate::model::{CONSTRAINT_DIM, PoseConstraint};
 use crate::motion::quaternion::normalize;
 use crate::motion::{Channel, Normalizer};
 use crate::training::batch::Batch;
@@ -62,7 +62,7 @@ fn n_asked(n: usize, u: f64) -> usize {
 
 /// Returns what is asked of a frame, in the tokenizer's units; of the subset bit 0 is the floor, 1 the height, 2 the
 /// orientation.
-fn asked(frame: &[f32], normalizer: &Normalizer, subset: usize) -> AskedPose {
+fn asked(frame: &[f32], normalizer: &Normalizer, subset: usize) -> PoseConstraint {
     let has = |bit: usize| subset & (1 << bit) != 0;
     let [x, y, z] = [0, 1, 2].map(|axis| frame[Channel::Position.range().start + axis]);
     let first = Channel::Quaternion.range().start;
@@ -70,7 +70,7 @@ fn asked(frame: &[f32], normalizer: &Normalizer, subset: usize) -> AskedPose {
         let channel = first + i;
         f64::from(frame[channel] * normalizer.scale[channel] + normalizer.centre[channel])
     });
-    AskedPose {
+    PoseConstraint {
         floor: has(0).then_some([x, z]),
         height: has(1).then_some(y),
         orientation: has(2).then(|| normalize(q)),

@@ -9,19 +9,18 @@ mod inputs;
 
 use std::sync::Arc;
 
-use crate::autodiff::{Arena, Eager, Interpreter as _, Parameters, Tape, Threads};
+use crate::autodiff::{Arena, Eager, Interpreter as _, Parameters, Tape};
 use crate::model::{Planner, PlannerConfig, Tokenizer, TokensConfig};
 use crate::motion::MOTION_DIM;
 use crate::training::averaged::NetworkState;
 use crate::training::batch::Batch;
-use crate::training::checkpoint::Progress;
 use crate::training::diffusion::tape_seed;
 use crate::training::error::TrainingError;
-use crate::training::learner::{Learner, Losses, Ownership, StepResult, Validation};
+use crate::training::learner::{
+    CheckpointState, Learner, Losses, Ownership, PartedLearner, StepResult, Validation,
+};
 use crate::training::parts::Parts;
-use crate::training::ranks::Ranks;
 use crate::training::window::Windows;
-use crate::weights::{Archive, Section};
 
 use super::{MAX_VALIDATION_WINDOWS, MIN_VALIDATION_WINDOWS, VALIDATION_BATCH};
 pub use config::{PlannerNetworkConfig, PlannerTrainConfig, PlannerTraining, TokenizerSource};
@@ -38,12 +37,13 @@ pub const PLANNER: &str = "planner.";
 pub struct FrozenTokenizer {
     tokenizer: Tokenizer,
     sizes: TokensConfig,
-    parameters: Parameters<f32>,
+    parameters: Arc<Parameters<f32>>,
 }
 
 impl FrozenTokenizer {
     /// Holds a tokenizer; `parameters` are those of [`Tokenizer`].
     pub fn new(sizes: &TokensConfig, parameters: Parameters<f32>) -> Self {
+        let parameters = Arc::new(parameters);
         Self { tokenizer: Tokenizer::new(sizes).0, sizes: sizes.clone(), parameters }
     }
 
@@ -99,22 +99,6 @@ impl PlannerLearner {
             seed,
             windows: Arc::clone(windows),
         })
-    }
-
-    /// Has steps run on threads; the results are the same on any.
-    pub fn on(mut self, threads: &Arc<Threads>) -> Self {
-        self.parts.on(threads);
-        self
-    }
-
-    /// Trains together with other processes.
-    ///
-    /// # Errors
-    /// When the parts of a batch cannot be shared out evenly.
-    pub fn among(mut self, ranks: &Arc<Ranks>) -> Result<Self, TrainingError> {
-        self.parts.among(ranks)?;
-        self.network.among(ranks);
-        Ok(self)
     }
 
     /// Computes the gradients of a batch, part by part; returns its loss.
@@ -187,12 +171,7 @@ impl Learner for PlannerLearner {
         n_steps: u64,
     ) -> Result<StepResult, TrainingError> {
         let loss = self.differentiate(batch, step)?;
-        let learning_rate = self.config.learning_rate.at(step, n_steps);
-        let Self { network, parts, .. } = self;
-        let threads = Arc::clone(parts.threads());
-        let gradient_norm =
-            threads.run(|| network.step(parts.gradients(), loss, learning_rate, step))?;
-        Ok(StepResult { losses: whole(loss), gradient_norm, learning_rate, lr_decoder: None })
+        self.take_step(whole(loss), self.config.learning_rate.at(step, n_steps), step)
     }
 
     fn rehearse(&mut self, batch: &Batch) -> Result<(), TrainingError> {
@@ -209,36 +188,17 @@ impl Learner for PlannerLearner {
         self.parts.ownership(1)
     }
 
-    fn collect_average(&mut self) -> Result<(), TrainingError> {
-        self.network.collect_average()
+    fn state(&self) -> Vec<&dyn CheckpointState> {
+        vec![&self.network]
     }
 
-    fn collect(&mut self) -> Result<(), TrainingError> {
-        self.network.collect()
+    fn state_mut(&mut self) -> Vec<&mut dyn CheckpointState> {
+        vec![&mut self.network]
     }
+}
 
-    fn release(&mut self) {
-        self.network.release();
-    }
-
-    fn sections(&self) -> Vec<Section<'_, f32>> {
-        self.network.sections()
-    }
-
-    fn best(&self) -> Vec<Section<'_, f32>> {
-        self.network.best()
-    }
-
-    fn n_updates(&self) -> (u64, u64) {
-        self.network.n_updates()
-    }
-
-    fn restore(
-        &mut self,
-        archive: &Archive,
-        place: &str,
-        at: &Progress,
-    ) -> Result<(), TrainingError> {
-        self.network.restore(archive, place, at)
+impl PartedLearner for PlannerLearner {
+    fn parts_and_network(&mut self) -> (&mut Parts, &mut NetworkState) {
+        (&mut self.parts, &mut self.network)
     }
 }

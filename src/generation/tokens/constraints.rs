@@ -6,7 +6,7 @@ use ndarray::{Array2, ArrayView1};
 use serde::{Deserialize, Serialize};
 
 use crate::generation::control::{Constraints, WantedValue};
-use crate::model::{AskedPose, CONSTRAINT_DIM};
+use crate::model::{CONSTRAINT_DIM, PoseConstraint};
 use crate::motion::quaternion::{Quaternion, normalize};
 use crate::motion::{Channel, MOTION_DIM, Normalizer, Placement};
 
@@ -16,11 +16,11 @@ use crate::motion::{Channel, MOTION_DIM, Normalizer, Placement};
 pub enum Control {
     /// On the plan and in decoding.
     Both,
-    /// On the plan alone: motion is made that goes there by and large.
+    /// On the plan alone: motion meets them roughly.
     Plan,
-    /// In decoding alone: motion that was planned without them is moved there.
+    /// In decoding alone: motion is planned without them and moved to meet them.
     Decode,
-    /// Nowhere; how far motion is from them is told.
+    /// Nowhere; how far motion is from them is reported.
     None,
 }
 
@@ -46,14 +46,14 @@ impl Control {
     }
 }
 
-/// Returns what is asked of the poses of a window, [`AskedPose::channels`] of each frame; none where nothing is.
+/// Returns the constraints on the poses of a window, [`PoseConstraint::channels`] of each frame; none where there are none.
 ///
 /// - `frames`: those of the window in the track
 /// - `place`: where the window stands in the world
 /// - `normalizer`: the tokenizer's units
 ///
-/// Of a point of the floor x alone, or z alone, says nothing once the window is turned, and is left to decoding.
-pub fn asked_of_window(
+/// x alone, or z alone, is no constraint on a point of the floor once the window is turned, and is left to decoding.
+pub fn window_constraints(
     constraints: &Constraints,
     frames: &Range<usize>,
     place: Placement,
@@ -87,7 +87,7 @@ pub fn asked_of_window(
     let mut channels = Array2::zeros((n, CONSTRAINT_DIM));
     for (t, [x, y, z, is_turned]) in has.into_iter().enumerate() {
         let at = |axis: usize| poses[[t, Channel::Position.range().start + axis]];
-        let asked = AskedPose {
+        let asked = PoseConstraint {
             floor: (x && z).then(|| [at(0), at(2)]),
             height: y.then(|| at(1)),
             orientation: is_turned.then_some(turned[t]),
@@ -118,7 +118,7 @@ mod tests {
             Constraints::new(wanted, 400, ChannelLimits::Wide).expect("sound constraints");
         let mut normalizer = Normalizer::identity();
         (normalizer.centre[1], normalizer.scale[2]) = (0.5, 2.0);
-        asked_of_window(&constraints, &(100..110), place, &normalizer)
+        window_constraints(&constraints, &(100..110), place, &normalizer)
     }
 
     #[test]
@@ -172,7 +172,7 @@ mod tests {
         let mut placed = motion;
         place.remove(&mut placed);
         for (row, pose) in channels.rows().into_iter().zip(placed.rows()) {
-            let expected = AskedPose {
+            let expected = PoseConstraint {
                 floor: Some([pose[0], pose[2] / 2.0]),
                 height: Some(pose[1] - 0.5),
                 orientation: Some(orientation(pose)),

@@ -7,12 +7,12 @@ use crate::store::{Commit, Item, Ledger, Location, SettledItem, StoreError, dige
 
 /// Items whose content a stage has seen again under another fingerprint.
 #[derive(Debug)]
-pub struct SeenContent {
+pub struct TouchedContent {
     stage: &'static str,
     ledger: Ledger,
 }
 
-impl SeenContent {
+impl TouchedContent {
     /// Reads what was seen again, as commits of `stage` have it.
     ///
     /// # Errors
