@@ -72,6 +72,7 @@ pub fn matmul<E: Element>(
                 c_panel: PANEL,
                 n_columns: (n - panel * PANEL).min(MAX_PANELS * PANEL),
                 add,
+                goes_on: false,
                 stream: false,
             };
             // SAFETY: strips and columns have k rows each, the result was checked to hold m rows.
