@@ -75,7 +75,8 @@ pub fn weight_gradient_of_many<E: Element>(
         let mut strips = arena.take(&[panels(channels), rows * PANEL]);
         let strips_of = strips.as_slice_mut().expect("one run of memory");
         let widest = split(own.len(), own.len().div_ceil(super::tile::MAX_PANELS));
-        let mut columns = arena.take(&[widest.iter().map(Range::len).max().unwrap_or(0), rows * PANEL]);
+        let mut columns =
+            arena.take(&[widest.iter().map(Range::len).max().unwrap_or(0), rows * PANEL]);
         let columns_of = columns.as_slice_mut().expect("one run of memory");
         // What is there is added to at the end, so that sums begin at zero.
         let mut sums = add[0].then(|| arena.take(&[d_weight.len()]));
@@ -92,13 +93,23 @@ pub fn weight_gradient_of_many<E: Element>(
                 pack_block(d_out, n, of_all, rows, columns_of);
                 let n_rows = d_out.len() / n;
                 let sums = sums_bias[group.start * PANEL..].chunks_exact_mut(PANEL);
-                for (sums, panel) in sums.zip(columns_of.chunks_exact(rows * PANEL)).take(group.len()) {
+                for (sums, panel) in
+                    sums.zip(columns_of.chunks_exact(rows * PANEL)).take(group.len())
+                {
                     for row in panel.chunks_exact(PANEL).take(n_rows) {
                         sums.iter_mut().zip(row).for_each(|(sum, &x)| *sum += x);
                     }
                 }
-                let target = &mut target[group.start * channels * PANEL..][..group.len() * channels * PANEL];
-                add_block(strips_of, columns_of, [n_rows, rows, channels], group.len(), target, i > 0);
+                let target =
+                    &mut target[group.start * channels * PANEL..][..group.len() * channels * PANEL];
+                add_block(
+                    strips_of,
+                    columns_of,
+                    [n_rows, rows, channels],
+                    group.len(),
+                    target,
+                    i > 0,
+                );
             }
         }
         if let Some(sums) = sums {
@@ -123,7 +134,10 @@ fn add_block<E: Element>(
     target: &mut [E],
     goes_on: bool,
 ) {
-    assert!(n_rows <= rows && strips.len() == panels(channels) * rows * PANEL, "strips of the block");
+    assert!(
+        n_rows <= rows && strips.len() == panels(channels) * rows * PANEL,
+        "strips of the block"
+    );
     assert!(columns.len() >= n_panels * rows * PANEL, "columns of the block");
     assert_eq!(target.len(), n_panels * channels * PANEL, "panels of {channels} inputs");
     let target = target.as_mut_ptr();

@@ -2,10 +2,10 @@
 
 use crate::autodiff::element::Element;
 
-use super::vectorized;
 use super::pack::{PANEL, panels, transpose_16};
 use super::product::split;
 use super::tile::{MAX_PANELS, MAX_ROWS, Tile};
+use super::vectorized;
 
 /// A matrix in memory: element (i, j) is `data[i rows + j columns]`, one of the two being 1.
 #[derive(Clone, Copy)]
@@ -32,7 +32,7 @@ impl<E> Matrix<'_, E> {
 ///
 /// # Shapes
 /// `[m, k, n]`: A is \[m, k\], B \[k, n\], C \[m, n\]. `scratch` is grown as needed and holds a copy of B, and one of A
-/// unless α is 1 and its columns lie side by side.
+/// unless α is 1.
 pub fn matmul<E: Element>(
     [m, k, n]: [usize; 3],
     alpha: E,
@@ -46,8 +46,10 @@ pub fn matmul<E: Element>(
         return;
     }
     assert!(c.data.len() >= (m - 1) * c.row_stride + n, "a result of {m} rows");
-    let in_place = alpha == E::ONE && a.strides[1] == 1;
-    assert!(!in_place || a.data.len() >= (m - 1) * a.strides[0] + k, "a factor of {m} rows");
+    let in_place = alpha == E::ONE;
+    let [row, column] = a.strides;
+    let last = (m - 1) * row + k.saturating_sub(1) * column;
+    assert!(!in_place || k == 0 || a.data.len() > last, "a factor of {m} rows");
     let a_len = if in_place { 0 } else { panels(m) * k * PANEL };
     let len = a_len + panels(n) * k * PANEL;
     if scratch.len() < len {
@@ -59,19 +61,19 @@ pub fn matmul<E: Element>(
     }
     pack(n, k, b.t(), columns, E::ONE);
     let strips = &*strips;
-    let row_of = |row: usize| match in_place {
-        true => a.data[row * a.strides[0]..].as_ptr(),
-        false => strips[row / PANEL * k * PANEL + row % PANEL..].as_ptr(),
+    let row_of = |r: usize| match in_place {
+        true => a.data[r * row..].as_ptr(),
+        false => strips[r / PANEL * k * PANEL + r % PANEL..].as_ptr(),
     };
     let c_start = c.data.as_mut_ptr();
     for group in split(panels(n), panels(n).div_ceil(MAX_PANELS)) {
         for first in (0..m).step_by(MAX_ROWS) {
             let n_rows = (m - first).min(MAX_ROWS);
-            let row = |r: usize| first + r.min(n_rows - 1);
+            let row_at = |r: usize| first + r.min(n_rows - 1);
             let tile = Tile {
-                rows: std::array::from_fn(|r| row_of(row(r))),
+                rows: std::array::from_fn(|r| row_of(row_at(r))),
                 n_rows,
-                step: if in_place { 1 } else { PANEL },
+                step: if in_place { column } else { PANEL },
                 k,
                 segments: 1,
                 a_segment: 0,
@@ -80,7 +82,7 @@ pub fn matmul<E: Element>(
                 b_segment: 0,
                 n_panels: group.len(),
                 c: std::array::from_fn(|r| {
-                    c_start.wrapping_add(row(r) * c.row_stride + group.start * PANEL)
+                    c_start.wrapping_add(row_at(r) * c.row_stride + group.start * PANEL)
                 }),
                 c_panel: PANEL,
                 n_columns: n.min(group.end * PANEL) - group.start * PANEL,

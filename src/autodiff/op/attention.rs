@@ -266,7 +266,8 @@ impl<E: Element> Operation<E> for Attend<E> {
                 samples.for_each(|(b, d)| {
                     for (place, part) in &mine {
                         for h in 0..heads {
-                            let source = part.data()[(b * heads + h) * frames * dim..].chunks_exact(dim);
+                            let source =
+                                part.data()[(b * heads + h) * frames * dim..].chunks_exact(dim);
                             for (target, source) in d.chunks_exact_mut(channels).zip(source) {
                                 let target = &mut target[place.first + h * dim..][..dim];
                                 if apart {

@@ -82,7 +82,8 @@ impl<E: Element> Operation<E> for Modulate<E> {
         let d_film = at.needs[1].then(|| {
             at.tensor(film.shape(), |d| {
                 d.fill(E::ZERO);
-                let samples = x.data().par_chunks_exact(sample).zip(dy.data().par_chunks_exact(sample));
+                let samples =
+                    x.data().par_chunks_exact(sample).zip(dy.data().par_chunks_exact(sample));
                 let films = d.par_chunks_exact_mut(2 * channels);
                 films.zip(samples).for_each(|(d, (x, dy))| {
                     let (ds, dh) = d.split_at_mut(channels);

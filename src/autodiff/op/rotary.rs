@@ -61,9 +61,8 @@ impl Rotary {
         let (frames, channels) = (shape[1], shape[2]);
         let turned = self.turned.unwrap_or(channels);
         let dim = turned / self.heads;
-        let rates: Vec<_> = (0..dim / 2)
-            .map(|pair| 10_000_f64.powf(-2.0 * pair as f64 / dim as f64))
-            .collect();
+        let rates: Vec<_> =
+            (0..dim / 2).map(|pair| 10_000_f64.powf(-2.0 * pair as f64 / dim as f64)).collect();
         let (mut cosines, mut sines) = (vec![E::ZERO; frames * dim], vec![E::ZERO; frames * dim]);
         let rows = cosines.par_chunks_exact_mut(dim).zip(sines.par_chunks_exact_mut(dim));
         rows.with_min_len(LANES).enumerate().for_each(|(frame, (cosines, sines))| {

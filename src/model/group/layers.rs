@@ -228,6 +228,21 @@ impl EncoderLayer {
         let h = self.feed_forward.forward(g, &x)?;
         g.add(&x, &h)
     }
+
+    /// As [`EncoderLayer::forward`] with a token before the frames, which is taken away again.
+    ///
+    /// # Shapes
+    /// `token`: \[batch, d\]; `x`: \[batch, frames, d\] → as `x`
+    pub fn behind_token<G: Graph>(
+        &self,
+        g: &mut G,
+        token: &G::Tensor,
+        x: &G::Tensor,
+    ) -> Result<G::Tensor> {
+        let with_token = g.concat_frames(&[token, x])?;
+        let h = self.forward(g, &with_token)?;
+        g.frames(&h, 1, None)
+    }
 }
 
 /// A pre-norm transformer layer over the frames of all dancers, and tokens before them.
