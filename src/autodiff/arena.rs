@@ -46,7 +46,7 @@ impl<E> Pool<E> {
         }
         let smaller = self.free.range(len / 2..len).map(|(&len, _)| len).next_back();
         if let Some(memory) = smaller.and_then(|smaller| self.remove(smaller)) {
-            let bytes = (memory.len() - ALIGNMENT) * size_of::<E>();
+            let bytes = memory.len().saturating_sub(ALIGNMENT) * size_of::<E>();
             self.usage.reserved_bytes = self.usage.reserved_bytes.saturating_sub(bytes);
         }
         None
@@ -154,5 +154,29 @@ mod tests {
         arena.give(other);
         let usage = arena.usage();
         assert_eq!((usage.peak_bytes, usage.reserved_bytes), (120, 120));
+    }
+
+    #[test]
+    fn numbers_of_rows_that_differ_do_not_fill_the_memory() {
+        let arena = Arena::<f32>::default();
+        let first = arena.take(&[100]);
+        let address = first.as_ptr();
+        arena.give(first);
+        let fewer = arena.take(&[80]);
+        assert_eq!((fewer.as_ptr(), fewer.len()), (address, 80));
+        arena.give(fewer);
+        // What is half as large again as asked for stays free for others; what is too small is given up.
+        let few = arena.take(&[40]);
+        assert_ne!(few.as_ptr(), address);
+        assert_eq!(arena.usage().reserved_bytes, (100 + 40) * 4);
+        let more = arena.take(&[120]);
+        assert_eq!(arena.usage().reserved_bytes, (40 + 120) * 4);
+        assert_eq!(arena.usage().in_use_bytes, (40 + 120) * 4);
+        arena.give(few);
+        arena.give(more);
+        for n in (100..120).rev() {
+            arena.give(arena.take(&[n]));
+        }
+        assert_eq!(arena.usage().reserved_bytes, (40 + 120) * 4);
     }
 }
