@@ -183,6 +183,15 @@ impl<I: Interpreter> Graph for I {
         self.apply(Rotary::new(heads), &with(&[x], past))
     }
 
+    fn rotary_first(
+        &mut self,
+        x: &Self::Tensor,
+        heads: usize,
+        [turned, _]: [usize; 2],
+    ) -> Result<Self::Tensor> {
+        self.apply(Rotary::of_first(heads, turned), &[x])
+    }
+
     fn hold_frames(&mut self, x: &Self::Tensor, multiple: usize) -> Result<Self::Tensor> {
         let held =
             x.shape().len() == 3 && x.shape()[1] > 0 && x.shape()[1].is_multiple_of(multiple);

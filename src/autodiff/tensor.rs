@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use ndarray::{ArrayD, ArrayViewD};
+use ndarray::{ArrayD, ArrayViewD, IxDyn};
 
 use super::arena::Arena;
 use super::element::Element;
@@ -12,6 +12,7 @@ use super::tape::NodeId;
 #[derive(Clone, Debug)]
 pub struct Tensor<E: Element> {
     value: Arc<Value<E>>,
+    shape: Vec<usize>,
     /// The node that computed it, where a tape recorded that.
     pub(super) node: Option<NodeId>,
 }
@@ -35,28 +36,31 @@ impl<E: Element> Tensor<E> {
     /// Wraps an array of the arena.
     pub(super) fn new(array: ArrayD<E>, arena: &Arena<E>) -> Self {
         debug_assert!(array.is_standard_layout(), "tensors lie in order");
+        let shape = array.shape().to_vec();
         let value = Value { array: Some(array), arena: arena.clone() };
-        Self { value: Arc::new(value), node: None }
+        Self { value: Arc::new(value), shape, node: None }
     }
 
     /// Returns the values as an array.
     pub fn view(&self) -> ArrayViewD<'_, E> {
-        self.array().view()
+        let shape = IxDyn(&self.shape);
+        ArrayViewD::from_shape(shape, self.data()).expect("the length is the product of the shape")
     }
 
     /// Returns the values in order.
     pub fn data(&self) -> &[E] {
-        self.array().as_slice().expect("tensors lie in order")
+        let array = self.value.array.as_ref().expect("present until dropped");
+        array.as_slice().expect("tensors lie in order")
     }
 
     /// Returns the size of each axis.
     pub fn shape(&self) -> &[usize] {
-        self.array().shape()
+        &self.shape
     }
 
     /// Returns the number of values.
     pub fn len(&self) -> usize {
-        self.array().len()
+        self.data().len()
     }
 
     /// Returns whether there are no values.
@@ -95,20 +99,11 @@ impl<E: Element> Tensor<E> {
         Arc::strong_count(&self.value) == 1
     }
 
-    /// Returns the same values under another shape of equal length.
-    pub(super) fn reshaped(self, shape: &[usize]) -> Self {
-        let arena = self.value.arena.clone();
-        let array = match Arc::try_unwrap(self.value) {
-            Ok(mut value) => value.array.take().expect("present until dropped"),
-            Err(shared) => {
-                let array = shared.array.as_ref().expect("present until dropped");
-                arena.copy(array.shape(), array.as_slice().expect("tensors lie in order"))
-            }
-        };
-        Self::new(array.into_shape_with_order(shape).expect("equal lengths"), &arena)
-    }
-
-    fn array(&self) -> &ArrayD<E> {
-        self.value.array.as_ref().expect("present until dropped")
+    /// Returns the same values under another shape of equal length; none is moved.
+    pub(super) fn reshaped(mut self, shape: &[usize]) -> Self {
+        assert_eq!(self.len(), shape.iter().product::<usize>(), "equal lengths");
+        self.shape = shape.to_vec();
+        self.node = None;
+        self
     }
 }

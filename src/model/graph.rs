@@ -256,6 +256,19 @@ pub trait Graph: Sized {
         past: Option<&Self::Tensor>,
     ) -> Result<Self::Tensor>;
 
+    /// Turns the first `turned` of `channels` channels as [`Graph::rotary`] does, `heads` heads, and leaves the others.
+    fn rotary_first(
+        &mut self,
+        x: &Self::Tensor,
+        heads: usize,
+        [turned, channels]: [usize; 2],
+    ) -> Result<Self::Tensor> {
+        let first = self.channels(x, 0..turned)?;
+        let first = self.rotary(&first, heads, None)?;
+        let others = self.channels(x, turned..channels)?;
+        self.concat(&[&first, &others])
+    }
+
     /// Repeats the last frame until their number is a multiple.
     fn hold_frames(&mut self, x: &Self::Tensor, multiple: usize) -> Result<Self::Tensor>;
 

@@ -25,7 +25,7 @@ pub use graph::{
 };
 pub use group::{
     GroupConfig, GroupDenoiser, GroupInputs, GroupNetworks, GroupPrediction, GroupScore,
-    GroupScoreInputs, GroupScores,
+    GroupScoreInputs, GroupScores, ScoredDancers, ScoredGroups,
 };
 pub use layers::{AttentionBlock, Conv1d, GroupNorm, LayerNorm, Linear, ResBlock};
 pub use outline::{ActivationCounts, Layer, Outline};

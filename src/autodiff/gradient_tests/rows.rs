@@ -88,3 +88,37 @@ fn a_fixed_table_gives_its_rows() {
     let y = eager.gather(&table, &index).expect("within the table");
     assert_eq!((y.shape(), y.data()), (&[2, 3][..], &[30.0, 31.0, 32.0, 10.0, 11.0, 12.0][..]));
 }
+
+#[test]
+fn the_first_channels_are_turned_by_the_formula_and_the_others_are_left() {
+    let (batch, frames, channels) = (2, 5, 79);
+    let (p, arena) = (none(), Arena::default());
+    let mut g = Eager::new(&p, &arena);
+    let values = numbers(batch * frames * channels, 4);
+    let x = g.input(&[batch, frames, channels], &values);
+    // Heads of 38 channels: two runs of 16, and pairs behind them.
+    let (heads, dim) = (2, 38);
+    let y = g.rotary_first(&x, heads, [heads * dim, channels]).expect("shapes fit");
+    for (row, (y, x)) in
+        y.data().chunks_exact(channels).zip(values.chunks_exact(channels)).enumerate()
+    {
+        let frame = (row % frames) as f64;
+        for head in 0..heads {
+            for pair in 0..dim / 2 {
+                let angle = frame * 10_000_f64.powf(-2.0 * pair as f64 / dim as f64);
+                let (at, (sin, cos)) = (head * dim + 2 * pair, angle.sin_cos());
+                let wanted = [x[at] * cos - x[at + 1] * sin, x[at] * sin + x[at + 1] * cos];
+                for (i, wanted) in wanted.into_iter().enumerate() {
+                    let found = y[at + i];
+                    assert!((found - wanted).abs() < 1e-14, "row {row}, {at}: {found}, {wanted}");
+                }
+            }
+        }
+        assert_eq!(y[heads * dim..], x[heads * dim..], "row {row}");
+    }
+    check(&[input(&[2, 3, 39], 1)], &p, |g, x| g.rotary_first(&x[0], 1, [36, 39]));
+    assert_eq!(
+        g.rotary_first(&x, 2, [80, channels]).expect_err("too many").to_string(),
+        "rotary: input has 79 channels, 80 are turned"
+    );
+}

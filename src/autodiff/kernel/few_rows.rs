@@ -82,6 +82,7 @@ pub fn input_gradient_of_few<E: Element>(
                         c_panel: PANEL,
                         n_columns: n_here * PANEL,
                         add: first > 0,
+                        goes_on: false,
                         stream: false,
                     };
                     // SAFETY: the weight has its panels, the columns were made of as many, and the part

@@ -15,6 +15,7 @@
 
 mod few_rows;
 mod gather;
+mod many_rows;
 mod pack;
 mod product;
 mod small;

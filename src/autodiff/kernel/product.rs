@@ -19,6 +19,9 @@ use super::tile::{MAX_PANELS, MAX_ROWS, Tile};
 /// Channels of a block: 3 panels of it (72 kB of `f32`) stay in the second cache while rows pass.
 const BLOCK: usize = 384;
 
+/// Elements of a chunk of rows: 768 kB of `f32`, of a second cache of 1 MB or more.
+const CHUNK_LEN: usize = 3 << 16;
+
 /// Output rows up to which the product for the input's gradient is computed transposed.
 const FEW_ROWS: usize = 64;
 
@@ -42,14 +45,20 @@ impl<E> SharedPointer<E> {
 /// Splits panels into groups of at most three, evenly, at least one for each thread where possible.
 pub fn groups(n_panels: usize) -> Vec<Range<usize>> {
     let threads = rayon::current_num_threads();
-    let n = n_panels.div_ceil(MAX_PANELS).next_multiple_of(threads).min(n_panels);
-    (0..n).map(|i| i * n_panels / n..(i + 1) * n_panels / n).collect()
+    split(n_panels, n_panels.div_ceil(MAX_PANELS).next_multiple_of(threads).min(n_panels))
 }
 
-/// Splits rows into chunks, so that there are enough tasks for the threads.
-fn row_chunks(rows: usize, n_groups: usize) -> Vec<Range<usize>> {
+/// Splits 0..len into n ranges, evenly.
+pub fn split(len: usize, n: usize) -> Vec<Range<usize>> {
+    (0..n).map(|i| i * len / n..(i + 1) * len / n).collect()
+}
+
+/// Splits rows of `channels` numbers into chunks that stay in the second cache while all panels meet them, and so that
+/// there are enough tasks for the threads.
+fn row_chunks(rows: usize, channels: usize, n_groups: usize) -> Vec<Range<usize>> {
     let threads = rayon::current_num_threads();
     let wanted = if n_groups >= threads { 1 } else { (2 * threads).div_ceil(n_groups) };
+    let wanted = wanted.max((rows * channels).div_ceil(CHUNK_LEN));
     let size = rows.div_ceil(wanted).next_multiple_of(MAX_ROWS);
     (0..rows).step_by(size.max(1)).map(|at| at..rows.min(at + size)).collect()
 }
@@ -116,6 +125,7 @@ unsafe fn run_rows<E: Element>(
             c_panel: PANEL,
             n_columns: columns.len(),
             add,
+            goes_on: false,
             stream: false,
         };
         // SAFETY: rows are slices of k elements; the rest is the caller's promise.
@@ -146,9 +156,9 @@ pub fn product<E: Element>(
     let zeros = zeros::<E>();
     let out = SharedPointer::new(out);
     let groups = groups(panels(n));
-    let chunks = row_chunks(gather.target.len(), groups.len());
+    let chunks = row_chunks(gather.target.len(), channels, groups.len());
     let tasks: Vec<_> =
-        groups.iter().flat_map(|group| chunks.iter().map(move |rows| (group, rows))).collect();
+        chunks.iter().flat_map(|rows| groups.iter().map(move |group| (group, rows))).collect();
     tasks.into_par_iter().for_each(|(group, rows)| {
         let columns = group.start * PANEL..n.min(group.end * PANEL);
         if let Some(bias) = bias {
@@ -209,6 +219,9 @@ pub fn input_gradient<E: Element>(
     }
     let phases = conv.backward();
     let zeros = zeros::<E>();
+    if *conv == Conv::linear(conv.out_rows()) && d_out.len() > CHUNK_LEN {
+        return input_gradient_of_many(d_out, n, &phases[0], weight, d_source, channels, arena);
+    }
     let out = SharedPointer::new(d_source);
     let groups = groups(panels(channels));
     let scratch = || Arena::<E>::aligned(MAX_PANELS * BLOCK * PANEL);
@@ -249,6 +262,53 @@ pub fn input_gradient<E: Element>(
             }
         }
     });
+}
+
+/// As [`input_gradient`] of a linear layer over many rows: the weight is transposed as a whole first, and then a chunk of
+/// rows meets all of it before the next one does. Numbers are summed in the same order.
+fn input_gradient_of_many<E: Element>(
+    d_out: &[E],
+    n: usize,
+    gather: &GatherRows,
+    weight: &[E],
+    d_source: &mut [E],
+    channels: usize,
+    arena: &Arena<E>,
+) {
+    let zeros = zeros::<E>();
+    let out = SharedPointer::new(d_source);
+    let groups = groups(panels(channels));
+    // Panels of [n / BLOCK][BLOCK][16] each.
+    let panel_len = n.next_multiple_of(BLOCK) * PANEL;
+    let mut turned = arena.take(&[panels(channels), panel_len]);
+    let turned_of = turned.as_slice_mut().expect("one run of memory");
+    turned_of.par_chunks_mut(panel_len).enumerate().for_each(|(p, panel)| {
+        let columns = p * PANEL..channels.min((p + 1) * PANEL);
+        for (first, block) in (0..n).step_by(BLOCK).zip(panel.chunks_exact_mut(BLOCK * PANEL)) {
+            transpose_block(weight, channels, 0, &columns, &(first..n.min(first + BLOCK)), block);
+        }
+    });
+    let turned_of = &*turned_of;
+    let chunks = row_chunks(gather.target.len(), n, groups.len());
+    let tasks: Vec<_> =
+        chunks.iter().flat_map(|rows| groups.iter().map(move |group| (group, rows))).collect();
+    tasks.into_par_iter().for_each(|(group, rows)| {
+        let columns = group.start * PANEL..channels.min(group.end * PANEL);
+        for first in (0..n).step_by(BLOCK) {
+            let block = Block {
+                b: turned_of[group.start * panel_len + first * PANEL..].as_ptr(),
+                b_panel: panel_len,
+                tap: 0,
+                channels: first..n.min(first + BLOCK),
+            };
+            // SAFETY: lengths were checked by the caller; the task owns its rows and columns.
+            unsafe {
+                let (rows, columns, add) = (rows.clone(), columns.clone(), first > 0);
+                run_rows(gather, rows, d_out, n, &block, &zeros, &out, channels, columns, add);
+            }
+        }
+    });
+    arena.give(turned);
 }
 
 /// Fills `scratch`, panels of \[BLOCK\]\[16\], with W\[output\]\[from + column\] at \[column / 16\]\[output\]\[lane\].

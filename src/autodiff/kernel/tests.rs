@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::autodiff::arena::Arena;
+use crate::autodiff::element::Element;
 
 /// Numbers in \[-1, 1) that look random and are always the same.
 fn numbers(n: usize, seed: u64) -> Vec<f64> {
@@ -44,6 +45,8 @@ fn products_are_those_of_the_definition() {
         (shape(1, 7, 3, 1, 1, 1), 400, 17),
         (shape(2, 10, 4, 2, 1, 1), 5, 3),
         (Conv::linear(37), 21, 65),
+        // Rows that pass in blocks.
+        (Conv::linear(1100), 70, 200),
         // More rows than the turned product takes, and a gradient that is summed in two blocks.
         (shape(3, 43, 3, 1, 1, 1), 25, 70),
         (shape(4, 90, 3, 2, 1, 1), 19, 33),
@@ -135,6 +138,36 @@ fn any_number_of_threads_gives_the_same_bits() {
 }
 
 #[test]
+fn rows_in_blocks_give_the_bits_of_one_pass() {
+    // Two blocks and a part of one; weights that end within a panel.
+    let (rows, channels, n) = (1100, 21, 37);
+    assert!(rows > many_rows::block_rows(channels), "one block is no test");
+    let (x, dy) = (single(&numbers(rows * channels, 1)), single(&numbers(rows * n, 2)));
+    let arena = Arena::default();
+    let (mut panels, mut d_bias) = (vec![0.0; packed_len(n, channels)], vec![0.0; n]);
+    let conv = Conv::linear(rows);
+    for add in [[false; 2], [true; 2]] {
+        let d_bias = Some(&mut d_bias[..]);
+        weight_gradient(&x, channels, &dy, n, &conv, &mut panels, d_bias, add, &arena);
+    }
+    let mut got = vec![0.0; n * channels];
+    unpack_weight(&panels, n, channels, 1, &mut got);
+    let of_bias = |o: usize| (0..rows).fold(0.0_f32, |sum, row| sum + dy[row * n + o]);
+    let wanted: Vec<_> = (0..n).map(|o| of_bias(o) + of_bias(o)).collect();
+    assert_eq!(d_bias, wanted, "bias");
+    for o in 0..n {
+        for c in 0..channels {
+            let product = |row: usize| (x[row * channels + c], dy[row * n + o]);
+            let sum = (0..rows).map(product).fold(0.0_f32, |sum, (x, dy)| match level() {
+                Level::Portable => sum.fused(x, dy),
+                _ => x.mul_add(dy, sum),
+            });
+            assert_eq!(got[o * channels + c], sum + sum, "output {o}, channel {c}");
+        }
+    }
+}
+
+#[test]
 fn small_products_are_those_of_the_definition_with_any_strides() {
     let [m, k, n] = [13, 7, 53];
     let (a, b) = (numbers(m * k, 1), numbers(k * n, 2));
@@ -155,8 +188,14 @@ fn small_products_are_those_of_the_definition_with_any_strides() {
 
 /// Runs one tile with a form of the kernel, and returns what it wrote.
 #[cfg(target_arch = "x86_64")]
-fn run_form(form: unsafe fn(&Tile<f32>), n_rows: usize, n_panels: usize, add: bool) -> Vec<f32> {
-    let (k, segments, n_columns) = (37, 3, 16 * n_panels - 5);
+fn run_form(
+    form: unsafe fn(&Tile<f32>),
+    n_rows: usize,
+    n_panels: usize,
+    [add, goes_on]: [bool; 2],
+) -> Vec<f32> {
+    let (k, segments) = (37, 3);
+    let n_columns = if goes_on { 16 * n_panels } else { 16 * n_panels - 5 };
     let a = single(&numbers(8 * segments * k, 1));
     let b = single(&numbers(n_panels * segments * k * PANEL, 2));
     let mut c = single(&numbers(n_rows * n_columns, 3));
@@ -177,6 +216,7 @@ fn run_form(form: unsafe fn(&Tile<f32>), n_rows: usize, n_panels: usize, add: bo
         c_panel: PANEL,
         n_columns,
         add,
+        goes_on,
         stream: false,
     };
     // SAFETY: rows, panels and output have the sizes that the tile states, and the caller found the
@@ -192,8 +232,8 @@ fn every_form_of_the_tile_gives_what_the_portable_one_gives() {
     let avx512 = avx2 && is_x86_feature_detected!("avx512f");
     for n_rows in 1..=8 {
         for n_panels in 1..=3 {
-            for add in [false, true] {
-                let what = format!("{n_rows} rows, {n_panels} panels, add {add}");
+            for add in [[false, false], [true, false], [false, true]] {
+                let what = format!("{n_rows} rows, {n_panels} panels, added to, goes on: {add:?}");
                 let portable = run_form(run_portable, n_rows, n_panels, add);
                 let wanted: Vec<_> = portable.iter().map(|&x| f64::from(x)).collect();
                 if avx2 {

@@ -37,6 +37,9 @@ pub struct Tile<E> {
     pub n_columns: usize,
     /// Whether C is added to or overwritten.
     pub add: bool,
+    /// Whether sums begin with what C holds instead of zero, so that k may be divided without another rounding; then
+    /// panels are whole and `add` is not set.
+    pub goes_on: bool,
     /// Whether C is large and not read soon, so that it should not pass through the caches; the
     /// caller must call [`fence`] before other threads may read.
     pub stream: bool,
@@ -99,6 +102,7 @@ pub fn peak_gflops() -> f64 {
         c_panel: PANEL,
         n_columns: MAX_PANELS * PANEL,
         add: false,
+        goes_on: false,
         stream: false,
     };
     let flops = 2.0 * (RUNS * MAX_ROWS * MAX_PANELS * PANEL * K) as f64;
@@ -122,6 +126,15 @@ pub unsafe fn run_portable<E: Element>(tile: &Tile<E>) {
     for first in (0..tile.n_rows).step_by(ROWS) {
         for p in 0..tile.n_panels {
             let mut sums = [[E::ZERO; PANEL]; ROWS];
+            if tile.goes_on {
+                for (r, sums) in sums.iter_mut().enumerate() {
+                    // SAFETY: a tile that goes on has whole panels; rows beyond the last repeat it (invariants).
+                    *sums = unsafe {
+                        let row = tile.c[(first + r).min(tile.n_rows - 1)];
+                        *row.add(p * tile.c_panel).cast::<[E; PANEL]>()
+                    };
+                }
+            }
             for s in 0..tile.segments {
                 for k in 0..tile.k {
                     // SAFETY: a panel has 16 k elements (invariant 1).

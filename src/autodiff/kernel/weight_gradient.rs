@@ -6,6 +6,7 @@ use crate::autodiff::arena::Arena;
 use crate::autodiff::element::Element;
 
 use super::gather::Conv;
+use super::many_rows::{block_rows, weight_gradient_of_many};
 use super::pack::{PANEL, pack_strips, panels};
 use super::product::groups;
 use super::tile::{MAX_ROWS, Tile, fence};
@@ -47,6 +48,9 @@ pub fn weight_gradient<E: Element>(
     assert_eq!(d_weight.len(), panels(n) * k * PANEL, "panels of {n} outputs with {k} inputs");
     assert_eq!(d_out.len(), out_rows * n, "rows of {n} outputs");
     assert_eq!(source.len(), conv.in_rows() * channels, "rows of {channels} inputs");
+    if *conv == Conv::linear(out_rows) && out_rows > block_rows(channels) {
+        return weight_gradient_of_many(source, channels, d_out, n, d_weight, d_bias, add, arena);
+    }
 
     let sample_rows = conv.stride * conv.strip_frames();
     let strip = conv.batch * sample_rows * PANEL;
@@ -116,6 +120,7 @@ pub fn weight_gradient<E: Element>(
                         c_panel: k * PANEL,
                         n_columns: group.len() * PANEL,
                         add: add[0] || first > 0,
+                        goes_on: false,
                         stream,
                     };
                     // SAFETY: a tap's frames lie within its phase of the strip, and panels and the

@@ -117,18 +117,8 @@ pub unsafe fn run_avx512(tile: &Tile<f32>) {
         // SAFETY: as promised by the caller; the loops below need at least one step.
         return unsafe { super::tile::run_portable(tile) };
     }
-    let many = tile.n_rows > 4;
     // SAFETY: the caller's promise is passed on.
-    let v = unsafe {
-        match (many, tile.n_panels) {
-            (true, 3) => tile_8_3(tile),
-            (true, 2) => tile_8_2(tile),
-            (true, _) => tile_8_1(tile),
-            (false, 3) => tile_4_3(tile),
-            (false, 2) => tile_4_2(tile),
-            (false, _) => tile_4_1(tile),
-        }
-    };
+    let v = unsafe { if tile.goes_on { sums::<true>(tile) } else { sums::<false>(tile) } };
     if tile.stream && !tile.add && tile.n_columns == tile.n_panels * PANEL {
         // SAFETY: the caller's promise is passed on.
         return unsafe { stream(tile, &v) };
@@ -149,12 +139,52 @@ pub unsafe fn run_avx512(tile: &Tile<f32>) {
     }
 }
 
+/// The sums of a tile: of each row, 16 lanes for each panel.
+type Sums = [[__m512; MAX_PANELS]; MAX_ROWS];
+
+/// Sums up a tile, from zero or from what the output holds.
+///
+/// # Safety
+/// As for [`run_avx512`].
+#[target_feature(enable = "avx512f")]
+unsafe fn sums<const GOES_ON: bool>(tile: &Tile<f32>) -> Sums {
+    // SAFETY: the caller's promise is passed on.
+    unsafe {
+        match (tile.n_rows > 4, tile.n_panels) {
+            (true, 3) => tile_8_3::<GOES_ON>(tile),
+            (true, 2) => tile_8_2::<GOES_ON>(tile),
+            (true, _) => tile_8_1::<GOES_ON>(tile),
+            (false, 3) => tile_4_3::<GOES_ON>(tile),
+            (false, 2) => tile_4_2::<GOES_ON>(tile),
+            (false, _) => tile_4_1::<GOES_ON>(tile),
+        }
+    }
+}
+
+/// Returns what the sums of a tile begin with.
+///
+/// # Safety
+/// As for [`run_avx512`].
+#[target_feature(enable = "avx512f")]
+unsafe fn begin<const GOES_ON: bool>(tile: &Tile<f32>) -> Sums {
+    let mut v = [[_mm512_setzero_ps(); MAX_PANELS]; MAX_ROWS];
+    if GOES_ON {
+        for (r, v) in v.iter_mut().enumerate() {
+            for (p, v) in v.iter_mut().enumerate().take(tile.n_panels) {
+                // SAFETY: a tile that goes on has whole panels; rows beyond the last repeat it (invariants).
+                *v = unsafe { _mm512_loadu_ps(tile.c[r].add(p * tile.c_panel)) };
+            }
+        }
+    }
+    v
+}
+
 /// Writes full panels past the caches: a line that is not read soon need not be fetched before.
 ///
 /// # Safety
 /// As for [`run_avx512`].
 #[target_feature(enable = "avx512f")]
-unsafe fn stream(tile: &Tile<f32>, v: &[[__m512; MAX_PANELS]; MAX_ROWS]) {
+unsafe fn stream(tile: &Tile<f32>, v: &Sums) {
     for p in 0..tile.n_panels {
         for (r, v) in v.iter().enumerate().take(tile.n_rows) {
             let c = tile.c[r].wrapping_add(p * tile.c_panel);
@@ -175,8 +205,9 @@ unsafe fn stream(tile: &Tile<f32>, v: &[[__m512; MAX_PANELS]; MAX_ROWS]) {
 /// # Safety
 /// As for [`run_avx512`].
 #[target_feature(enable = "avx512f")]
-unsafe fn tile_8_3(tile: &Tile<f32>) -> [[__m512; MAX_PANELS]; MAX_ROWS] {
-    let mut v = [[_mm512_setzero_ps(); MAX_PANELS]; MAX_ROWS];
+unsafe fn tile_8_3<const GOES_ON: bool>(tile: &Tile<f32>) -> Sums {
+    // SAFETY: as promised by the caller.
+    let mut v = unsafe { begin::<GOES_ON>(tile) };
     for s in 0..tile.segments {
         // SAFETY: every row and panel has k elements in segment s (invariant 1); k is not zero.
         unsafe {
@@ -203,8 +234,9 @@ unsafe fn tile_8_3(tile: &Tile<f32>) -> [[__m512; MAX_PANELS]; MAX_ROWS] {
 /// # Safety
 /// As for [`run_avx512`].
 #[target_feature(enable = "avx512f")]
-unsafe fn tile_8_2(tile: &Tile<f32>) -> [[__m512; MAX_PANELS]; MAX_ROWS] {
-    let mut v = [[_mm512_setzero_ps(); MAX_PANELS]; MAX_ROWS];
+unsafe fn tile_8_2<const GOES_ON: bool>(tile: &Tile<f32>) -> Sums {
+    // SAFETY: as promised by the caller.
+    let mut v = unsafe { begin::<GOES_ON>(tile) };
     for s in 0..tile.segments {
         // SAFETY: every row and panel has k elements in segment s (invariant 1); k is not zero.
         unsafe {
@@ -231,8 +263,9 @@ unsafe fn tile_8_2(tile: &Tile<f32>) -> [[__m512; MAX_PANELS]; MAX_ROWS] {
 /// # Safety
 /// As for [`run_avx512`].
 #[target_feature(enable = "avx512f")]
-unsafe fn tile_8_1(tile: &Tile<f32>) -> [[__m512; MAX_PANELS]; MAX_ROWS] {
-    let mut v = [[_mm512_setzero_ps(); MAX_PANELS]; MAX_ROWS];
+unsafe fn tile_8_1<const GOES_ON: bool>(tile: &Tile<f32>) -> Sums {
+    // SAFETY: as promised by the caller.
+    let mut v = unsafe { begin::<GOES_ON>(tile) };
     for s in 0..tile.segments {
         // SAFETY: every row and panel has k elements in segment s (invariant 1); k is not zero.
         unsafe {
@@ -259,8 +292,9 @@ unsafe fn tile_8_1(tile: &Tile<f32>) -> [[__m512; MAX_PANELS]; MAX_ROWS] {
 /// # Safety
 /// As for [`run_avx512`].
 #[target_feature(enable = "avx512f")]
-unsafe fn tile_4_3(tile: &Tile<f32>) -> [[__m512; MAX_PANELS]; MAX_ROWS] {
-    let mut v = [[_mm512_setzero_ps(); MAX_PANELS]; MAX_ROWS];
+unsafe fn tile_4_3<const GOES_ON: bool>(tile: &Tile<f32>) -> Sums {
+    // SAFETY: as promised by the caller.
+    let mut v = unsafe { begin::<GOES_ON>(tile) };
     for s in 0..tile.segments {
         // SAFETY: every row and panel has k elements in segment s (invariant 1); k is not zero.
         unsafe {
@@ -283,8 +317,9 @@ unsafe fn tile_4_3(tile: &Tile<f32>) -> [[__m512; MAX_PANELS]; MAX_ROWS] {
 /// # Safety
 /// As for [`run_avx512`].
 #[target_feature(enable = "avx512f")]
-unsafe fn tile_4_2(tile: &Tile<f32>) -> [[__m512; MAX_PANELS]; MAX_ROWS] {
-    let mut v = [[_mm512_setzero_ps(); MAX_PANELS]; MAX_ROWS];
+unsafe fn tile_4_2<const GOES_ON: bool>(tile: &Tile<f32>) -> Sums {
+    // SAFETY: as promised by the caller.
+    let mut v = unsafe { begin::<GOES_ON>(tile) };
     for s in 0..tile.segments {
         // SAFETY: every row and panel has k elements in segment s (invariant 1); k is not zero.
         unsafe {
@@ -307,8 +342,9 @@ unsafe fn tile_4_2(tile: &Tile<f32>) -> [[__m512; MAX_PANELS]; MAX_ROWS] {
 /// # Safety
 /// As for [`run_avx512`].
 #[target_feature(enable = "avx512f")]
-unsafe fn tile_4_1(tile: &Tile<f32>) -> [[__m512; MAX_PANELS]; MAX_ROWS] {
-    let mut v = [[_mm512_setzero_ps(); MAX_PANELS]; MAX_ROWS];
+unsafe fn tile_4_1<const GOES_ON: bool>(tile: &Tile<f32>) -> Sums {
+    // SAFETY: as promised by the caller.
+    let mut v = unsafe { begin::<GOES_ON>(tile) };
     for s in 0..tile.segments {
         // SAFETY: every row and panel has k elements in segment s (invariant 1); k is not zero.
         unsafe {
@@ -344,6 +380,9 @@ pub unsafe fn run_avx2(tile: &Tile<f32>) {
                 part.rows[r] = tile.rows[(first + r).min(tile.n_rows - 1)];
             }
             part.b = tile.b.wrapping_add(p * tile.b_panel);
+            part.c = std::array::from_fn(|r| {
+                tile.c[(first + r).min(tile.n_rows - 1)].wrapping_add(p * tile.c_panel)
+            });
             // SAFETY: the caller's promise is passed on.
             let v = unsafe { tile_4_avx2(&part) };
             for r in first..tile.n_rows.min(first + ROWS) {
@@ -377,6 +416,12 @@ pub unsafe fn run_avx2(tile: &Tile<f32>) {
 #[target_feature(enable = "avx2,fma")]
 unsafe fn tile_4_avx2(tile: &Tile<f32>) -> [[__m256; 2]; 4] {
     let mut v = [[_mm256_setzero_ps(); 2]; 4];
+    if tile.goes_on {
+        for (v, c) in v.iter_mut().zip(tile.c) {
+            // SAFETY: a tile that goes on has whole panels; rows beyond the last repeat it (invariants).
+            *v = unsafe { [_mm256_loadu_ps(c), _mm256_loadu_ps(c.add(8))] };
+        }
+    }
     for s in 0..tile.segments {
         // SAFETY: every row and the panel have k elements in segment s (invariant 1); k is not zero.
         unsafe {

@@ -140,8 +140,8 @@ vectorized! {
         row.iter_mut().for_each(|x| *x *= scale);
     }
 
-    /// d = w (d − Σ d w), the gradient of a softmax.
-    fn softmax_slope<E: Element>(d: &mut [E], w: &[E]) {
+    /// d = α w (d − Σ d w), the gradient of a softmax.
+    fn softmax_slope<E: Element>(d: &mut [E], w: &[E], alpha: E) {
         const LANES: usize = 16;
         let mut lanes = [E::ZERO; LANES];
         for (d, w) in d.chunks(LANES).zip(w.chunks(LANES)) {
@@ -151,7 +151,7 @@ vectorized! {
         }
         let mean = lanes.into_iter().sum::<E>();
         for (d, &w) in d.iter_mut().zip(w) {
-            *d = w * (*d - mean);
+            *d = alpha * (w * (*d - mean));
         }
     }
 }
@@ -204,8 +204,7 @@ impl<E: Element> Operation<E> for Attend<E> {
         Ok(y)
     }
 
-    /// With P the weights: dV = Pᵀ dO, dP = dO Vᵀ, dS = P ∘ (dP − Σ_j dP P), dQ = dS K/√d,
-    /// dK = dSᵀ Q/√d.
+    /// With P the weights: dV = Pᵀ dO, dP = dO Vᵀ, dS = P ∘ (dP − Σ_j dP P)/√d, dQ = dS K, dK = dSᵀ Q.
     fn backward(&mut self, dy: Tensor<E>, at: &mut Backward<E>) -> Vec<Option<Tensor<E>>> {
         let AttentionActivations { inputs, weights } =
             self.kept.take().expect("kept by the forward");
@@ -233,11 +232,11 @@ impl<E: Element> Operation<E> for Attend<E> {
             let into = MatrixMut { data: &mut *ds, row_stride: keys };
             matmul([queries, dim, keys], E::ONE, d_o, v.t(), into, false, scratch);
             for (ds, w) in ds.chunks_exact_mut(keys).zip(w.chunks_exact(keys)) {
-                softmax_slope(ds, w);
+                softmax_slope(ds, w, scale);
             }
             let ds = Matrix { data: &*ds, strides: [keys, 1] };
-            matmul([queries, keys, dim], scale, ds, k, rows(dq), false, scratch);
-            matmul([keys, queries, dim], scale, ds.t(), q, rows(dk), false, scratch);
+            matmul([queries, keys, dim], E::ONE, ds, k, rows(dq), false, scratch);
+            matmul([keys, queries, dim], E::ONE, ds.t(), q, rows(dk), false, scratch);
         });
         drop(weights);
         let mut found = Vec::with_capacity(inputs.len());
@@ -262,20 +261,24 @@ impl<E: Element> Operation<E> for Attend<E> {
                 if !apart {
                     d.fill(E::ZERO);
                 }
-                for (place, part) in mine {
-                    let frames = x.shape()[1];
-                    for (row, target) in d.chunks_exact_mut(channels).enumerate() {
-                        let (b, t) = (row / frames, row % frames);
+                let frames = x.shape()[1];
+                let samples = d.par_chunks_exact_mut((frames * channels).max(1)).enumerate();
+                samples.for_each(|(b, d)| {
+                    for (place, part) in &mine {
                         for h in 0..heads {
                             let source =
-                                &part.data()[((b * heads + h) * frames + t) * dim..][..dim];
-                            let target = &mut target[place.first + h * dim..][..dim];
-                            for (d, &x) in target.iter_mut().zip(source) {
-                                *d = if apart { x } else { *d + x };
+                                part.data()[(b * heads + h) * frames * dim..].chunks_exact(dim);
+                            for (target, source) in d.chunks_exact_mut(channels).zip(source) {
+                                let target = &mut target[place.first + h * dim..][..dim];
+                                if apart {
+                                    target.copy_from_slice(source);
+                                } else {
+                                    target.iter_mut().zip(source).for_each(|(d, &x)| *d += x);
+                                }
                             }
                         }
                     }
-                }
+                });
             })));
         }
         found
@@ -284,10 +287,13 @@ impl<E: Element> Operation<E> for Attend<E> {
 
 /// \[batch, heads, frames, dim\] → \[batch, frames, heads · dim\]
 fn interleave<E: Element>(source: &[E], target: &mut [E], heads: usize, frames: usize, dim: usize) {
-    for (row, target) in target.chunks_exact_mut((heads * dim).max(1)).enumerate() {
-        let (b, t) = (row / frames, row % frames);
-        for (h, target) in target.chunks_exact_mut(dim).enumerate() {
-            target.copy_from_slice(&source[((b * heads + h) * frames + t) * dim..][..dim]);
+    let sample = (heads * frames * dim).max(1);
+    let samples = target.par_chunks_exact_mut(sample).zip(source.par_chunks_exact(sample));
+    samples.for_each(|(target, source)| {
+        for (t, target) in target.chunks_exact_mut(heads * dim).enumerate() {
+            for (h, target) in target.chunks_exact_mut(dim).enumerate() {
+                target.copy_from_slice(&source[(h * frames + t) * dim..][..dim]);
+            }
         }
-    }
+    });
 }

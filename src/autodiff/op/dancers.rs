@@ -1,5 +1,7 @@
 //! Dancers of a group between the batch and the frames: folding, unfolding, repeating for each of them.
 
+use rayon::prelude::*;
+
 use super::binary::add_assign;
 use crate::autodiff::element::Element;
 use crate::autodiff::operation::{Backward, Operation, Run};
@@ -20,7 +22,7 @@ impl<E: Element> Operation<E> for Rebatch {
         "rebatch"
     }
 
-    fn forward(&mut self, x: &[&Tensor<E>], run: &Run<E>) -> Result<Tensor<E>> {
+    fn forward(&mut self, x: &[&Tensor<E>], _: &Run<E>) -> Result<Tensor<E>> {
         let (x, like) = (x[0], x[1]);
         let (Some([rows, frames]), Some(&batch)) = (x.shape().first_chunk(), like.shape().first())
         else {
@@ -36,7 +38,7 @@ impl<E: Element> Operation<E> for Rebatch {
         let mut shape = x.shape().to_vec();
         (shape[0], shape[1]) = (batch, rows * frames / batch);
         self.from = x.shape().to_vec();
-        Ok(run.tensor(&shape, |y| y.copy_from_slice(x.data())))
+        Ok(x.clone().reshaped(&shape))
     }
 
     fn backward(&mut self, dy: Tensor<E>, at: &mut Backward<E>) -> Vec<Option<Tensor<E>>> {
@@ -206,9 +208,9 @@ impl<E: Element> Operation<E> for TakeSamples {
         shape[0] = self.index.len();
         let sample = (x.len() / batch.max(1)).max(1);
         Ok(run.tensor(&shape, |y| {
-            for (y, &i) in y.chunks_exact_mut(sample).zip(&self.index) {
+            y.par_chunks_exact_mut(sample).zip(&self.index).for_each(|(y, &i)| {
                 y.copy_from_slice(&x.data()[i * sample..][..sample]);
-            }
+            });
         }))
     }
 

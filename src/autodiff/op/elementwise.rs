@@ -44,6 +44,12 @@ pub fn map<E: Element>(x: &[E], y: &mut [E], f: impl Fn(E) -> E + Copy + Sync) {
     chunks.for_each(|(y, x)| map_slice(x, y, f));
 }
 
+/// y = x, in parallel.
+pub fn copy<E: Element>(x: &[E], y: &mut [E]) {
+    assert_eq!(x.len(), y.len(), "as many results as numbers");
+    y.par_chunks_mut(CHUNK).zip(x.par_chunks(CHUNK)).for_each(|(y, x)| y.copy_from_slice(x));
+}
+
 /// y = f(a, b), in parallel.
 pub fn zip<E: Element>(a: &[E], b: &[E], y: &mut [E], f: impl Fn(E, E) -> E + Copy + Sync) {
     assert!(a.len() == y.len() && b.len() == y.len(), "as many results as numbers");

@@ -1,5 +1,9 @@
 //! Operations on the number of frames: repeating, holding the last, cropping, masks.
 
+use std::ops::Range;
+
+use rayon::prelude::*;
+
 use super::binary::add_assign;
 use crate::autodiff::element::Element;
 use crate::autodiff::operation::{Backward, Operation, Run, expect_axes, expect_size};
@@ -86,6 +90,13 @@ impl TakeFrames {
     fn new(name: &'static str, choose: Choice) -> Self {
         Self { name, choose, index: Vec::new(), frames: 0 }
     }
+
+    /// Returns the frames that are taken where each is once and they follow each other.
+    fn run(&self) -> Option<Range<usize>> {
+        let first = *self.index.first()?;
+        let follow = self.index.iter().zip(first..).all(|(&i, wanted)| i == wanted);
+        follow.then(|| first..first + self.index.len())
+    }
 }
 
 impl<E: Element> Operation<E> for TakeFrames {
@@ -151,12 +162,15 @@ impl<E: Element> Operation<E> for TakeFrames {
         let shape = [batch, self.index.len(), channels];
         Ok(run.tensor(&shape, |y| {
             let n = (self.index.len() * channels).max(1);
-            let samples = y.chunks_exact_mut(n).zip(input.data().chunks_exact(frames * channels));
-            for (y, x) in samples {
+            let samples = y.par_chunks_exact_mut(n);
+            samples.zip(input.data().par_chunks_exact(frames * channels)).for_each(|(y, x)| {
+                if let Some(run) = self.run() {
+                    return y.copy_from_slice(&x[run.start * channels..run.end * channels]);
+                }
                 for (y, &i) in y.chunks_exact_mut(channels).zip(&self.index) {
                     y.copy_from_slice(&x[i * channels..][..channels]);
                 }
-            }
+            });
         }))
     }
 
@@ -165,13 +179,21 @@ impl<E: Element> Operation<E> for TakeFrames {
         let sample = self.frames * channels;
         let mut found = at.only(|| {
             at.tensor(&[batch, self.frames, channels], |dx| {
-                dx.fill(E::ZERO);
                 let n = (self.index.len() * channels).max(1);
-                for (dx, dy) in dx.chunks_exact_mut(sample).zip(dy.data().chunks_exact(n)) {
+                let samples = dx.par_chunks_exact_mut(sample).zip(dy.data().par_chunks_exact(n));
+                samples.for_each(|(dx, dy)| {
+                    if let Some(run) = self.run() {
+                        let (before, rest) = dx.split_at_mut(run.start * channels);
+                        let (own, behind) = rest.split_at_mut(dy.len());
+                        own.copy_from_slice(dy);
+                        before.fill(E::ZERO);
+                        return behind.fill(E::ZERO);
+                    }
+                    dx.fill(E::ZERO);
                     for (dy, &i) in dy.chunks_exact(channels).zip(&self.index) {
                         add_assign(&mut dx[i * channels..][..channels], dy);
                     }
-                }
+                });
             })
         });
         if matches!(self.choose, Choice::Crop | Choice::Behind) {

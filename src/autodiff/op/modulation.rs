@@ -1,5 +1,7 @@
 //! Normalisation over the frames that count, means over them, and a scale and shift for each sample.
 
+use rayon::prelude::*;
+
 use super::binary::add_assign;
 use crate::autodiff::element::Element;
 use crate::autodiff::operation::{Backward, Operation, Run, expect_axes, expect_size};
@@ -59,15 +61,16 @@ impl<E: Element> Operation<E> for Modulate<E> {
         }
         let (bias, sample) = (E::from_f64(self.bias), modulated_at_once(x, film));
         Ok(run.tensor(x.shape(), |y| {
-            let samples = y.chunks_exact_mut(sample).zip(x.data().chunks_exact(sample));
-            for ((y, x), film) in samples.zip(film.data().chunks_exact(2 * channels)) {
+            let samples = y.par_chunks_exact_mut(sample).zip(x.data().par_chunks_exact(sample));
+            let films = film.data().par_chunks_exact(2 * channels);
+            samples.zip(films).for_each(|((y, x), film)| {
                 let (s, h) = film.split_at(channels);
                 for (y, x) in y.chunks_exact_mut(channels).zip(x.chunks_exact(channels)) {
                     for (((y, &x), &s), &h) in y.iter_mut().zip(x).zip(s).zip(h) {
                         *y = (bias + s) * x + h;
                     }
                 }
-            }
+            });
         }))
     }
 
@@ -79,8 +82,10 @@ impl<E: Element> Operation<E> for Modulate<E> {
         let d_film = at.needs[1].then(|| {
             at.tensor(film.shape(), |d| {
                 d.fill(E::ZERO);
-                let samples = x.data().chunks_exact(sample).zip(dy.data().chunks_exact(sample));
-                for (d, (x, dy)) in d.chunks_exact_mut(2 * channels).zip(samples) {
+                let samples =
+                    x.data().par_chunks_exact(sample).zip(dy.data().par_chunks_exact(sample));
+                let films = d.par_chunks_exact_mut(2 * channels);
+                films.zip(samples).for_each(|(d, (x, dy))| {
                     let (ds, dh) = d.split_at_mut(channels);
                     for (x, dy) in x.chunks_exact(channels).zip(dy.chunks_exact(channels)) {
                         for ((ds, &x), &dy) in ds.iter_mut().zip(x).zip(dy) {
@@ -88,19 +93,19 @@ impl<E: Element> Operation<E> for Modulate<E> {
                         }
                         add_assign(dh, dy);
                     }
-                }
+                });
             })
         });
         let dx = at.needs[0].then(|| {
             let bias = E::from_f64(self.bias);
-            let samples = dy.data_mut().chunks_exact_mut(sample);
-            for (dy, film) in samples.zip(film.data().chunks_exact(2 * channels)) {
+            let samples = dy.data_mut().par_chunks_exact_mut(sample);
+            samples.zip(film.data().par_chunks_exact(2 * channels)).for_each(|(dy, film)| {
                 for dy in dy.chunks_exact_mut(channels) {
                     for (dy, &s) in dy.iter_mut().zip(&film[..channels]) {
                         *dy *= bias + s;
                     }
                 }
-            }
+            });
             dy
         });
         vec![dx, d_film]
@@ -173,22 +178,23 @@ impl<E: Element> Operation<E> for NormalizeFrames<E> {
         expect_size("normalize_frames", "input", "channels", channels.min(1), "a norm", 1)?;
         let sample = (x.shape()[1] * channels).max(1);
         let weights = shares(x, mask);
-        let mut rates = Vec::with_capacity(weights.len() * channels);
+        let mut rates = vec![0.0; weights.len() * channels];
         let y = run.tensor(x.shape(), |y| {
-            let samples = y.chunks_exact_mut(sample).zip(x.data().chunks_exact(sample));
-            for ((y, x), weights) in samples.zip(&weights) {
+            let samples = y.par_chunks_exact_mut(sample).zip(x.data().par_chunks_exact(sample));
+            let samples = samples.zip(rates.par_chunks_exact_mut(channels));
+            samples.zip(&weights).for_each(|(((y, x), rates), weights)| {
                 let mean = weighted_sums(x, channels, weights, |x, _| x);
                 let variance =
                     weighted_sums(x, channels, weights, |x, c| (x - mean[c]) * (x - mean[c]));
-                let rate: Vec<f64> =
-                    variance.iter().map(|v| 1.0 / (v + self.epsilon).sqrt()).collect();
+                for (rate, v) in rates.iter_mut().zip(&variance) {
+                    *rate = 1.0 / (v + self.epsilon).sqrt();
+                }
                 for (y, x) in y.chunks_exact_mut(channels).zip(x.chunks_exact(channels)) {
-                    for (((y, &x), mean), rate) in y.iter_mut().zip(x).zip(&mean).zip(&rate) {
+                    for (((y, &x), mean), rate) in y.iter_mut().zip(x).zip(&mean).zip(&*rates) {
                         *y = E::from_f64((x.to_f64() - mean) * rate);
                     }
                 }
-                rates.extend(rate);
-            }
+            });
         });
         if run.recording {
             self.kept = Some((y.clone(), rates));
@@ -204,10 +210,10 @@ impl<E: Element> Operation<E> for NormalizeFrames<E> {
         let channels = y.channels();
         let sample = (y.shape()[1] * channels).max(1);
         let dx = at.needs[0].then(|| {
-            let samples = dy.data_mut().chunks_exact_mut(sample).zip(y.data().chunks_exact(sample));
-            for ((dy, y), (weights, rates)) in
-                samples.zip(self.weights.iter().zip(rates.chunks_exact(channels)))
-            {
+            let samples = dy.data_mut().par_chunks_exact_mut(sample);
+            let samples = samples.zip(y.data().par_chunks_exact(sample));
+            let numbers = self.weights.par_iter().zip(rates.par_chunks_exact(channels));
+            samples.zip(numbers).for_each(|((dy, y), (weights, rates))| {
                 let mut sums = vec![[0.0; 2]; channels];
                 for (dy, y) in dy.chunks_exact(channels).zip(y.chunks_exact(channels)) {
                     for ((sums, &dy), &y) in sums.iter_mut().zip(dy).zip(y) {
@@ -222,7 +228,7 @@ impl<E: Element> Operation<E> for NormalizeFrames<E> {
                         *dy = E::from_f64(rate * (dy.to_f64() - of_moments));
                     }
                 }
-            }
+            });
             dy
         });
         let mut found = vec![dx];
@@ -257,11 +263,11 @@ impl<E: Element> Operation<E> for MeanFrames {
         self.weights = shares(x, mask);
         Ok(run.tensor(&[batch, channels], |y| {
             y.fill(E::ZERO);
-            let samples = y.chunks_exact_mut(channels).zip(x.data().chunks_exact(sample));
-            for ((y, x), weights) in samples.zip(&self.weights) {
+            let samples = y.par_chunks_exact_mut(channels).zip(x.data().par_chunks_exact(sample));
+            samples.zip(&self.weights).for_each(|((y, x), weights)| {
                 let sums = weighted_sums(x, channels, weights, |x, _| x);
                 y.iter_mut().zip(sums).for_each(|(y, sum)| *y = E::from_f64(sum));
-            }
+            });
         }))
     }
 
@@ -270,14 +276,14 @@ impl<E: Element> Operation<E> for MeanFrames {
         let frames = self.weights.first().map_or(0, Vec::len);
         let dx = at.needs[0].then(|| {
             at.tensor(&[dy.shape()[0], frames, channels], |dx| {
-                let samples = dx.chunks_exact_mut((frames * channels).max(1));
-                let vectors = dy.data().chunks_exact(channels).zip(&self.weights);
-                for (dx, (dy, weights)) in samples.zip(vectors) {
+                let samples = dx.par_chunks_exact_mut((frames * channels).max(1));
+                let vectors = dy.data().par_chunks_exact(channels).zip(&self.weights);
+                samples.zip(vectors).for_each(|(dx, (dy, weights))| {
                     for (dx, &w) in dx.chunks_exact_mut(channels).zip(weights) {
                         let w = E::from_f64(w);
                         dx.iter_mut().zip(dy).for_each(|(dx, &dy)| *dx = w * dy);
                     }
-                }
+                });
             })
         });
         let mut found = vec![dx];

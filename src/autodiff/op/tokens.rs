@@ -1,5 +1,7 @@
 //! Tokens beside frames: frames of several tensors one after the other, and the mask of both.
 
+use rayon::prelude::*;
+
 use crate::autodiff::element::Element;
 use crate::autodiff::operation::{Backward, Operation, Run, expect_axes};
 use crate::autodiff::tensor::Tensor;
@@ -51,15 +53,15 @@ impl<E: Element> Operation<E> for ConcatFrames {
         }
         self.shapes = x.iter().map(|x| x.shape().to_vec()).collect();
         Ok(run.tensor(&[batch, frames, channels], |y| {
-            let mut rest = y;
-            for b in 0..batch {
+            y.par_chunks_exact_mut((frames * channels).max(1)).enumerate().for_each(|(b, y)| {
+                let mut rest = y;
                 for x in x {
                     let n = x.len() / batch;
                     let (part, behind) = std::mem::take(&mut rest).split_at_mut(n);
                     part.copy_from_slice(&x.data()[b * n..][..n]);
                     rest = behind;
                 }
-            }
+            });
         }))
     }
 
@@ -72,9 +74,9 @@ impl<E: Element> Operation<E> for ConcatFrames {
             let n = shape.iter().skip(1).product::<usize>();
             found.push(needed.then(|| {
                 at.tensor(shape, |dx| {
-                    for (b, dx) in dx.chunks_exact_mut(n.max(1)).enumerate() {
+                    dx.par_chunks_exact_mut(n.max(1)).enumerate().for_each(|(b, dx)| {
                         dx.copy_from_slice(&dy.data()[b * sample + first..][..n]);
-                    }
+                    });
                 })
             }));
             first += n;

@@ -77,8 +77,8 @@ impl SelfAttention {
         let h = self.norm.forward(g, x)?;
         let qkv = self.qkv.forward(g, &h)?;
         let qkv = g.rebatch(&qkv, like)?;
-        let (qk, v) = self.turned(g, &qkv)?;
-        let h = self.attend(g, &qk, &v, None)?;
+        let qkv = self.turned(g, &qkv)?;
+        let h = self.attend(g, &qkv, None)?;
         let h = g.rebatch(&h, x)?;
         let h = self.proj.forward(g, &h)?;
         g.dropout(&h, self.dropout)
@@ -105,37 +105,32 @@ impl SelfAttention {
         let h = self.norm.forward(g, x)?;
         let qkv = self.qkv.forward(g, &h)?;
         let qkv = g.rebatch(&qkv, like)?;
-        let (qk, v) = self.turned(g, &qkv)?;
-        let (qk, v) = (g.rebatch(&qk, x)?, g.rebatch(&v, x)?);
+        let qkv = self.turned(g, &qkv)?;
+        let qkv = g.rebatch(&qkv, x)?;
         let of_tokens = self.norm.forward(g, tokens)?;
         let of_tokens = self.qkv.forward(g, &of_tokens)?;
-        let qk_tokens = g.channels(&of_tokens, 0..2 * self.width)?;
-        let v_tokens = g.channels(&of_tokens, 2 * self.width..3 * self.width)?;
-        let qk = g.concat_frames(&[&qk_tokens, &qk])?;
-        let v = g.concat_frames(&[&v_tokens, &v])?;
-        let h = self.attend(g, &qk, &v, mask)?;
+        let qkv = g.concat_frames(&[&of_tokens, &qkv])?;
+        let h = self.attend(g, &qkv, mask)?;
         let h = self.proj.forward(g, &h)?;
         g.dropout(&h, self.dropout)
     }
 
-    /// Queries and keys, turned by their frame, and values.
-    fn turned<G: Graph>(&self, g: &mut G, qkv: &G::Tensor) -> Result<(G::Tensor, G::Tensor)> {
-        let qk = g.channels(qkv, 0..2 * self.width)?;
-        let qk = g.rotary(&qk, 2 * self.heads, None)?;
-        Ok((qk, g.channels(qkv, 2 * self.width..3 * self.width)?))
+    /// Queries and keys, turned by their frame, and values beside them.
+    fn turned<G: Graph>(&self, g: &mut G, qkv: &G::Tensor) -> Result<G::Tensor> {
+        g.rotary_first(qkv, 2 * self.heads, [2 * self.width, 3 * self.width])
     }
 
     fn attend<G: Graph>(
         &self,
         g: &mut G,
-        qk: &G::Tensor,
-        v: &G::Tensor,
+        qkv: &G::Tensor,
         key_mask: Option<&G::Tensor>,
     ) -> Result<G::Tensor> {
+        let part = |i: usize| Channels { tensor: qkv, first: i * self.width };
         g.attention(Attention {
-            query: Channels { tensor: qk, first: 0 },
-            key: Channels { tensor: qk, first: self.width },
-            value: Channels { tensor: v, first: 0 },
+            query: part(0),
+            key: part(1),
+            value: part(2),
             width: self.width,
             heads: self.heads,
             key_mask,
@@ -195,17 +190,12 @@ impl CrossAttention {
         let q = g.rebatch(&q, x)?;
         let music = self.kv.forward(g, &memory.music)?;
         let step = self.kv.forward(g, &memory.step)?;
-        let k_music = g.channels(&music, 0..width)?;
-        let k_music = g.rotary(&k_music, self.heads, None)?;
-        let k_step = g.channels(&step, 0..width)?;
-        let k = g.concat_frames(&[&k_music, &k_step])?;
-        let (v_music, v_step) =
-            (g.channels(&music, width..2 * width)?, g.channels(&step, width..2 * width)?);
-        let v = g.concat_frames(&[&v_music, &v_step])?;
+        let music = g.rotary_first(&music, self.heads, [width, 2 * width])?;
+        let kv = g.concat_frames(&[&music, &step])?;
         let h = g.attention(Attention {
             query: Channels { tensor: &q, first: 0 },
-            key: Channels { tensor: &k, first: 0 },
-            value: Channels { tensor: &v, first: 0 },
+            key: Channels { tensor: &kv, first: 0 },
+            value: Channels { tensor: &kv, first: width },
             width,
             heads: self.heads,
             key_mask: None,
@@ -237,6 +227,21 @@ impl EncoderLayer {
         let x = g.add(x, &h)?;
         let h = self.feed_forward.forward(g, &x)?;
         g.add(&x, &h)
+    }
+
+    /// As [`EncoderLayer::forward`] with a token before the frames, which is taken away again.
+    ///
+    /// # Shapes
+    /// `token`: \[batch, d\]; `x`: \[batch, frames, d\] → as `x`
+    pub fn behind_token<G: Graph>(
+        &self,
+        g: &mut G,
+        token: &G::Tensor,
+        x: &G::Tensor,
+    ) -> Result<G::Tensor> {
+        let with_token = g.concat_frames(&[token, x])?;
+        let h = self.forward(g, &with_token)?;
+        g.frames(&h, 1, None)
     }
 }
 

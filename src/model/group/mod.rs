@@ -21,7 +21,7 @@ use self::block::GroupBlock;
 pub use self::config::GroupConfig;
 use self::embedding::GroupEmbedding;
 use self::layers::{EncoderLayer, Memory};
-pub use self::score::{GroupScore, GroupScoreInputs, GroupScores};
+pub use self::score::{GroupScore, GroupScoreInputs, GroupScores, ScoredDancers, ScoredGroups};
 use super::graph::{Activation, Graph, Result};
 use super::layers::{LayerNorm, Linear};
 use super::parameter::{Init, ParameterId, ParameterList, Role, Scope};

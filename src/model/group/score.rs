@@ -52,6 +52,25 @@ pub struct GroupScoreInputs<'a, T> {
     pub there: Option<&'a T>,
 }
 
+/// What the first layer made of dancers alone.
+#[derive(Clone, Debug)]
+pub struct ScoredDancers<T> {
+    /// Token of step and group, \[rows, d\].
+    pub token: T,
+    /// \[rows, ⌈T / patch⌉, d\]
+    pub frames: T,
+}
+
+/// The groups of dancers that are scored together.
+pub struct ScoredGroups<'a, T> {
+    /// Token of each group, \[B, d\]: [`GroupScore::token`].
+    pub within: &'a T,
+    /// As in [`GroupScoreInputs`].
+    pub number: &'a T,
+    pub mask: Option<&'a T>,
+    pub there: Option<&'a T>,
+}
+
 /// The scores of B groups.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GroupScores<T> {
@@ -113,32 +132,67 @@ impl GroupScore {
         g: &mut G,
         inputs: &GroupScoreInputs<G::Tensor>,
     ) -> Result<GroupScores<G::Tensor>> {
+        let GroupScoreInputs { x0, t, w, number, mask, there } = *inputs;
+        let within = self.token(g, w)?;
+        let of_each = g.repeat_batch(&within, x0)?;
+        let dancers = self.dancers(g, x0, t, &of_each)?;
+        self.together(g, &dancers, &ScoredGroups { within: &within, number, mask, there })
+    }
+
+    /// Returns the token of each group. \[B, d\] → \[B, d\]
+    pub fn token<G: Graph>(&self, g: &mut G, w: &G::Tensor) -> Result<G::Tensor> {
+        self.group.forward(g, w)
+    }
+
+    /// Returns what the first layer makes of every dancer alone, which depends on none of the others.
+    ///
+    /// # Shapes
+    /// `x0`: \[rows, T, motion_dim\]; `t`: \[rows\]; `within`: the token of each one's group, \[rows, d\]
+    pub fn dancers<G: Graph>(
+        &self,
+        g: &mut G,
+        x0: &G::Tensor,
+        t: &G::Tensor,
+        within: &G::Tensor,
+    ) -> Result<ScoredDancers<G::Tensor>> {
         let (weight, bias, convolution) = self.patches;
-        let x = g.hold_frames(inputs.x0, convolution.taps)?;
-        let mut x = g.conv1d(&x, weight, Some(bias), convolution)?;
-        let hidden = self.time.hidden(g, inputs.t)?;
+        let x = g.hold_frames(x0, convolution.taps)?;
+        let x = g.conv1d(&x, weight, Some(bias), convolution)?;
+        let hidden = self.time.hidden(g, t)?;
         let t_emb = self.time.embedding.forward(g, &hidden)?;
-        let group = self.group.forward(g, inputs.w)?;
-        let of_each = g.repeat_batch(&group, inputs.x0)?;
-        let token = g.add(&t_emb, &of_each)?;
-        let e_n = g.embedding(self.numbers, inputs.number)?;
-        let tokens = g.concat_frames(&[&group, &e_n])?;
-        let mask = inputs.mask.map(|mask| g.token_mask(mask, 2)).transpose()?;
-        let mut alone = x.clone();
-        for (local, global) in &self.layers {
-            let with_token = g.concat_frames(&[&token, &x])?;
-            let h = local.forward(g, &with_token)?;
-            x = g.frames(&h, 1, None)?;
-            alone = x.clone();
-            let folded = g.rebatch(&x, inputs.number)?;
-            let all = global.forward(g, &tokens, &folded, &x, mask.as_ref())?;
-            let folded = g.frames(&all, 2, None)?;
-            x = g.rebatch(&folded, inputs.x0)?;
+        let token = g.add(&t_emb, within)?;
+        let frames = self.layers[0].0.behind_token(g, &token, &x)?;
+        Ok(ScoredDancers { token, frames })
+    }
+
+    /// Returns log f of each group of dancers.
+    ///
+    /// # Shapes
+    /// See [`ScoredDancers`], those of each group one after the other, and [`ScoredGroups`].
+    pub fn together<G: Graph>(
+        &self,
+        g: &mut G,
+        dancers: &ScoredDancers<G::Tensor>,
+        groups: &ScoredGroups<G::Tensor>,
+    ) -> Result<GroupScores<G::Tensor>> {
+        let ScoredGroups { within, number, mask, there } = *groups;
+        let e_n = g.embedding(self.numbers, number)?;
+        let tokens = g.concat_frames(&[within, &e_n])?;
+        let with_tokens = mask.map(|mask| g.token_mask(mask, 2)).transpose()?;
+        let mut alone = dancers.frames.clone();
+        let mut folded = g.rebatch(&alone, number)?;
+        for (i, (local, global)) in self.layers.iter().enumerate() {
+            if i > 0 {
+                let x = g.rebatch(&folded, &alone)?;
+                alone = local.behind_token(g, &dancers.token, &x)?;
+                folded = g.rebatch(&alone, number)?;
+            }
+            let all = global.forward(g, &tokens, &folded, &alone, with_tokens.as_ref())?;
+            folded = g.frames(&all, 2, None)?;
         }
-        let folded = g.rebatch(&x, inputs.number)?;
-        let mean = g.mean_frames(&folded, inputs.mask)?;
+        let mean = g.mean_frames(&folded, mask)?;
         let fit = self.out.forward(g, &mean)?;
-        let agreement = self.agreement(g, &alone, inputs)?;
+        let agreement = self.agreement(g, &alone, number, there)?;
         Ok(GroupScores { log_ratio: g.add(&fit, &agreement)?, agreement })
     }
 
@@ -147,11 +201,12 @@ impl GroupScore {
         &self,
         g: &mut G,
         alone: &G::Tensor,
-        inputs: &GroupScoreInputs<G::Tensor>,
+        number: &G::Tensor,
+        there: Option<&G::Tensor>,
     ) -> Result<G::Tensor> {
         let v = self.agreement.forward(g, alone)?;
         let u = g.normalize(&v, EPSILON)?;
-        let mean = g.mean_dancers(&u, inputs.number, inputs.there)?;
+        let mean = g.mean_dancers(&u, number, there)?;
         let squares = g.mul(&mean, &mean)?;
         let squares = g.mean_frames(&squares, None)?;
         let length = g.mean_channels(&squares)?;

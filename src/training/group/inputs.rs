@@ -9,7 +9,8 @@ use crate::autodiff::op::softmax::CrossEntropy;
 use crate::autodiff::{Interpreter, Stream, Tensor};
 use crate::diffusion::Schedule;
 use crate::model::{
-    Graph, GroupConfig, GroupInputs, GroupNetworks, GroupScoreInputs, Result as GraphResult,
+    Graph, GroupConfig, GroupInputs, GroupNetworks, Result as GraphResult, ScoredDancers,
+    ScoredGroups,
 };
 use crate::motion::{Channel, MOTION_DIM, Normalizer};
 use crate::training::batch::Batch;
@@ -20,7 +21,7 @@ use crate::training::sampling::motion_view;
 
 use super::GroupTraining;
 use super::markers::markers;
-use super::negatives::{MixedGroups, mixed};
+use super::negatives::{DistinctDancer, DistinctGroups, mixed};
 
 /// Streams of random numbers of a batch, told apart by their use.
 const EMBEDDING_NOISE: u64 = 1 << 61;
@@ -198,15 +199,15 @@ impl<'a> GroupBatch<'a> {
         let Some(mixed) = mixed(&self.batch.n_dancers, slots, n_negatives, random) else {
             return Ok(None);
         };
-        let n_groups = mixed.groups.len();
-        let t: Vec<f32> = mixed.dancers.iter().map(|&i| self.t_dancers[i] as f32).collect();
+        let DistinctGroups { dancers, places, groups, of_all } = mixed.distinct();
+        let n_groups = groups.len();
+        let t: Vec<f32> = dancers.iter().map(|it| self.t_dancers[it.dancer] as f32).collect();
         let t = g.constant(&[t.len()], &t);
-        let number: Vec<f32> = mixed.groups.iter().map(|&b| self.number[b]).collect();
+        let number: Vec<f32> = groups.iter().map(|&b| self.number[b]).collect();
         let number = g.constant(&[n_groups], &number);
         // A patch counts where its first frame does.
         let patches = frames.div_ceil(self.patch_frames);
-        let mask: Vec<f32> = mixed
-            .groups
+        let mask: Vec<f32> = groups
             .iter()
             .flat_map(|&b| {
                 (0..slots * patches).map(move |i| {
@@ -216,21 +217,35 @@ impl<'a> GroupBatch<'a> {
             })
             .collect();
         let mask = g.constant(&[n_groups, slots * patches], &mask);
-        let moves = self.moves(x0.data(), &mixed);
-        let x0 = g.apply(TakeSamples::new(mixed.dancers), &[x0])?;
-        let moves = g.constant(x0.shape(), &moves);
-        let x0 = g.add(&x0, &moves)?;
-        let mixed_groups = mixed.groups;
-        let w = g.apply(TakeSamples::new(mixed_groups.clone()), &[w])?;
         let is_there = |&b: &usize| {
             let n_there = self.batch.n_dancers[b];
             (0..slots).map(move |slot| f32::from(u8::from(slot < n_there)))
         };
-        let there: Vec<f32> = mixed_groups.iter().flat_map(is_there).collect();
+        let there: Vec<f32> = groups.iter().flat_map(is_there).collect();
         let there = g.constant(&[n_groups, slots], &there);
-        let (mask, there) = (Some(&mask), Some(&there));
-        let inputs = GroupScoreInputs { x0: &x0, t: &t, w: &w, number: &number, mask, there };
-        let logits = networks.score.forward(g, &inputs)?.log_ratio;
+
+        let moves = self.moves(x0.data(), &dancers);
+        let who = dancers.iter().map(|it| it.dancer).collect();
+        let x0 = g.apply(TakeSamples::new(who), &[x0])?;
+        let moves = g.constant(x0.shape(), &moves);
+        let x0 = g.add(&x0, &moves)?;
+        let within = networks.score.token(g, w)?;
+        let whose = dancers.iter().map(|it| it.group).collect();
+        let of_each = g.apply(TakeSamples::new(whose), &[&within])?;
+        let found = networks.score.dancers(g, &x0, &t, &of_each)?;
+        let of_places = ScoredDancers {
+            token: g.apply(TakeSamples::new(places.clone()), &[&found.token])?,
+            frames: g.apply(TakeSamples::new(places), &[&found.frames])?,
+        };
+        let within = g.apply(TakeSamples::new(groups), &[&within])?;
+        let groups = ScoredGroups {
+            within: &within,
+            number: &number,
+            mask: Some(&mask),
+            there: Some(&there),
+        };
+        let logits = networks.score.together(g, &of_places, &groups)?.log_ratio;
+        let logits = g.apply(TakeSamples::new(of_all), &[&logits])?;
         let logits = g.apply(Reshape::new(&[n, 1 + n_negatives]), &[&logits])?;
         let labels = g.constant(&[n], &vec![0.0; n]);
         g.apply(CrossEntropy::default(), &[&logits, &labels]).map(Some)
@@ -238,7 +253,7 @@ impl<'a> GroupBatch<'a> {
 
     /// Returns what is added to dancers of mixed groups that dance in the place of another: the difference of their mean
     /// places on the floor, \[rows, T, 25\].
-    fn moves(&self, x0: &[f32], mixed: &MixedGroups) -> Vec<f32> {
+    fn moves(&self, x0: &[f32], dancers: &[DistinctDancer]) -> Vec<f32> {
         let frames = self.batch.n_frames;
         let mean = |dancer: usize, channel: usize| -> f32 {
             let (mask, rows) = (&self.mask[dancer * frames..], &x0[dancer * frames * MOTION_DIM..]);
@@ -248,9 +263,9 @@ impl<'a> GroupBatch<'a> {
             });
             (sum / f64::max(n, 1.0)) as f32
         };
-        let mut moves = vec![0.0; mixed.dancers.len() * frames * MOTION_DIM];
+        let mut moves = vec![0.0; dancers.len() * frames * MOTION_DIM];
         let of_dancer = moves.chunks_exact_mut(frames * MOTION_DIM);
-        for ((rows, &dancer), &floor) in of_dancer.zip(&mixed.dancers).zip(&mixed.floor) {
+        for (rows, &DistinctDancer { dancer, floor, .. }) in of_dancer.zip(dancers) {
             if dancer != floor {
                 let first = Channel::Position.range().start;
                 for channel in [first, first + 2] {

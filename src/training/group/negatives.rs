@@ -1,5 +1,7 @@
 //! Mixed groups, which a score learns to tell from real ones.
 
+use std::collections::BTreeMap;
+
 use crate::autodiff::Stream;
 
 /// Who dances in mixed groups: for every group the group itself, and then its mixed ones.
@@ -22,6 +24,63 @@ pub struct MixedGroups {
     pub floor: Vec<usize>,
     /// Of every group, the group that it is held against.
     pub groups: Vec<usize>,
+}
+
+/// What has to be computed of mixed groups: each dancer and each group once.
+///
+/// The dancers who stay are those of the group itself, and of few other groups some are drawn more than once.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DistinctGroups {
+    /// Dancers that differ: who it is, in whose place on the floor, and the group that it is held against.
+    pub dancers: Vec<DistinctDancer>,
+    /// Of every place in each group that differs from those before it, the dancer.
+    pub places: Vec<usize>,
+    /// Of each such group, the one that it is held against.
+    pub groups: Vec<usize>,
+    /// Of every group and its mixed ones, the one that it is the same as.
+    pub of_all: Vec<usize>,
+}
+
+/// A dancer of mixed groups; see [`MixedGroups`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct DistinctDancer {
+    pub dancer: usize,
+    pub floor: usize,
+    pub group: usize,
+}
+
+impl MixedGroups {
+    /// Tells what differs.
+    pub fn distinct(&self) -> DistinctGroups {
+        let n_slots = self.dancers.len() / self.groups.len().max(1);
+        let (mut dancers, mut groups) = (BTreeMap::new(), BTreeMap::new());
+        let mut found = DistinctGroups {
+            dancers: Vec::new(),
+            places: Vec::new(),
+            groups: Vec::new(),
+            of_all: Vec::with_capacity(self.groups.len()),
+        };
+        for (i, &group) in self.groups.iter().enumerate() {
+            let places: Vec<usize> = (i * n_slots..(i + 1) * n_slots)
+                .map(|at| {
+                    let it =
+                        DistinctDancer { dancer: self.dancers[at], floor: self.floor[at], group };
+                    *dancers.entry(it).or_insert_with(|| {
+                        found.dancers.push(it);
+                        found.dancers.len() - 1
+                    })
+                })
+                .collect();
+            // The group is that of its dancers.
+            let number = *groups.entry(places.clone()).or_insert_with(|| {
+                found.places.extend(places);
+                found.groups.push(group);
+                found.groups.len() - 1
+            });
+            found.of_all.push(number);
+        }
+        found
+    }
 }
 
 /// Mixes groups that have `n_dancers` dancers in the first of `n_slots` places; none where there is one group alone.
@@ -146,6 +205,30 @@ mod tests {
         let share = n_swapped as f64 / n_members as f64;
         // 40 members with p = 1/2: three deviations are 0.24.
         assert!((0.26..0.74).contains(&share), "{share}");
+    }
+
+    #[test]
+    fn every_dancer_and_every_group_is_told_apart_once() {
+        let (n_dancers, n_slots) = ([3, 2, 4, 1], 4);
+        let all = mixed(&n_dancers, n_slots, 8, Stream::new(3, 1)).expect("four groups");
+        let found = all.distinct();
+        assert_eq!((found.groups.len() * n_slots, all.groups.len()), (found.places.len(), 36));
+        for (i, &number) in found.of_all.iter().enumerate() {
+            assert_eq!(found.groups[number], all.groups[i], "group {i}");
+            for slot in 0..n_slots {
+                let it = found.dancers[found.places[number * n_slots + slot]];
+                let at = i * n_slots + slot;
+                let wanted = (all.dancers[at], all.floor[at], all.groups[i]);
+                assert_eq!((it.dancer, it.floor, it.group), wanted, "group {i}, place {slot}");
+            }
+        }
+        let once = |n: usize, distinct: usize| assert_eq!(n, distinct, "something is there twice");
+        let dancers: std::collections::BTreeSet<_> = found.dancers.iter().collect();
+        once(found.dancers.len(), dancers.len());
+        let groups: std::collections::BTreeSet<_> = found.places.chunks(n_slots).collect();
+        once(found.groups.len(), groups.len());
+        // Of three other groups four draws are not all different.
+        assert!(found.groups.len() < 36 && found.dancers.len() < 36 * 3, "nothing was saved");
     }
 
     #[test]

@@ -41,8 +41,12 @@ fn a_stranger_in_the_place_of_another_keeps_its_steps_and_moves_over_the_floor()
         (values[0], values[2]) = (10.0 * dancer + frame * frame, -3.0 * dancer);
     }
     // Dancer 2 dances in the place of 0; 1 where it is; 0 in the place of 1; the fourth place is empty.
-    let mixed = MixedGroups { dancers: vec![2, 1, 0, 3], floor: vec![0, 1, 1, 3], groups: vec![0] };
-    let moves = group.moves(&x0, &mixed);
+    let dancers = [(2, 0), (1, 1), (0, 1), (3, 3)].map(|(dancer, floor)| DistinctDancer {
+        dancer,
+        floor,
+        group: 0,
+    });
+    let moves = group.moves(&x0, &dancers);
     // Means over the frames that count differ by 10 a dancer along x and by 3 along z; held frames move as well.
     let expected = [(-20.0, 6.0), (0.0, 0.0), (10.0, -3.0), (0.0, 0.0)];
     assert_eq!(moves.len(), slots * frames * MOTION_DIM);
