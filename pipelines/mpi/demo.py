@@ -22,7 +22,7 @@ SETTINGS = ["--preset", "tiny", "--side-by-side", "2", "--batch-size", "8", "--s
             "--save-every-steps", "5", "--validate-every", "2", "--quiet"]
 
 
-def ranks_of(store):
+def ranks_of(motiongen, store):
     """Process numbers of those that train in a store."""
     found = []
     for entry in pathlib.Path("/proc").iterdir():
@@ -30,7 +30,7 @@ def ranks_of(store):
             words = (entry / "cmdline").read_bytes().split(b"\0") if entry.name.isdigit() else []
         except OSError:
             continue
-        if words and words[0].endswith(b"/motiongen") and b"train" in words and str(store).encode() in words:
+        if words[0:1] == [str(motiongen).encode()] and b"train" in words and str(store).encode() in words:
             found.append(int(entry.name))
     return sorted(found)
 
@@ -76,13 +76,18 @@ def main():
         started = time.monotonic()
         process = subprocess.Popen([*launcher, *command(stores["two"], 1)], stdout=subprocess.DEVNULL)
         checkpoints = stores["two"] / "runs/mpi/diffusion"
-        while process.poll() is None and len(list(checkpoints.glob("step-*"))) < 2:
-            time.sleep(0.01)
-        ranks = ranks_of(stores["two"])
-        if len(ranks) != 2:
-            raise SystemExit(f"{len(ranks)} ranks are at work where 2 should be")
-        os.kill(ranks[1], signal.SIGKILL)
-        code = process.wait()
+        try:
+            while process.poll() is None and len(list(checkpoints.glob("step-*"))) < 2:
+                time.sleep(0.01)
+            ranks = ranks_of(motiongen, stores["two"])
+            if len(ranks) != 2:
+                raise SystemExit(f"{len(ranks)} ranks are at work where 2 should be")
+            os.kill(ranks[1], signal.SIGKILL)
+            code = process.wait()
+        finally:
+            if process.poll() is None:
+                process.terminate()
+                process.wait()
         print(f"two ranks, one killed after {time.monotonic() - started:.0f} s: exit code {code}", flush=True)
         if code != 75:
             raise SystemExit("a job of which a rank was killed should end with 75")
