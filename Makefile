@@ -66,14 +66,16 @@ ingest: build ## ingest your own files: make ingest SOURCE=… STORE=… [SHARDS
 cluster: ## submit all stages to Slurm as a chain: make cluster SOURCE=… STORE=… RUN=… [SHARDS=16 AGAIN=1 DRY_RUN=1] (docs/cluster.md)
 	@MOTIONGEN="$${MOTIONGEN:-$(BIN)/motiongen}" pipelines/slurm/submit.sh
 
+DEMO_ARGS ?=
 .PHONY: cluster-demo
-cluster-demo: build build-diff-tables ## start a Slurm of two nodes here, kill one under ingest, extract and generate, and compare the tables
-	@$(PYTHON) pipelines/slurm/demo.py --bin $(BIN)
+cluster-demo: build build-diff-tables ## start a Slurm of two nodes here, kill one under ingest, extract and generate, and compare the tables [DEMO_ARGS]
+	@$(PYTHON) pipelines/slurm/demo.py --bin $(BIN) $(DEMO_ARGS)
 
+# With the features of every other build beside `mpi`, so that the dependencies are there already.
 .PHONY: mpi-demo
-mpi-demo: ## train by two processes of mpirun, of which one is killed, and compare the bits with those of one process
+mpi-demo: ## train by two processes of mpirun, of which one is killed, and compare the bits with those of one process [DEMO_ARGS]
 	$(CARGO) build --locked --features mpi --bin motiongen
-	@$(PYTHON) pipelines/mpi/demo.py --bin $(BIN)
+	@$(PYTHON) pipelines/mpi/demo.py --bin $(BIN) $(DEMO_ARGS)
 
 .PHONY: check-kubernetes
 check-kubernetes: build/kubernetes-venv/ready ## hold the manifests of pipelines/kubernetes against the API's schema

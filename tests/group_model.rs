@@ -26,7 +26,7 @@ const SMALL: [&str; 8] = [
 ];
 
 /// Writes phrases of 2 to 4 dancers, 13 to train and 3 to validate, and a soloist.
-fn make_store(dir: &Dir) -> PathBuf {
+pub fn make_store(dir: &Dir) -> PathBuf {
     let (source, store) = (dir.at("source"), dir.at("store"));
     let names = |split: &'static str, n: usize| {
         let all = (0..).map(|i| format!("phrase {i:03}"));
@@ -56,7 +56,7 @@ fn make_store(dir: &Dir) -> PathBuf {
     store
 }
 
-fn train_command(store: &Path, run: &str, more: &[&str]) -> Command {
+pub fn train_command(store: &Path, run: &str, more: &[&str]) -> Command {
     let mut command = motiongen();
     command.arg("train").arg("--store").arg(store).args(["--run", run, "--quiet"]);
     let flag = |argument: &str| argument.split('=').next().unwrap_or_default().to_owned();

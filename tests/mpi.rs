@@ -166,6 +166,67 @@ mod ranks {
         }
     }
 
+    /// Trains in two copies of a store, by one process and by two, and compares what they wrote.
+    fn assert_same_by_two(
+        dir: &Dir,
+        store: &Path,
+        stage: &str,
+        command: impl Fn(&Path) -> Command,
+    ) {
+        let [alone, both] = ["alone", "both"].map(|name| {
+            let store = copy(store, &dir.at(format!("{stage} {name}")));
+            let mut command = command(&store);
+            if name == "both" {
+                command = mpirun(&[(2, &command)]);
+            }
+            let output = finish(&mut command);
+            assert_eq!(output.code, 0, "{stage} {name}: {output:?}");
+            store
+        });
+        for kind in ["step", "best"] {
+            let [alone, both] = [&alone, &both].map(|store| newest(store, "run", stage, kind));
+            assert_eq!(both.0, alone.0, "{stage} {kind}");
+            assert!(both.1 == alone.1, "{stage} {kind} has other numbers");
+        }
+        let alone = losses(&alone, "run", stage);
+        assert!(!alone.is_empty() && losses(&both, "run", stage) == alone, "{stage}: {alone:?}");
+    }
+
+    /// Parts of a batch by their number, whatever the family's usual number is; several validations.
+    const FEW: [&str; 4] = ["--side-by-side=2", "--steps=12", "--validate-every=2", "--threads=1"];
+
+    #[test]
+    fn groups_of_two_ranks_have_the_bits_of_one_process() {
+        if !has_mpirun() {
+            return;
+        }
+        let dir = Dir::new();
+        let store = crate::group_model::make_store(&dir);
+        assert_same_by_two(&dir, &store, "group", |store| {
+            crate::group_model::train_command(store, "run", &FEW)
+        });
+    }
+
+    #[test]
+    fn tokenizers_and_planners_of_two_ranks_have_the_bits_of_one_process() {
+        if !has_mpirun() {
+            return;
+        }
+        let dir = Dir::new();
+        let store = crate::planner::store_with_tokenizer(&dir);
+        let with_few = |more: &[&'static str]| more.iter().chain(&FEW).copied().collect::<Vec<_>>();
+        for (stage, more) in [
+            ("tokens", &[][..]),
+            ("planner", &crate::planner::MASKED),
+            ("planner", &crate::planner::AUTOREGRESSIVE),
+        ] {
+            let dir = Dir::new();
+            assert_same_by_two(&dir, &store, stage, |store| {
+                crate::tokens::train_command(store, "run", &with_few(more))
+            });
+        }
+    }
+
     #[test]
     fn a_dead_rank_ends_the_job_with_75_and_the_same_command_goes_on_with_any_number() {
         if !has_mpirun() {

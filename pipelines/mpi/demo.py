@@ -3,11 +3,15 @@
 killed on the way; says whether both runs ended with the same bits.
 
     pipelines/mpi/demo.py --bin target/debug
+    pipelines/mpi/demo.py --bin target/debug --store build/demo/store      phrases of a store that is there already
+
+A store is copied, not written to.
 """
 
 import argparse
 import os
 import pathlib
+import shutil
 import signal
 import subprocess
 import tempfile
@@ -18,7 +22,7 @@ SETTINGS = ["--preset", "tiny", "--side-by-side", "2", "--batch-size", "8", "--s
             "--save-every-steps", "5", "--validate-every", "2", "--quiet"]
 
 
-def ranks_of(store):
+def ranks_of(motiongen, store):
     """Process numbers of those that train in a store."""
     found = []
     for entry in pathlib.Path("/proc").iterdir():
@@ -26,7 +30,7 @@ def ranks_of(store):
             words = (entry / "cmdline").read_bytes().split(b"\0") if entry.name.isdigit() else []
         except OSError:
             continue
-        if words and words[0].endswith(b"/motiongen") and b"train" in words and str(store).encode() in words:
+        if words[0:1] == [str(motiongen).encode()] and b"train" in words and str(store).encode() in words:
             found.append(int(entry.name))
     return sorted(found)
 
@@ -38,17 +42,29 @@ def newest(store, network):
     return path.name, content[8 + int.from_bytes(content[:8], "little"):]
 
 
+def make_store(motiongen, store, like):
+    """Puts phrases into a store: those of another, without what was trained there, or constructed ones of tests/data."""
+    if like:
+        shutil.copytree(like, store, ignore=shutil.ignore_patterns("runs", "models"))
+        return
+    for stage in (["ingest", "--source", HERE.parent.parent / "tests/data/music"], ["extract"], ["library"]):
+        subprocess.run([motiongen, *stage, "--store", store, "--quiet"], check=True, stdout=subprocess.DEVNULL)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--bin", type=pathlib.Path, default=pathlib.Path("target/debug"))
-    motiongen = (parser.parse_args().bin / "motiongen").resolve()
+    parser.add_argument("--store", type=pathlib.Path, help="store of phrases to train on; made from tests/data otherwise")
+    arguments = parser.parse_args()
+    motiongen = (arguments.bin / "motiongen").resolve()
     launcher = [HERE / "mpirun.sh", "--oversubscribe", "--bind-to", "none", "-n", "2"]
     launcher[1:1] = ["--allow-run-as-root"] if os.geteuid() == 0 else []
     with tempfile.TemporaryDirectory(prefix="motiongen-mpi-") as folder:
         stores = {name: pathlib.Path(folder) / name for name in ("one", "two")}
-        for store in stores.values():
-            for stage in (["ingest", "--source", HERE.parent.parent / "tests/data/music"], ["extract"], ["library"]):
-                subprocess.run([motiongen, *stage, "--store", store, "--quiet"], check=True, stdout=subprocess.DEVNULL)
+        started = time.monotonic()
+        make_store(motiongen, stores["one"], arguments.store)
+        shutil.copytree(stores["one"], stores["two"])
+        print(f"phrases: {time.monotonic() - started:.0f} s", flush=True)
 
         def command(store, threads):
             return [motiongen, "train", "--store", store, "--run", "mpi", "--threads", str(threads), *SETTINGS]
@@ -60,13 +76,18 @@ def main():
         started = time.monotonic()
         process = subprocess.Popen([*launcher, *command(stores["two"], 1)], stdout=subprocess.DEVNULL)
         checkpoints = stores["two"] / "runs/mpi/diffusion"
-        while process.poll() is None and len(list(checkpoints.glob("step-*"))) < 2:
-            time.sleep(0.01)
-        ranks = ranks_of(stores["two"])
-        if len(ranks) != 2:
-            raise SystemExit(f"{len(ranks)} ranks are at work where 2 should be")
-        os.kill(ranks[1], signal.SIGKILL)
-        code = process.wait()
+        try:
+            while process.poll() is None and len(list(checkpoints.glob("step-*"))) < 2:
+                time.sleep(0.01)
+            ranks = ranks_of(motiongen, stores["two"])
+            if len(ranks) != 2:
+                raise SystemExit(f"{len(ranks)} ranks are at work where 2 should be")
+            os.kill(ranks[1], signal.SIGKILL)
+            code = process.wait()
+        finally:
+            if process.poll() is None:
+                process.terminate()
+                process.wait()
         print(f"two ranks, one killed after {time.monotonic() - started:.0f} s: exit code {code}", flush=True)
         if code != 75:
             raise SystemExit("a job of which a rank was killed should end with 75")

@@ -3,6 +3,7 @@
 
     make cluster-demo                                  builds first
     pipelines/slurm/demo.py --bin target/debug         with executables that are there already
+    … --songs 8 --shards 4                             with some of the songs
 
 Starts munged, slurmctld and two slurmd on loopback, with a configuration, keys and folders of their own. The chain of
 submit.sh runs on them; while a task of generate is at work on node c2, that node is killed whole. Slurm queues its tasks again,
@@ -26,6 +27,7 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
 SONGS = ROOT / "tests/data/music"
+AUDIO = {".flac", ".mp3", ".ogg", ".wav"}
 PACKAGES = {"slurmctld": "slurmctld", "slurmd": "slurmd", "sbatch": "slurm-client", "munged": "munge"}
 STAGES = ["ingest", "extract", "generate"]
 NODES = ["c1", "c2"]
@@ -256,10 +258,10 @@ def field(text, name):
     return next((word.split("=", 1)[1] for word in text.split() if word.startswith(f"{name}=")), "")
 
 
-def submit(arguments, motiongen, store, logs):
+def submit(arguments, motiongen, songs, store, logs):
     """Submits the chain, and returns the job of every stage."""
     settings = {
-        "SOURCE": SONGS,
+        "SOURCE": songs,
         "STORE": store,
         "MODEL": "pretrained",
         "STAGES": " ".join(STAGES),
@@ -282,15 +284,29 @@ def submit(arguments, motiongen, store, logs):
 GENERATE = "--steps 4 --quiet"
 
 
-def one_machine(motiongen, store):
-    flags = {"ingest": ["--source", SONGS], "generate": ["--model", "pretrained", *GENERATE.split()]}
+def some_songs(n, folder):
+    """Copies the first songs into a folder, and returns it."""
+    files = sorted(path for path in SONGS.glob("*/*") if path.suffix in AUDIO)
+    if n > len(files):
+        raise CannotRun(f"--songs {n} is more than the {len(files)} songs of {SONGS}")
+    for path in files[:n]:
+        (folder / path.parent.name).mkdir(parents=True, exist_ok=True)
+        # With the beats that lie beside some.
+        for one in [path, path.with_suffix(".beats.txt")]:
+            if one.exists():
+                shutil.copy(one, folder / path.parent.name)
+    return folder
+
+
+def one_machine(motiongen, songs, store):
+    flags = {"ingest": ["--source", songs], "generate": ["--model", "pretrained", *GENERATE.split()]}
     for stage in STAGES:
         run([motiongen, stage, "--store", store, *flags.get(stage, [])])
 
 
-def two_nodes(cluster, arguments, motiongen, store, logs):
+def two_nodes(cluster, arguments, motiongen, songs, store, logs):
     """Runs the chain on the cluster, kills a node on the way, and returns how many tasks were taken over."""
-    chain = submit(arguments, motiongen, store, logs)
+    chain = submit(arguments, motiongen, songs, store, logs)
     job = chain[KILLED_DURING]
 
     def under_way():
@@ -362,13 +378,14 @@ def demo(arguments):
     for name in [name for name in os.environ if name.startswith(("SLURM_", "SBATCH_", "MOTIONGEN_"))]:
         del os.environ[name]
     one, two = out / "one", out / "two"
-    one_machine(motiongen, one)
+    songs = some_songs(arguments.songs, out / "songs") if arguments.songs else SONGS
+    one_machine(motiongen, songs, one)
     say("one machine: ingest, extract and generate are done")
     cluster = Cluster(logs)
     try:
         cluster.start()
         say("two nodes are idle")
-        n_taken_over = two_nodes(cluster, arguments, motiongen, two, logs)
+        n_taken_over = two_nodes(cluster, arguments, motiongen, songs, two, logs)
         say("the chain is done")
     finally:
         cluster.stop()
@@ -383,6 +400,7 @@ def main():
     parser.add_argument("--bin", type=Path, default=Path("target/debug"), help="folder of the executables")
     parser.add_argument("--out", type=Path, default=Path("build/cluster-demo"), help="folder of stores and logs")
     parser.add_argument("--shards", type=int, default=8, help="tasks of every stage")
+    parser.add_argument("--songs", type=int, help="as many of the songs of tests/data; all of them otherwise")
     arguments = parser.parse_args()
     arguments.bin = arguments.bin.resolve()
     # A signal ends the demo as an error does, so that the cluster is stopped.

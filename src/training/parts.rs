@@ -12,13 +12,15 @@
 use std::ops::Range;
 use std::sync::{Arc, Mutex, PoisonError};
 
+use rayon::prelude::*;
+
 use crate::autodiff::op::elementwise::update;
-use crate::autodiff::{Arena, Gradients, Parameters, Shard, Tape, Tensor, Threads};
+use crate::autodiff::{Arena, Gradients, Parameters, Tape, Tensor, Threads};
 use crate::model::ParameterId;
 
 use super::error::TrainingError;
 use super::learner::{Ownership, all_windows};
-use super::ranks::{Exchange, Ranks, packed, piece_range};
+use super::ranks::{Exchange, Numbers, Ranks, RanksError, piece_range};
 
 /// Computes gradients part by part.
 pub struct Parts {
@@ -284,10 +286,6 @@ impl<'a> Reduction<'a> {
         Self { ranks, n_slots, n_own, n, n_pieces, ranges, leaving }
     }
 
-    fn shard(&self, rank: usize) -> Shard {
-        Shard { rank, size: self.ranks.size() }
-    }
-
     /// Returns the parameters that lie within a range, wholly or in part.
     fn parameters_in(&self, range: &Range<usize>) -> Range<usize> {
         let first = self.ranges.partition_point(|own| own.end <= range.start);
@@ -301,7 +299,7 @@ impl<'a> Reduction<'a> {
         let values = gradients.settled(self.parameters_in(&range), 0..self.n);
         let for_rank = |rank: usize| match rank == self.ranks.rank() {
             true => Vec::new(),
-            false => packed(values, range.clone(), self.shard(rank)),
+            false => self.ranks.packed(values, range.clone(), rank),
         };
         let numbers = (0..self.ranks.size()).map(for_rank).collect();
         let mut leaving = self.leaving.lock().unwrap_or_else(PoisonError::into_inner);
@@ -325,39 +323,56 @@ impl<'a> Reduction<'a> {
     /// Waits for what the others computed, and adds up the process's share, in order of gradients.
     fn finish(self, gradients: &mut [Gradients<f32>]) -> Result<(), TrainingError> {
         let begun = self.leaving.into_inner().unwrap_or_else(PoisonError::into_inner).begun;
-        let own_rank = self.ranks.rank();
-        let shard = Shard { rank: own_rank, size: self.ranks.size() };
+        let (rank, n_own) = (self.ranks.rank(), self.n_own);
+        let (first, others) = gradients.split_first_mut().expect("at least one");
+        let first = first.all();
+        let others: Vec<&[f32]> = others.iter_mut().map(|other| &*other.all()).collect();
         let pieces = (0..self.n_pieces).rev().zip(begun);
         for (piece, exchange) in pieces {
             let found = exchange.numbers()?;
             let range = piece_range(piece, self.n);
-            let n_own: usize = shard.ranges_in(range.clone()).map(|own| own.len()).sum();
-            let mut sum: Vec<f32> = Vec::new();
-            for slot in 0..self.n_slots {
-                let (rank, place) = (slot / self.n_own, slot % self.n_own);
-                let own;
-                let numbers = if rank == own_rank {
-                    own = packed(gradients[place].all(), range.clone(), shard);
-                    &own[..]
-                } else {
-                    let numbers = found[rank].get(place * n_own..(place + 1) * n_own);
-                    numbers.ok_or(super::ranks::RanksError::Unreadable(rank))?
-                };
-                match slot {
-                    0 => sum = numbers.to_vec(),
-                    _ => update(&mut sum, numbers, |x, y| x + y),
-                }
+            let shard = self.ranks.shard();
+            let n: usize = shard.ranges_in(range.clone()).map(|own| own.len()).sum();
+            let is_whole =
+                |(of, numbers): (usize, &Arc<Numbers>)| of == rank || numbers.len() == n_own * n;
+            if let Some(of) = found.iter().enumerate().position(|one| !is_whole(one)) {
+                return Err(RanksError::Unreadable(of).into());
             }
-            let whole = gradients[0].all();
-            let mut rest = &sum[..];
+            // Where a chunk lies among the numbers of a gradient that were received.
+            let mut at = 0;
             for own in shard.ranges_in(range) {
-                let (numbers, others) = rest.split_at(own.len());
-                whole[own].copy_from_slice(numbers);
-                rest = others;
+                let of_slot = |slot: usize| match (slot / n_own, slot % n_own) {
+                    (of, place) if of != rank => Some(&found[of][place * n + at..][..own.len()]),
+                    (_, 0) => None,
+                    (_, place) => Some(&others[place - 1][own.clone()]),
+                };
+                let numbers: Vec<_> = (0..self.n_slots).map(of_slot).collect();
+                add_up(&mut first[own.clone()], &numbers);
+                at += own.len();
             }
         }
         Ok(())
     }
+}
+
+/// Numbers that are added up at a time: they stay in the processor's first cache.
+const ADDED: usize = 1 << 11;
+
+/// Adds up numbers in their order; where there are none, those of `own` come, which takes the sum.
+fn add_up(own: &mut [f32], numbers: &[Option<&[f32]>]) {
+    own.par_chunks_mut(ADDED).enumerate().for_each(|(i, own)| {
+        let at = i * ADDED..i * ADDED + own.len();
+        let mut sum = [0.0; ADDED];
+        let sum = &mut sum[..own.len()];
+        for (slot, numbers) in numbers.iter().enumerate() {
+            let numbers = numbers.map_or(&*own, |numbers| &numbers[at.clone()]);
+            match slot {
+                0 => sum.copy_from_slice(numbers),
+                _ => update(sum, numbers, |x, y| x + y),
+            }
+        }
+        own.copy_from_slice(sum);
+    });
 }
 
 /// Where the pieces of one gradient go when they are final.

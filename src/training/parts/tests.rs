@@ -135,6 +135,43 @@ fn any_number_of_processes_ends_with_the_same_bits() {
 }
 
 #[test]
+fn what_processes_give_each_other_grows_with_steps_alone() {
+    let (list, ids) = network();
+    let n = Parameters::<f32>::new(list, 7).plan().len();
+    let n_pieces = n.div_ceil(EXCHANGED_CHUNKS * SHARD_CHUNK);
+    for (side_by_side, size) in [(2, 2), (6, 3)] {
+        let found = together(size, |ranks| {
+            let (list, _) = network();
+            let parameters = Parameters::<f32>::new(list, 7);
+            let mut parts = Parts::new(&parameters, 1, side_by_side);
+            parts.among(&ranks).expect("shared out evenly");
+            let (optimizer, ema) = (OptimizerConfig::default(), EmaConfig { decay: 0.9, every: 1 });
+            let mut network = NetworkState::new("x.", parameters, &optimizer, ema);
+            network.among(&ranks);
+            let mut after = |n_steps: u64| {
+                for step in 0..n_steps {
+                    differentiate(&mut parts, network.live(), ids);
+                    network.step(parts.gradients(), 1.0, 1e-2, step).expect("all");
+                }
+                ranks.traffic()
+            };
+            [after(0), after(3), after(6)]
+        });
+        let mut n_given = 0;
+        for [none, three, nine] in found {
+            assert_eq!((none.n_exchanges, none.n_numbers), (0, 0));
+            // A step's: the pieces of gradient and weights, the weights of parts, the norm, and the losses.
+            assert_eq!(three.n_exchanges, 3 * (2 * n_pieces + 3));
+            assert_eq!(nine.n_exchanges, 3 * three.n_exchanges);
+            assert_eq!(nine.n_numbers, 3 * three.n_numbers);
+            n_given += three.n_numbers;
+        }
+        // Together they send each gradient but the share of the one that has it, and the new weights to all others.
+        assert_eq!(n_given, 3 * n * (side_by_side * (size - 1) / size + size - 1));
+    }
+}
+
+#[test]
 fn a_process_keeps_its_share_of_the_moments_alone() {
     let found = together(2, |ranks| {
         let (list, ids) = network();

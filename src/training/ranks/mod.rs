@@ -3,6 +3,7 @@
 //! Everything is one kind of exchange: each process has a message for each. Exchanges have no names; they are matched by
 //! their order, so that all processes must begin the same ones in the same order. Nothing here depends on a clock.
 
+mod buffers;
 #[cfg(test)]
 mod memory;
 #[cfg(feature = "mpi")]
@@ -11,6 +12,7 @@ mod one;
 
 use std::collections::VecDeque;
 use std::ops::Range;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
@@ -22,6 +24,7 @@ use crate::autodiff::{SHARD_CHUNK, Shard};
 
 #[cfg(feature = "mpi")]
 pub use self::mpi::MpiLink;
+pub use buffers::{Buffers, Numbers};
 #[cfg(test)]
 pub use memory::{MemoryLink, together};
 pub use one::ByOne;
@@ -48,12 +51,12 @@ pub enum RanksError {
 /// What one process gives another.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Message {
-    Numbers(Arc<Vec<f32>>),
+    Numbers(Arc<Numbers>),
     Bytes(Arc<Vec<u8>>),
 }
 
 impl Message {
-    fn numbers(self, of: usize) -> Result<Arc<Vec<f32>>, RanksError> {
+    fn numbers(self, of: usize) -> Result<Arc<Numbers>, RanksError> {
         match self {
             Self::Numbers(numbers) => Ok(numbers),
             Self::Bytes(_) => Err(RanksError::Unreadable(of)),
@@ -65,6 +68,31 @@ impl Message {
             Self::Bytes(bytes) => Ok(bytes),
             Self::Numbers(_) => Err(RanksError::Unreadable(of)),
         }
+    }
+}
+
+/// What the thread that has the link shares with those that give it messages.
+#[derive(Debug, Default)]
+pub struct Desk {
+    pub buffers: Arc<Buffers>,
+    /// Threads that have nothing else to do until messages are there.
+    n_waiting: AtomicUsize,
+    n_exchanges: AtomicUsize,
+    n_given: AtomicUsize,
+}
+
+/// What a process gave others so far.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Traffic {
+    pub n_exchanges: usize,
+    /// Numbers of 4 bytes; the few bytes of other exchanges are not counted.
+    pub n_numbers: usize,
+}
+
+impl Desk {
+    /// Returns whether somebody waits for messages, rather than computes meanwhile.
+    pub fn is_waited_for(&self) -> bool {
+        self.n_waiting.load(Ordering::Relaxed) > 0
     }
 }
 
@@ -80,7 +108,8 @@ pub trait Link {
     ///
     /// # Errors
     /// [`RanksError::Gone`].
-    fn exchange(&mut self, messages: Vec<Message>) -> Result<Vec<Message>, RanksError>;
+    fn exchange(&mut self, messages: Vec<Message>, desk: &Desk)
+    -> Result<Vec<Message>, RanksError>;
 }
 
 type Answer = Result<Vec<Message>, RanksError>;
@@ -94,6 +123,7 @@ enum Order {
 pub struct Ranks {
     rank: usize,
     size: usize,
+    desk: Arc<Desk>,
     courier: Option<Courier>,
 }
 
@@ -104,7 +134,10 @@ struct Courier {
 }
 
 /// An exchange under way.
-pub struct Exchange(Receiver<Answer>);
+pub struct Exchange {
+    answer: Receiver<Answer>,
+    desk: Arc<Desk>,
+}
 
 impl Exchange {
     /// Waits for the messages of all, by rank.
@@ -112,14 +145,17 @@ impl Exchange {
     /// # Errors
     /// [`RanksError::Gone`].
     pub fn wait(self) -> Answer {
-        self.0.recv().unwrap_or(Err(RanksError::Gone))
+        self.desk.n_waiting.fetch_add(1, Ordering::Relaxed);
+        let answer = self.answer.recv().unwrap_or(Err(RanksError::Gone));
+        self.desk.n_waiting.fetch_sub(1, Ordering::Relaxed);
+        answer
     }
 
     /// Waits for the numbers of all, by rank.
     ///
     /// # Errors
     /// When a message of another process did not come.
-    pub fn numbers(self) -> Result<Vec<Arc<Vec<f32>>>, RanksError> {
+    pub fn numbers(self) -> Result<Vec<Arc<Numbers>>, RanksError> {
         self.wait()?.into_iter().enumerate().map(|(of, message)| message.numbers(of)).collect()
     }
 }
@@ -127,7 +163,7 @@ impl Exchange {
 impl Ranks {
     /// A process that trains alone.
     pub fn alone() -> Arc<Self> {
-        Arc::new(Self { rank: 0, size: 1, courier: None })
+        Arc::new(Self { rank: 0, size: 1, desk: Arc::default(), courier: None })
     }
 
     /// Starts the thread that has the link, which is made there.
@@ -139,6 +175,8 @@ impl Ranks {
     ) -> Result<Arc<Self>, RanksError> {
         let (orders, given) = channel();
         let (told, place) = sync_channel(1);
+        let desk = Arc::<Desk>::default();
+        let at = Arc::clone(&desk);
         let work = move || {
             let mut link = match make() {
                 Ok(link) => link,
@@ -149,7 +187,7 @@ impl Ranks {
                 match order {
                     Order::Exchange(messages, answer) => {
                         // Nobody waits for the answer once the process is on its way out.
-                        answer.send(link.exchange(messages)).unwrap_or_default();
+                        answer.send(link.exchange(messages, &at)).unwrap_or_default();
                     }
                     Order::Finish => return drop(link),
                 }
@@ -163,7 +201,7 @@ impl Ranks {
             .map_err(|e| RanksError::NotStarted(e.to_string()))?;
         let (rank, size) = place.recv().unwrap_or(Err(RanksError::Gone))?;
         let courier = Courier { orders: Mutex::new(orders), thread: Mutex::new(Some(thread)) };
-        Ok(Arc::new(Self { rank, size, courier: Some(courier) }))
+        Ok(Arc::new(Self { rank, size, desk, courier: Some(courier) }))
     }
 
     pub fn rank(&self) -> usize {
@@ -188,9 +226,23 @@ impl Ranks {
         Shard { rank: self.rank, size: self.size }
     }
 
+    /// Returns what this process gave others so far.
+    pub fn traffic(&self) -> Traffic {
+        let count = |counter: &AtomicUsize| counter.load(Ordering::Relaxed);
+        let (n_exchanges, n_numbers) = (count(&self.desk.n_exchanges), count(&self.desk.n_given));
+        Traffic { n_exchanges, n_numbers }
+    }
+
     /// Begins to give each process its message, by rank.
     pub fn begin(&self, messages: Vec<Message>) -> Exchange {
         let (answer, exchange) = sync_channel(1);
+        let n_numbers = |(rank, message): (usize, &Message)| match message {
+            Message::Numbers(numbers) if rank != self.rank => numbers.len(),
+            _ => 0,
+        };
+        let n_given = messages.iter().enumerate().map(n_numbers).sum();
+        self.desk.n_exchanges.fetch_add(1, Ordering::Relaxed);
+        self.desk.n_given.fetch_add(n_given, Ordering::Relaxed);
         match &self.courier {
             None => answer.send(Ok(messages)).unwrap_or_default(),
             Some(courier) => {
@@ -199,12 +251,23 @@ impl Ranks {
                 orders.send(Order::Exchange(messages, answer)).unwrap_or_default();
             }
         }
-        Exchange(exchange)
+        Exchange { answer: exchange, desk: Arc::clone(&self.desk) }
     }
 
     /// Begins to give each process its numbers, by rank.
     pub fn begin_numbers(&self, numbers: Vec<Vec<f32>>) -> Exchange {
-        self.begin(numbers.into_iter().map(|one| Message::Numbers(Arc::new(one))).collect())
+        let message = |one| Message::Numbers(Numbers::of(one, &self.desk.buffers));
+        self.begin(numbers.into_iter().map(message).collect())
+    }
+
+    /// Returns the chunks of a process within a range, one behind the other.
+    pub fn packed(&self, values: &[f32], range: Range<usize>, rank: usize) -> Vec<f32> {
+        let shard = Shard { rank, size: self.size };
+        let n = shard.ranges_in(range.clone()).map(|own| own.len()).sum();
+        let mut numbers = self.desk.buffers.take(n);
+        numbers.clear();
+        shard.ranges_in(range).for_each(|own| numbers.extend_from_slice(&values[own]));
+        numbers
     }
 
     /// Gives all the same bytes, and returns those of all, by rank.
@@ -278,14 +341,15 @@ impl Ranks {
         if self.is_alone() {
             return Ok(());
         }
-        let nothing = Arc::new(Vec::new());
+        let nothing = Numbers::of(Vec::new(), &self.desk.buffers);
         let n = values.len();
         let n_pieces = n.div_ceil(EXCHANGED_CHUNKS * SHARD_CHUNK);
         let (mut under_way, mut n_begun) = (VecDeque::new(), 0);
         for piece in 0..n_pieces {
             // One is on its way while the one before is put in its place.
             while n_begun < n_pieces.min(piece + 2) {
-                let own = Arc::new(packed(values, piece_range(n_begun, n), self.shard()));
+                let own = self.packed(values, piece_range(n_begun, n), self.rank);
+                let own = Numbers::of(own, &self.desk.buffers);
                 let message = |rank: usize| {
                     let gets = receives(rank) && rank != self.rank;
                     Message::Numbers(Arc::clone(if gets { &own } else { &nothing }))
@@ -331,11 +395,6 @@ impl Ranks {
 pub fn piece_range(piece: usize, n: usize) -> Range<usize> {
     let len = EXCHANGED_CHUNKS * SHARD_CHUNK;
     (piece * len).min(n)..((piece + 1) * len).min(n)
-}
-
-/// Returns the chunks of a process within a range, one behind the other.
-pub fn packed(values: &[f32], range: Range<usize>, shard: Shard) -> Vec<f32> {
-    shard.ranges_in(range).flat_map(|own| &values[own]).copied().collect()
 }
 
 fn unpack(numbers: &[f32], values: &mut [f32], range: Range<usize>, shard: Shard) {

@@ -14,12 +14,12 @@ use ::mpi::traits::{
 };
 use ::mpi::{Rank, Threading, initialize_with_threading};
 
-use super::{Link, Message, RanksError};
+use super::{Desk, Link, Message, Numbers, RanksError};
 
-/// How long a message that is expected at once is polled for without a pause: from the beginning, and without a pause once another
-/// process is seen to be there. Large messages move a little with each question.
+/// How long answers that somebody waits for are polled for without a pause: from the beginning, and without a pause once another
+/// process is seen to be there. Large messages may move a little with each poll.
 const BRISK: Duration = Duration::from_millis(20);
-/// Pauses between two questions: then, and later.
+/// Pauses between two polls: then, and later, and while nobody waits: whoever polls takes time from those that compute.
 const PAUSES: [Duration; 2] = [Duration::from_micros(40), Duration::from_micros(500)];
 
 /// The world of MPI.
@@ -52,54 +52,59 @@ impl MpiLink {
     }
 }
 
-/// Gives each process numbers of one kind, by rank, and returns those for this one.
-fn exchange<T: Equivalence + Clone + Default>(
+/// Gives each process numbers of one kind, by rank, and returns those for this one; `room` returns memory for so many.
+fn exchange<T: Equivalence + Clone>(
     link: &MpiLink,
-    outgoing: &[Arc<Vec<T>>],
-) -> Vec<Arc<Vec<T>>>
+    outgoing: &[&[T]],
+    desk: &Desk,
+    room: impl Fn(usize) -> Vec<T>,
+) -> Vec<Vec<T>>
 where
     [T]: Buffer + BufferMut,
 {
     let (world, own) = (&link.world, link.rank);
-    let mut found: Vec<Option<Arc<Vec<T>>>> = vec![None; outgoing.len()];
-    found[own] = Some(Arc::clone(&outgoing[own]));
+    let mut found: Vec<Vec<T>> = outgoing.iter().map(|_| Vec::new()).collect();
     scope(|scope| {
         let others = outgoing.iter().enumerate().filter(|(rank, _)| *rank != own);
         let mut under_way: Vec<_> = others
-            .map(|(rank, one)| world.process_at_rank(rank as Rank).immediate_send(scope, &one[..]))
+            .map(|(rank, one)| world.process_at_rank(rank as Rank).immediate_send(scope, *one))
             .collect();
+        let mut expected: Vec<_> =
+            found.iter_mut().enumerate().filter(|(rank, _)| *rank != own).collect();
         let started = Instant::now();
-        let mut arrived = None;
+        let mut moved = None;
         loop {
-            let mut is_idle = true;
-            let missing = found.iter_mut().enumerate().filter(|(_, one)| one.is_none());
-            for (rank, one) in missing {
-                let from = world.process_at_rank(rank as Rank);
-                if let Some((message, status)) = from.immediate_matched_probe() {
-                    let mut numbers =
-                        vec![T::default(); status.count(T::equivalent_datatype()) as usize];
-                    message.matched_receive_into(&mut numbers[..]);
-                    *one = Some(Arc::new(numbers));
-                    is_idle = false;
-                    arrived = Some(Instant::now());
-                }
-            }
+            let before = (under_way.len(), expected.len());
+            expected = expected
+                .into_iter()
+                .filter_map(|(rank, place)| {
+                    let from = world.process_at_rank(rank as Rank);
+                    let Some((message, status)) = from.immediate_matched_probe() else {
+                        return Some((rank, place));
+                    };
+                    *place = room(status.count(T::equivalent_datatype()) as usize);
+                    under_way.push(message.immediate_matched_receive_into(scope, &mut place[..]));
+                    moved = Some(Instant::now());
+                    None
+                })
+                .collect();
             under_way = under_way.into_iter().filter_map(|one| one.test().err()).collect();
-            if under_way.is_empty() && found.iter().all(Option::is_some) {
+            let now = (under_way.len(), expected.len());
+            if now == (0, 0) {
                 return;
             }
-            if !is_idle {
+            if now != before {
                 continue;
             }
-            if arrived.is_some_and(|arrived: Instant| arrived.elapsed() < BRISK) {
-                std::thread::yield_now();
-            } else {
-                let is_brisk = started.elapsed() < BRISK;
-                std::thread::sleep(PAUSES[usize::from(!is_brisk)]);
+            let is_brisk = |since: Instant| since.elapsed() < BRISK;
+            match desk.is_waited_for() {
+                true if moved.is_some_and(is_brisk) => std::thread::yield_now(),
+                true => std::thread::sleep(PAUSES[usize::from(!is_brisk(started))]),
+                false => std::thread::sleep(PAUSES[1]),
             }
         }
     });
-    found.into_iter().flatten().collect()
+    found
 }
 
 impl Link for MpiLink {
@@ -111,16 +116,38 @@ impl Link for MpiLink {
         self.size
     }
 
-    fn exchange(&mut self, messages: Vec<Message>) -> Result<Vec<Message>, RanksError> {
-        let rank = self.rank;
-        if let Some(Message::Numbers(_)) = messages.first() {
+    fn exchange(
+        &mut self,
+        messages: Vec<Message>,
+        desk: &Desk,
+    ) -> Result<Vec<Message>, RanksError> {
+        let own = self.rank;
+        let mut found: Vec<_> = if let Some(Message::Numbers(_)) = messages.first() {
             let outgoing: Result<Vec<_>, _> =
-                messages.into_iter().map(|m| m.numbers(rank)).collect();
+                messages.iter().map(|one| one.clone().numbers(own)).collect();
             let outgoing = outgoing?;
-            return Ok(exchange(self, &outgoing).into_iter().map(Message::Numbers).collect());
+            let outgoing: Vec<_> = outgoing.iter().map(|one| &one[..]).collect();
+            // What a buffer held before is written over.
+            let room = |n| {
+                let mut numbers = desk.buffers.take(n);
+                numbers.resize(n, 0.0);
+                numbers
+            };
+            let found = exchange(self, &outgoing, desk, room);
+            found.into_iter().map(|one| Message::Numbers(Numbers::of(one, &desk.buffers))).collect()
+        } else {
+            let outgoing: Result<Vec<_>, _> =
+                messages.iter().map(|one| one.clone().bytes(own)).collect();
+            let outgoing = outgoing?;
+            let outgoing: Vec<_> = outgoing.iter().map(|one| &one[..]).collect();
+            let found = exchange(self, &outgoing, desk, |n| vec![0; n]);
+            found.into_iter().map(|one| Message::Bytes(Arc::new(one))).collect()
+        };
+        for (rank, one) in messages.into_iter().enumerate() {
+            if rank == own {
+                found[rank] = one;
+            }
         }
-        let outgoing: Result<Vec<_>, _> = messages.into_iter().map(|m| m.bytes(rank)).collect();
-        let outgoing = outgoing?;
-        Ok(exchange(self, &outgoing).into_iter().map(Message::Bytes).collect())
+        Ok(found)
     }
 }
