@@ -1,13 +1,15 @@
 //! Catalogues: what a stage's manifests say, in one Parquet file that is read in place of them.
 //!
 //! `catalogue/<stage>/<number>-<digest>.parquet` has one row per item, the latest word on it, sorted by name;
-//! its footer lists the commits that it covers, their parts, and the items whose rows in them are dead. It says
-//! nothing that the manifests do not say, so any process may write one, a lost race is harmless, and one
-//! that cannot be read is passed over.
+//! its footer lists the commits that it covers, their parts, and the items whose rows in them are dead. Before the
+//! footer lie the commits that settled the items, for those who ask. It says nothing that the manifests do not say, so
+//! any process may write one, a lost race is harmless, and one that cannot be read is passed over.
 
+mod headers;
 mod writer;
 
 use std::collections::{BTreeSet, HashSet};
+use std::sync::OnceLock;
 
 use arrow_array::{Array as _, Int32Array, RecordBatch, StringArray};
 use parquet::errors::ParquetError;
@@ -17,11 +19,13 @@ use super::digest::digest;
 use super::location::{ListedObject, Location};
 use super::manifest::{Header, Item, Part, Rank};
 use super::parquet_object::{ParquetObject, WantedItems, names};
+use headers::HeaderPlace;
 
 pub(super) use writer::{CatalogueError, write};
 
-/// Layout of catalogues; one of another layout is passed over.
-const FORMAT: u32 = 1;
+/// Layout of catalogues; the first has the headers in its footer, and one of a later layout is passed over.
+const FORMAT: u32 = 2;
+const FIRST_FORMAT: u32 = 1;
 /// Folder of the catalogues.
 pub(super) const FOLDER: &str = "catalogue";
 const SUFFIX: &str = ".parquet";
@@ -51,8 +55,12 @@ pub(super) struct Meta {
     format: u32,
     stage: String,
     n_items: u64,
-    /// The commits that settled the items.
-    pub headers: Vec<Header>,
+    /// The commits that settled the items, in the first layout.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    headers: Vec<Header>,
+    /// Where they are in this one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    header_place: Option<HeaderPlace>,
     /// The commits whose parts hold their rows.
     pub commits: Vec<Entry>,
 }
@@ -74,6 +82,8 @@ pub(super) struct Catalogue {
     pub meta: Meta,
     path: String,
     file: ParquetObject,
+    n_headers: usize,
+    headers: OnceLock<Vec<Header>>,
 }
 
 /// The latest settlement of an item, as a catalogue has it.
@@ -115,12 +125,26 @@ impl Catalogue {
         if file.text(META_DIGEST) != Some(digest(text.as_bytes()).as_str()) {
             return Err("its list of commits is damaged".to_owned());
         }
-        let meta: Meta = serde_json::from_str(text).map_err(|e| e.to_string())?;
-        if meta.format != FORMAT || meta.stage != stage {
+        let mut meta: Meta = serde_json::from_str(text).map_err(|e| e.to_string())?;
+        if !(FIRST_FORMAT..=FORMAT).contains(&meta.format) || meta.stage != stage {
             let Meta { format, stage: found, .. } = &meta;
             return Err(format!("it is of format {format} and stage {found}"));
         }
-        Ok(Self { meta, path: store.url_of(&listed.path), file })
+        let headers = OnceLock::new();
+        let n_headers = match &meta.header_place {
+            Some(place) => place.n_headers,
+            None => headers.get_or_init(|| std::mem::take(&mut meta.headers)).len(),
+        };
+        Ok(Self { meta, path: store.url_of(&listed.path), file, n_headers, headers })
+    }
+
+    /// Returns the commits that settled the items; they are read when they are asked for first.
+    pub fn headers(&self) -> Result<&[Header], UnusableReason> {
+        if let (None, Some(place)) = (self.headers.get(), &self.meta.header_place) {
+            let read = place.read(&self.file)?;
+            return Ok(self.headers.get_or_init(|| read));
+        }
+        Ok(self.headers.get().map_or(&[][..], Vec::as_slice))
     }
 
     /// Refuses a catalogue that counts rows of a commit whose manifest is gone.
@@ -142,10 +166,18 @@ impl Catalogue {
         self.meta.n_items
     }
 
-    /// Returns the rank of a row.
-    pub fn rank(&self, row: CatalogueRow) -> Rank<'_> {
+    /// Returns how much of what it says of commits was parsed.
+    #[cfg(test)]
+    pub fn n_parsed_bytes(&self) -> u64 {
+        let list = self.file.text(META).map_or(0, str::len) as u64;
+        let headers = self.headers.get().and(self.meta.header_place.as_ref());
+        list + headers.map_or(0, |place| place.n_bytes)
+    }
+
+    /// Returns the rank of a row, which one of [`Catalogue::headers`] settled.
+    pub fn rank<'a>(&'a self, row: CatalogueRow, headers: &'a [Header]) -> Rank<'a> {
         let entry = &self.meta.commits[row.commit];
-        Rank::new(&self.meta.headers[row.header], entry.generation, &entry.key)
+        Rank::new(&headers[row.header], entry.generation, &entry.key)
     }
 
     /// Visits the names of all items, in order, and which commits they are of.
@@ -197,7 +229,7 @@ impl Catalogue {
         for batch in self.file.batches(ITEM, wanted, columns).map_err(text)? {
             let batch = batch.map_err(text)?;
             n_rows += batch.num_rows() as u64;
-            visit(&CatalogueColumns::of(&batch, &self.meta).ok_or("its columns are others")?)?;
+            visit(&CatalogueColumns::of(&batch, self).ok_or("its columns are others")?)?;
         }
         if matches!(wanted, WantedItems::All) && n_rows != self.meta.n_items {
             return Err(format!("it has {n_rows} of {} items", self.meta.n_items));
@@ -209,18 +241,19 @@ impl Catalogue {
 /// The columns of a batch of a catalogue.
 struct CatalogueColumns<'a> {
     batch: &'a RecordBatch,
-    meta: &'a Meta,
+    catalogue: &'a Catalogue,
     items: &'a StringArray,
     commits: &'a Int32Array,
     headers: &'a Int32Array,
 }
 
 impl<'a> CatalogueColumns<'a> {
-    fn of(batch: &'a RecordBatch, meta: &'a Meta) -> Option<Self> {
+    fn of(batch: &'a RecordBatch, catalogue: &'a Catalogue) -> Option<Self> {
         let numbers =
             |name: &str| batch.column_by_name(name)?.as_any().downcast_ref::<Int32Array>();
         let items = names(batch, ITEM).ok()?;
-        Some(Self { batch, meta, items, commits: numbers(COMMIT)?, headers: numbers(HEADER)? })
+        let (commits, headers) = (numbers(COMMIT)?, numbers(HEADER)?);
+        Some(Self { batch, catalogue, items, commits, headers })
     }
 
     fn n_rows(&self) -> usize {
@@ -229,8 +262,8 @@ impl<'a> CatalogueColumns<'a> {
 
     fn row(&self, i: usize) -> Result<CatalogueRow<'a>, UnusableReason> {
         let place = |n: i32, len: usize| usize::try_from(n).ok().filter(|n| *n < len);
-        let commit = place(self.commits.value(i), self.meta.commits.len());
-        let header = place(self.headers.value(i), self.meta.headers.len());
+        let commit = place(self.commits.value(i), self.catalogue.meta.commits.len());
+        let header = place(self.headers.value(i), self.catalogue.n_headers);
         match (commit, header) {
             (Some(commit), Some(header)) => {
                 Ok(CatalogueRow { item: self.items.value(i), commit, header })

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::fs::File;
+use std::io::{Read as _, Seek as _, SeekFrom};
 use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -107,6 +108,33 @@ impl ParquetObject {
     pub fn text(&self, key: &str) -> Option<&str> {
         let texts = self.metadata.metadata().file_metadata().key_value_metadata()?;
         texts.iter().find(|text| text.key == key)?.value.as_deref()
+    }
+
+    /// Returns the bytes of a range.
+    pub fn bytes(&self, range: Range<u64>) -> ParquetResult<Bytes> {
+        let outside = |n_bytes: u64| {
+            let Range { start, end } = &range;
+            ParquetError::General(format!("bytes {start} to {end} are wanted of {n_bytes}"))
+        };
+        match &self.file {
+            Handle::Local(path) => {
+                let mut file = File::open(path)?;
+                let n_bytes = file.metadata()?.len();
+                if range.start > range.end || range.end > n_bytes {
+                    return Err(outside(n_bytes));
+                }
+                file.seek(SeekFrom::Start(range.start))?;
+                let mut bytes = vec![0; (range.end - range.start) as usize];
+                file.read_exact(&mut bytes)?;
+                Ok(bytes.into())
+            }
+            Handle::Remote(file) => {
+                if range.start > range.end || range.end > file.n_bytes {
+                    return Err(outside(file.n_bytes));
+                }
+                block_on(file.clone().get_bytes(range))
+            }
+        }
     }
 
     /// Returns the rows that are wanted by their `column`: row groups that cannot hold them are not read, and

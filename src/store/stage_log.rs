@@ -1,5 +1,9 @@
 //! What the commits of one stage say: its catalogue, and the manifests that are newer.
 
+mod newest_items;
+#[cfg(test)]
+mod tests;
+
 use std::collections::{HashMap, HashSet};
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -10,6 +14,7 @@ use super::StoreError;
 use super::catalogue::{self, Catalogue, CatalogueError, CatalogueRow, UnusableReason};
 use super::location::{ListedObject, Location};
 use super::manifest::{self, FOLDER, Header, Item, Manifest, Part, Rank, stage_and_key};
+use newest_items::NewestItems;
 
 /// Times that a listing is taken again, where what it told of was gone before it was read.
 const RETRIES: usize = 4;
@@ -317,24 +322,29 @@ impl StageLog {
             if let Some(catalogue) = contents.catalogue
                 && let Some((commit, header)) = catalogue.find(item)?
             {
-                let rank = catalogue.rank(CatalogueRow { item, commit, header });
+                let headers = catalogue.headers()?;
+                let rank = catalogue.rank(CatalogueRow { item, commit, header }, headers);
                 if best.as_ref().is_none_or(|(known, ..)| rank > *known) {
-                    let meta = &catalogue.meta;
-                    best = Some((rank, &meta.headers[header], &meta.commits[commit].parts));
+                    let parts = catalogue.meta.commits[commit].parts.as_slice();
+                    best = Some((rank, &headers[header], parts));
                 }
             }
             Ok(best.map(|(_, header, parts)| (header.clone(), parts.to_vec())))
         })
     }
 
-    /// Writes a catalogue if enough manifests came since the last one, or if `now`; returns whether it did.
+    /// Writes a catalogue if enough manifests came or went since the last one, or any if `now`; returns whether it
+    /// did.
     ///
     /// # Errors
     /// [`CatalogueError`]; the store is as it was then.
     pub fn checkpoint(&self, now: bool) -> Result<bool, CatalogueError> {
-        let n_covered = self.catalogue.as_ref().map_or(0, |c| c.meta.commits.len());
-        let due = MIN_NEWER.max(n_covered / COVERED_PER_NEWER);
-        if self.newer.len() < if now { 1 } else { due } {
+        let covered = self.catalogue.as_ref().map_or(&[][..], |c| c.meta.commits.as_slice());
+        let there: HashSet<&str> =
+            self.manifests.iter().filter_map(|l| Some(stage_and_key(&l.path)?.1)).collect();
+        let n_gone = covered.iter().filter(|entry| !there.contains(&*entry.key)).count();
+        let due = MIN_NEWER.max(covered.len() / COVERED_PER_NEWER);
+        if self.newer.len() + n_gone < if now { 1 } else { due } {
             return Ok(false);
         }
         let listed = (&self.catalogues[..], &self.manifests[..]);
@@ -356,45 +366,6 @@ impl StageLog {
     }
 }
 
-/// The latest settlement of each item in newer manifests.
-struct NewestItems<'a> {
-    headers: Vec<Vec<Header>>,
-    manifests: &'a [Manifest],
-    of: HashMap<&'a str, (usize, usize)>,
-    dead: Vec<Vec<String>>,
-}
-
-impl<'a> NewestItems<'a> {
-    fn of(manifests: &'a [Manifest]) -> Self {
-        let headers = manifests.iter().map(Manifest::headers).collect();
-        let dead = vec![Vec::new(); manifests.len()];
-        let mut newest = Self { headers, manifests, of: HashMap::new(), dead };
-        for (m, manifest) in manifests.iter().enumerate() {
-            for (i, item) in manifest.items.iter().enumerate() {
-                let Some(&known) = newest.of.get(item.id.as_str()) else {
-                    newest.of.insert(&item.id, (m, i));
-                    continue;
-                };
-                let is_later = newest.rank((m, i)) > newest.rank(known);
-                if is_later {
-                    newest.of.insert(&item.id, (m, i));
-                }
-                newest.dead[if is_later { known.0 } else { m }].push(item.id.clone());
-            }
-        }
-        newest
-    }
-
-    fn header(&self, (m, i): (usize, usize)) -> &Header {
-        &self.headers[m][self.manifests[m].header_of(i)]
-    }
-
-    fn rank(&self, place: (usize, usize)) -> Rank<'_> {
-        let manifest = &self.manifests[place.0];
-        Rank::new(self.header(place), manifest.generation(), &manifest.key)
-    }
-}
-
 /// Returns every commit, and what of it counts.
 fn states(contents: Contents) -> Result<Vec<CommitState>, UnusableReason> {
     let mut newest = NewestItems::of(contents.newer);
@@ -402,18 +373,23 @@ fn states(contents: Contents) -> Result<Vec<CommitState>, UnusableReason> {
     let mut states = Vec::new();
     if let Some(catalogue) = contents.catalogue {
         if !newest.of.is_empty() {
-            let mut outranked = Vec::new();
-            let visited = catalogue.visit(|row| {
-                let Some(&place) = newest.of.get(row.item) else { return };
-                if newest.rank(place) > catalogue.rank(row) {
-                    dead_of_old.entry(row.commit).or_default().push(row.item.to_owned());
-                } else {
-                    outranked.push((place.0, row.item.to_owned()));
+            let mut settled_again = Vec::new();
+            catalogue.visit(|CatalogueRow { item, commit, header }| {
+                if let Some((&item, &place)) = newest.of.get_key_value(item) {
+                    settled_again.push((place, CatalogueRow { item, commit, header }));
                 }
-            });
-            visited?;
-            for (m, item) in outranked {
-                newest.dead[m].push(item);
+            })?;
+            // Only these need to know which commits settled the items of the catalogue.
+            let headers: &[Header] =
+                if settled_again.is_empty() { &[] } else { catalogue.headers()? };
+            for (place, row) in settled_again {
+                let is_later = newest.rank(place) > catalogue.rank(row, headers);
+                let dead = if is_later {
+                    dead_of_old.entry(row.commit).or_default()
+                } else {
+                    &mut newest.dead[place.0]
+                };
+                dead.push(row.item.to_owned());
             }
         }
         for (i, entry) in catalogue.meta.commits.iter().enumerate() {
@@ -467,14 +443,15 @@ fn words(contents: Contents, visit: &mut dyn FnMut(ItemRecord)) -> Result<(), Un
     let newest = NewestItems::of(contents.newer);
     let mut outranked: HashSet<&str> = HashSet::new();
     if let Some(catalogue) = contents.catalogue {
+        let headers = catalogue.headers()?;
         let visited = catalogue.visit_items(|row, item| {
             if let Some((id, &place)) = newest.of.get_key_value(row.item) {
-                if newest.rank(place) > catalogue.rank(row) {
+                if newest.rank(place) > catalogue.rank(row, headers) {
                     return;
                 }
                 outranked.insert(id);
             }
-            let header = &catalogue.meta.headers[row.header];
+            let header = &headers[row.header];
             let commit = &catalogue.meta.commits[row.commit].key;
             visit(ItemRecord { item, header, commit });
         });

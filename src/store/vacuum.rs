@@ -10,6 +10,7 @@ use super::delta;
 use super::location::{ListedObject, Location};
 use super::manifest::{self, FOLDER, Manifest, Rank, stage_and_key};
 use super::stage_log::StageLog;
+use super::store_snapshot::checkpoint;
 use super::tables;
 
 /// Age at which a part that no manifest names is taken for abandoned, whatever is asked for: a commit under way
@@ -51,7 +52,7 @@ pub fn vacuum(
     }
     let named_by_delta = delta::active_paths(store)?;
     let mut keys: HashSet<String> = HashSet::new();
-    let mut dead: Vec<DeadCommit> = Vec::new();
+    let (mut dead, mut stages): (Vec<DeadCommit>, Vec<String>) = Default::default();
     for (stage, listed) in by_stage {
         let (listed, times): (Vec<ListedObject>, Vec<SystemTime>) = listed.into_iter().unzip();
         let manifests = manifest::read(store, &listed)?;
@@ -73,6 +74,7 @@ pub fn vacuum(
             if let Err(e) = StageLog::read(store, &stage)?.checkpoint(true) {
                 tracing::warn!("{store}: no catalogue of {stage} was written: {e}");
             }
+            stages.push(stage);
         }
         dead.extend(of_stage);
     }
@@ -82,6 +84,8 @@ pub fn vacuum(
             remove(store, path, n_bytes, dry_run, &mut done)?;
         }
     }
+    // Nor need they be told for ever of what is gone.
+    checkpoint(store, &stages.iter().map(String::as_str).collect::<Vec<_>>());
     for (listed, time) in parts {
         let is_named = key_of(&listed.path).is_none_or(|key| keys.contains(key));
         if !is_named

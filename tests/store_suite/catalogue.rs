@@ -1,6 +1,7 @@
 //! Catalogues say what the manifests say, are read in place of them, and are never needed.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 
 use motiongen::store::{
     Commit, Item, Ledger, Location, PutOutcome, Row as _, StoreSnapshot, checkpoint,
@@ -152,9 +153,11 @@ fn a_catalogue_that_is_damaged_or_of_others_is_passed_over() {
         assert_eq!(seen(location), expected, "cut at {cut}");
     }
     // A list of commits that reads well and says something else.
-    let text = b"{\"format\":1,";
-    let list = bytes.windows(text.len()).position(|window| window == text).expect("a list");
-    for place in (list..bytes.len() - 200).step_by(37) {
+    let position = |text: &[u8]| bytes.windows(text.len()).position(|window| window == text);
+    let (headers, list) = (position(b"{\"runs\":["), position(b"{\"format\":2,"));
+    let (headers, list) = headers.zip(list).expect("the commits that settled items, and a list");
+    assert!(headers < list, "a reader of rows would parse them");
+    for place in (headers..headers + 600).chain(list..bytes.len() - 200).step_by(37) {
         let mut flipped = bytes.clone();
         flipped[place] ^= 0x10;
         replace(&flipped);
@@ -201,4 +204,51 @@ fn whoever_comes_by_may_write_it_at_the_same_time() {
         assert!(!catalogues(location).is_empty(), "{backend}");
         assert_eq!(seen(location), expected, "{backend}");
     }
+}
+
+#[test]
+fn a_catalogue_in_the_layout_of_0_2_is_read_and_carried_on() {
+    const INGEST: &str = "ingest";
+    let Backend { location, .. } = &backends("layout-of-0-2").swap_remove(0);
+    let golden = Location::local(Path::new("tests/golden/catalogue_1")).expect("a location");
+    for path in paths(&golden, "commits") {
+        put(location, &path, &read(&golden, &path));
+    }
+    let words = || {
+        let ledger = Ledger::read(location, INGEST).expect("a ledger");
+        let words = ledger.iter().map(|known| {
+            let header = (known.key.clone(), known.sequence, known.origin.clone());
+            (known.item.id.clone(), known.item.input_hash.clone(), header)
+        });
+        words.collect::<BTreeSet<_>>()
+    };
+    let of_manifests = words();
+    let commits: BTreeSet<_> = of_manifests.iter().map(|(_, _, header)| &header.0).collect();
+    assert_eq!((of_manifests.len(), commits.len()), (5, 3), "{of_manifests:?}");
+    // Manifests that nobody can read are not missed by who reads the catalogue.
+    for path in paths(location, "commits") {
+        location.remove(&path).expect("removed");
+        put(location, &path, b"damaged");
+    }
+    assert!(Ledger::read(location, INGEST).is_err());
+    for path in paths(&golden, "catalogue") {
+        put(location, &path, &read(&golden, &path));
+    }
+    assert_eq!(words(), of_manifests);
+    // One of them is settled again, and the next catalogue is of the present layout.
+    for i in 0..16 {
+        let before = Ledger::read(location, INGEST).expect("a ledger");
+        let mut commit = Commit::new(location, INGEST, "", "another source");
+        commit.settle(item("phrase_0000003", &format!("{i}")), &before);
+        commit.publish().expect("published");
+    }
+    let expected = words();
+    assert_eq!((expected.len(), expected.difference(&of_manifests).count()), (5, 1));
+    checkpoint(location, &[INGEST]);
+    let newest = catalogues(location).pop().expect("a catalogue");
+    let is_in_layout = |path: &str, text: &[u8]| {
+        read(location, path).windows(text.len()).any(|window| window == text)
+    };
+    assert!(newest.contains("/00000002-") && is_in_layout(&newest, b"{\"format\":2,"), "{newest}");
+    assert_eq!(words(), expected);
 }

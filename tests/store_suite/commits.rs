@@ -2,8 +2,8 @@
 
 use motiongen::store::tables::{FailureRow, motion};
 use motiongen::store::{
-    Commit, CommitResult, Item, Ledger, Location, Row as _, Snapshot, StoreError, TableSchema,
-    TimestampUs,
+    Commit, CommitResult, Item, Ledger, Location, Row as _, Snapshot, StoreError, StoreSnapshot,
+    TableSchema, TimestampUs,
 };
 use ndarray::Array2;
 
@@ -324,4 +324,43 @@ fn below(location: &Location, folder: &str) -> Option<Location> {
     let is_remote = location.url().starts_with("s3:") || location.url().starts_with("gs:");
     let url = format!("{}/{folder}", location.url());
     (!is_remote).then(|| Location::open(&url, &options).expect("a location"))
+}
+
+#[test]
+fn a_snapshot_is_of_one_moment_in_all_tables() {
+    let settle = |location: &Location, n: usize| {
+        let known = ledger(location);
+        let mut commit = Commit::new(location, STAGE, "rules", "source");
+        let frames = Array2::from_elem((n, 25), n as f32);
+        commit.part("motion", motion).expect("a part").write_frames("a", frames.view()).expect("a");
+        let (text, part) = (n.to_string(), commit.part("failures", FailureRow::schema));
+        part.expect("a part").write_rows(&[outcome("b", &text)]).expect("rows");
+        commit.settle(Item { failure: None, ..item("a", &text) }, &known);
+        commit.settle(item("b", &text), &known);
+        commit.publish().expect("published");
+    };
+    let seen = |taken: &StoreSnapshot| {
+        let failures = visible(&taken.table(FailureRow::schema()).expect("a table"));
+        let table = taken.table(motion()).expect("a table");
+        let n_frames: u64 = table.parts().iter().map(|live| live.part.n_rows).sum();
+        let rows: Vec<FailureRow> = taken.item("b").and_then(|b| b.rows()).expect("rows");
+        let known = taken.ledger(STAGE).expect("a ledger");
+        let known = known.get("a").expect("settled").item.input_hash.clone();
+        (n_frames, failures, rows[0].message.clone(), known)
+    };
+    for backend in backends("one-moment") {
+        let location = &backend.location;
+        settle(location, 2);
+        let before = StoreSnapshot::take(location).expect("a snapshot");
+        // What comes between the reading of two tables shows in neither.
+        settle(location, 3);
+        let expected = |n: u64| {
+            let text = n.to_string();
+            (n, vec![("b".to_owned(), text.clone())], text.clone(), text)
+        };
+        assert_eq!(seen(&before), expected(2), "{backend}");
+        let after = StoreSnapshot::take(location).expect("a snapshot");
+        assert_eq!(after.table(motion()).expect("a table").parts().len(), 1, "{backend}");
+        assert_eq!(seen(&after), expected(3), "{backend}");
+    }
 }

@@ -16,7 +16,7 @@ use parquet::schema::types::ColumnPath;
 use super::{
     COMMIT, Catalogue, CatalogueRow, Entry, FAILURE, FINGERPRINT, FOLDER, FORMAT, HEADER,
     INPUT_HASH, ITEM, META, META_DIGEST, Meta, N_KEPT, ROW_GROUP_ROWS, SUFFIX, UnusableReason,
-    is_catalogue, number_of,
+    headers, is_catalogue, number_of,
 };
 use crate::store::StoreError;
 use crate::store::digest::{digest, digest_texts};
@@ -62,6 +62,7 @@ pub(in crate::store) enum CatalogueError {
 
 struct Writer<'a> {
     old: Option<&'a Catalogue>,
+    old_headers: &'a [Header],
     newer: &'a [Manifest],
     /// Commits that settled items of `newer`.
     newer_headers: Vec<Vec<Header>>,
@@ -70,7 +71,8 @@ struct Writer<'a> {
     old_commits: Vec<Option<usize>>,
     /// Where the commits of `newer` begin in `meta`.
     first_commit: usize,
-    headers: HeaderPlaces,
+    headers: Vec<Header>,
+    header_places: HeaderPlaces,
     dead: Vec<Vec<String>>,
     writer: ArrowWriter<tempfile::NamedTempFile>,
     schema: SchemaRef,
@@ -93,6 +95,8 @@ impl<'a> Writer<'a> {
         newer: &'a [Manifest],
         there: &HashSet<&str>,
     ) -> Result<Self, CatalogueError> {
+        let old_headers = old.map_or(Ok(&[][..]), Catalogue::headers);
+        let old_headers = old_headers.map_err(CatalogueError::Unusable)?;
         let mut meta = Meta { format: FORMAT, stage: stage.to_owned(), ..Meta::default() };
         let mut old_commits = Vec::new();
         for entry in old.iter().flat_map(|old| &old.meta.commits) {
@@ -124,15 +128,18 @@ impl<'a> Writer<'a> {
         let writer =
             ArrowWriter::try_new(file, Arc::clone(&schema), Some(properties)).map_err(unusable)?;
         let newer_headers = newer.iter().map(Manifest::headers).collect();
-        let (headers, rows) = (HeaderPlaces::default(), CatalogueRows::default());
+        let (headers, header_places) = (Vec::new(), HeaderPlaces::default());
+        let rows = CatalogueRows::default();
         Ok(Self {
             old,
+            old_headers,
             newer,
             newer_headers,
             meta,
             old_commits,
             first_commit,
             headers,
+            header_places,
             dead,
             writer,
             schema,
@@ -190,7 +197,7 @@ impl<'a> Writer<'a> {
         let commit = self.old_commits[row.commit]
             .ok_or_else(|| CatalogueError::Unusable(format!("{} is of a dead commit", row.item)))?;
         if let Some(&(_, place)) = newest.peek().filter(|(id, _)| *id == row.item) {
-            if self.rank_of(place) > old.rank(row) {
+            if self.rank_of(place) > old.rank(row, self.old_headers) {
                 // The newer one is written in its turn.
                 self.dead[commit].push(row.item.to_owned());
                 return Ok(());
@@ -198,11 +205,11 @@ impl<'a> Writer<'a> {
             newest.next();
             self.dead[self.first_commit + place.0].push(row.item.to_owned());
         }
-        let header = match self.headers.of_old.get(&row.header) {
+        let header = match self.header_places.of_old.get(&row.header) {
             Some(&place) => place,
             None => {
-                let place = self.place_of(old.meta.headers[row.header].clone());
-                self.headers.of_old.insert(row.header, place);
+                let place = self.place_of(self.old_headers[row.header].clone());
+                self.header_places.of_old.insert(row.header, place);
                 place
             }
         };
@@ -219,11 +226,11 @@ impl<'a> Writer<'a> {
     fn push_newer(&mut self, (m, i): (usize, usize)) -> Result<(), CatalogueError> {
         let manifest = &self.newer[m];
         let place_in_manifest = (m, manifest.header_of(i));
-        let header = match self.headers.of_newer.get(&place_in_manifest) {
+        let header = match self.header_places.of_newer.get(&place_in_manifest) {
             Some(&place) => place,
             None => {
                 let place = self.place_of(self.newer_headers[m][place_in_manifest.1].clone());
-                self.headers.of_newer.insert(place_in_manifest, place);
+                self.header_places.of_newer.insert(place_in_manifest, place);
                 place
             }
         };
@@ -232,8 +239,8 @@ impl<'a> Writer<'a> {
     }
 
     fn place_of(&mut self, header: Header) -> usize {
-        let headers = &mut self.meta.headers;
-        *self.headers.all.entry(header).or_insert_with_key(|header| {
+        let headers = &mut self.headers;
+        *self.header_places.all.entry(header).or_insert_with_key(|header| {
             headers.push(header.clone());
             headers.len() - 1
         })
@@ -253,6 +260,11 @@ impl<'a> Writer<'a> {
     }
 
     fn finish(mut self) -> Result<(tempfile::NamedTempFile, Meta), CatalogueError> {
+        // Behind the last row group, where no reader of Parquet looks.
+        self.writer.flush().map_err(unusable)?;
+        let (bytes, place) = headers::encode(&self.headers, self.writer.bytes_written() as u64);
+        self.writer.write_all(&bytes).map_err(|e| unusable(e.into()))?;
+        self.meta.header_place = Some(place);
         for (entry, mut dead) in self.meta.commits.iter_mut().zip(self.dead) {
             entry.dead.append(&mut dead);
             entry.is_dead |= entry.dead.len() as u64 == entry.n_items;
