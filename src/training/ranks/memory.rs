@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
 
-use super::{Desk, Link, Message, Ranks, RanksError};
+use super::{Link, LinkState, Message, Ranks, RanksError};
 
 /// A link between threads: a channel from each to each.
 pub struct MemoryLink {
@@ -28,7 +28,11 @@ impl Link for MemoryLink {
         self.to.len()
     }
 
-    fn exchange(&mut self, messages: Vec<Message>, _: &Desk) -> Result<Vec<Message>, RanksError> {
+    fn exchange(
+        &mut self,
+        messages: Vec<Message>,
+        _: &LinkState,
+    ) -> Result<Vec<Message>, RanksError> {
         for (to, message) in self.to.iter().zip(messages) {
             to.send(message).map_err(|_| RanksError::Gone)?;
         }

@@ -73,7 +73,7 @@ impl Message {
 
 /// What the thread that has the link shares with those that give it messages.
 #[derive(Debug, Default)]
-pub struct Desk {
+pub struct LinkState {
     pub buffers: Arc<Buffers>,
     /// Threads that have nothing else to do until messages are there.
     n_waiting: AtomicUsize,
@@ -89,7 +89,7 @@ pub struct Traffic {
     pub n_numbers: usize,
 }
 
-impl Desk {
+impl LinkState {
     /// Returns whether somebody waits for messages, rather than computes meanwhile.
     pub fn is_waited_for(&self) -> bool {
         self.n_waiting.load(Ordering::Relaxed) > 0
@@ -108,8 +108,11 @@ pub trait Link {
     ///
     /// # Errors
     /// [`RanksError::Gone`].
-    fn exchange(&mut self, messages: Vec<Message>, desk: &Desk)
-    -> Result<Vec<Message>, RanksError>;
+    fn exchange(
+        &mut self,
+        messages: Vec<Message>,
+        shared: &LinkState,
+    ) -> Result<Vec<Message>, RanksError>;
 }
 
 type Answer = Result<Vec<Message>, RanksError>;
@@ -123,7 +126,7 @@ enum Order {
 pub struct Ranks {
     rank: usize,
     size: usize,
-    desk: Arc<Desk>,
+    shared: Arc<LinkState>,
     courier: Option<Courier>,
 }
 
@@ -136,7 +139,7 @@ struct Courier {
 /// An exchange under way.
 pub struct Exchange {
     answer: Receiver<Answer>,
-    desk: Arc<Desk>,
+    shared: Arc<LinkState>,
 }
 
 impl Exchange {
@@ -145,9 +148,9 @@ impl Exchange {
     /// # Errors
     /// [`RanksError::Gone`].
     pub fn wait(self) -> Answer {
-        self.desk.n_waiting.fetch_add(1, Ordering::Relaxed);
+        self.shared.n_waiting.fetch_add(1, Ordering::Relaxed);
         let answer = self.answer.recv().unwrap_or(Err(RanksError::Gone));
-        self.desk.n_waiting.fetch_sub(1, Ordering::Relaxed);
+        self.shared.n_waiting.fetch_sub(1, Ordering::Relaxed);
         answer
     }
 
@@ -163,7 +166,7 @@ impl Exchange {
 impl Ranks {
     /// A process that trains alone.
     pub fn alone() -> Arc<Self> {
-        Arc::new(Self { rank: 0, size: 1, desk: Arc::default(), courier: None })
+        Arc::new(Self { rank: 0, size: 1, shared: Arc::default(), courier: None })
     }
 
     /// Starts the thread that has the link, which is made there.
@@ -175,8 +178,8 @@ impl Ranks {
     ) -> Result<Arc<Self>, RanksError> {
         let (orders, given) = channel();
         let (told, place) = sync_channel(1);
-        let desk = Arc::<Desk>::default();
-        let at = Arc::clone(&desk);
+        let shared = Arc::<LinkState>::default();
+        let at = Arc::clone(&shared);
         let work = move || {
             let mut link = match make() {
                 Ok(link) => link,
@@ -201,7 +204,7 @@ impl Ranks {
             .map_err(|e| RanksError::NotStarted(e.to_string()))?;
         let (rank, size) = place.recv().unwrap_or(Err(RanksError::Gone))?;
         let courier = Courier { orders: Mutex::new(orders), thread: Mutex::new(Some(thread)) };
-        Ok(Arc::new(Self { rank, size, desk, courier: Some(courier) }))
+        Ok(Arc::new(Self { rank, size, shared, courier: Some(courier) }))
     }
 
     pub fn rank(&self) -> usize {
@@ -229,7 +232,8 @@ impl Ranks {
     /// Returns what this process gave others so far.
     pub fn traffic(&self) -> Traffic {
         let count = |counter: &AtomicUsize| counter.load(Ordering::Relaxed);
-        let (n_exchanges, n_numbers) = (count(&self.desk.n_exchanges), count(&self.desk.n_given));
+        let (n_exchanges, n_numbers) =
+            (count(&self.shared.n_exchanges), count(&self.shared.n_given));
         Traffic { n_exchanges, n_numbers }
     }
 
@@ -241,8 +245,8 @@ impl Ranks {
             _ => 0,
         };
         let n_given = messages.iter().enumerate().map(n_numbers).sum();
-        self.desk.n_exchanges.fetch_add(1, Ordering::Relaxed);
-        self.desk.n_given.fetch_add(n_given, Ordering::Relaxed);
+        self.shared.n_exchanges.fetch_add(1, Ordering::Relaxed);
+        self.shared.n_given.fetch_add(n_given, Ordering::Relaxed);
         match &self.courier {
             None => answer.send(Ok(messages)).unwrap_or_default(),
             Some(courier) => {
@@ -251,12 +255,12 @@ impl Ranks {
                 orders.send(Order::Exchange(messages, answer)).unwrap_or_default();
             }
         }
-        Exchange { answer: exchange, desk: Arc::clone(&self.desk) }
+        Exchange { answer: exchange, shared: Arc::clone(&self.shared) }
     }
 
     /// Begins to give each process its numbers, by rank.
     pub fn begin_numbers(&self, numbers: Vec<Vec<f32>>) -> Exchange {
-        let message = |one| Message::Numbers(Numbers::of(one, &self.desk.buffers));
+        let message = |one| Message::Numbers(Numbers::of(one, &self.shared.buffers));
         self.begin(numbers.into_iter().map(message).collect())
     }
 
@@ -264,7 +268,7 @@ impl Ranks {
     pub fn packed(&self, values: &[f32], range: Range<usize>, rank: usize) -> Vec<f32> {
         let shard = Shard { rank, size: self.size };
         let n = shard.ranges_in(range.clone()).map(|own| own.len()).sum();
-        let mut numbers = self.desk.buffers.take(n);
+        let mut numbers = self.shared.buffers.take(n);
         numbers.clear();
         shard.ranges_in(range).for_each(|own| numbers.extend_from_slice(&values[own]));
         numbers
@@ -341,7 +345,7 @@ impl Ranks {
         if self.is_alone() {
             return Ok(());
         }
-        let nothing = Numbers::of(Vec::new(), &self.desk.buffers);
+        let nothing = Numbers::of(Vec::new(), &self.shared.buffers);
         let n = values.len();
         let n_pieces = n.div_ceil(EXCHANGED_CHUNKS * SHARD_CHUNK);
         let (mut under_way, mut n_begun) = (VecDeque::new(), 0);
@@ -349,7 +353,7 @@ impl Ranks {
             // One is on its way while the one before is put in its place.
             while n_begun < n_pieces.min(piece + 2) {
                 let own = self.packed(values, piece_range(n_begun, n), self.rank);
-                let own = Numbers::of(own, &self.desk.buffers);
+                let own = Numbers::of(own, &self.shared.buffers);
                 let message = |rank: usize| {
                     let gets = receives(rank) && rank != self.rank;
                     Message::Numbers(Arc::clone(if gets { &own } else { &nothing }))

@@ -14,7 +14,7 @@ use ::mpi::traits::{
 };
 use ::mpi::{Rank, Threading, initialize_with_threading};
 
-use super::{Desk, Link, Message, Numbers, RanksError};
+use super::{Link, LinkState, Message, Numbers, RanksError};
 
 /// How long answers that somebody waits for are polled for without a pause: from the beginning, and without a pause once another
 /// process is seen to be there. Large messages may move a little with each poll.
@@ -56,7 +56,7 @@ impl MpiLink {
 fn exchange<T: Equivalence + Clone>(
     link: &MpiLink,
     outgoing: &[&[T]],
-    desk: &Desk,
+    shared: &LinkState,
     room: impl Fn(usize) -> Vec<T>,
 ) -> Vec<Vec<T>>
 where
@@ -97,7 +97,7 @@ where
                 continue;
             }
             let is_brisk = |since: Instant| since.elapsed() < BRISK;
-            match desk.is_waited_for() {
+            match shared.is_waited_for() {
                 true if moved.is_some_and(is_brisk) => std::thread::yield_now(),
                 true => std::thread::sleep(PAUSES[usize::from(!is_brisk(started))]),
                 false => std::thread::sleep(PAUSES[1]),
@@ -119,7 +119,7 @@ impl Link for MpiLink {
     fn exchange(
         &mut self,
         messages: Vec<Message>,
-        desk: &Desk,
+        shared: &LinkState,
     ) -> Result<Vec<Message>, RanksError> {
         let own = self.rank;
         let mut found: Vec<_> = if let Some(Message::Numbers(_)) = messages.first() {
@@ -129,18 +129,21 @@ impl Link for MpiLink {
             let outgoing: Vec<_> = outgoing.iter().map(|one| &one[..]).collect();
             // What a buffer held before is written over.
             let room = |n| {
-                let mut numbers = desk.buffers.take(n);
+                let mut numbers = shared.buffers.take(n);
                 numbers.resize(n, 0.0);
                 numbers
             };
-            let found = exchange(self, &outgoing, desk, room);
-            found.into_iter().map(|one| Message::Numbers(Numbers::of(one, &desk.buffers))).collect()
+            let found = exchange(self, &outgoing, shared, room);
+            found
+                .into_iter()
+                .map(|one| Message::Numbers(Numbers::of(one, &shared.buffers)))
+                .collect()
         } else {
             let outgoing: Result<Vec<_>, _> =
                 messages.iter().map(|one| one.clone().bytes(own)).collect();
             let outgoing = outgoing?;
             let outgoing: Vec<_> = outgoing.iter().map(|one| &one[..]).collect();
-            let found = exchange(self, &outgoing, desk, |n| vec![0; n]);
+            let found = exchange(self, &outgoing, shared, |n| vec![0; n]);
             found.into_iter().map(|one| Message::Bytes(Arc::new(one))).collect()
         };
         for (rank, one) in messages.into_iter().enumerate() {
