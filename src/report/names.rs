@@ -117,7 +117,7 @@ mod tests {
     #[test]
     fn every_subject_has_a_place_and_a_meaning() {
         let names = ["generated", "shifted", "training_truth", "ground_truth", "other"];
-        assert_eq!(names.map(order), [0, 2, 12, 13, 14]);
+        assert_eq!(names.map(order), [0, 2, 13, 14, 15]);
         assert_eq!(names.map(is_truth), [false, false, true, true, false]);
         assert_eq!(meaning("no_music"), {
             "the trained network without its music: what it does whatever is played"
