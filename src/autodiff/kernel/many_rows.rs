@@ -12,7 +12,7 @@ use crate::autodiff::element::Element;
 
 use super::pack::{PANEL, panels};
 use super::product::split;
-use super::tile::{MAX_ROWS, Tile};
+use super::tile::{MAX_PANELS, MAX_ROWS, Tile};
 
 /// Elements of a block of rows: 1 MB of `f32`, half of a second cache.
 const BLOCK_LEN: usize = 1 << 18;
@@ -74,7 +74,7 @@ pub fn weight_gradient_of_many<E: Element>(
         let Share { panels: own, d_weight, d_bias } = share;
         let mut strips = arena.take(&[panels(channels), rows * PANEL]);
         let strips_of = strips.as_slice_mut().expect("one run of memory");
-        let widest = split(own.len(), own.len().div_ceil(super::tile::MAX_PANELS));
+        let widest = split(own.len(), own.len().div_ceil(MAX_PANELS));
         let mut columns =
             arena.take(&[widest.iter().map(Range::len).max().unwrap_or(0), rows * PANEL]);
         let columns_of = columns.as_slice_mut().expect("one run of memory");

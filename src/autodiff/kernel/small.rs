@@ -147,7 +147,5 @@ vectorized! {
 fn scale_16<E: Element>(y: &mut [E], x: &[E], alpha: E) {
     let (y, x): (&mut [E; PANEL], &[E; PANEL]) =
         (y.try_into().expect("16 numbers"), x.try_into().expect("16 numbers"));
-    for i in 0..PANEL {
-        y[i] = alpha * x[i];
-    }
+    y.iter_mut().zip(x).for_each(|(y, &x)| *y = alpha * x);
 }

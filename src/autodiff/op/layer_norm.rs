@@ -60,9 +60,7 @@ vectorized! {
             let turned = Turned::of(rows, channels, first);
             for i in 0..(channels - first).min(LANES) {
                 let x = turned.channel(i);
-                for lane in 0..LANES {
-                    mean[lane] += x[lane];
-                }
+                mean.iter_mut().zip(x).for_each(|(mean, x)| *mean += x);
             }
         }
         mean.iter_mut().for_each(|mean| *mean /= n);
@@ -70,9 +68,8 @@ vectorized! {
             let turned = Turned::of(rows, channels, first);
             for i in 0..(channels - first).min(LANES) {
                 let x = turned.channel(i);
-                for lane in 0..LANES {
-                    let d = x[lane] - mean[lane];
-                    variance[lane] += d * d;
+                for ((variance, mean), x) in variance.iter_mut().zip(&mean).zip(x) {
+                    *variance += (x - mean) * (x - mean);
                 }
             }
         }
@@ -117,15 +114,11 @@ vectorized! {
                 let gx: [f64; LANES] =
                     std::array::from_fn(|lane| g[lane] * ((x[lane] - mean[lane]) * r[lane]));
                 if let Some(inverse) = inverse {
-                    for lane in 0..LANES {
-                        m1[lane] += g[lane] * inverse;
-                        m2[lane] += gx[lane] * inverse;
-                    }
+                    m1.iter_mut().zip(g).for_each(|(m, g)| *m += g * inverse);
+                    m2.iter_mut().zip(gx).for_each(|(m, gx)| *m += gx * inverse);
                 } else {
-                    for lane in 0..LANES {
-                        m1[lane] += g[lane] / n;
-                        m2[lane] += gx[lane] / n;
-                    }
+                    m1.iter_mut().zip(g).for_each(|(m, g)| *m += g / n);
+                    m2.iter_mut().zip(gx).for_each(|(m, gx)| *m += gx / n);
                 }
             }
         }

@@ -34,8 +34,8 @@ vectorized! {
         let angles = cos.chunks_exact(LANES).zip(sin.chunks_exact(LANES));
         for (x, (cos, sin)) in run.chunks_exact_mut(LANES).zip(angles) {
             let old: [E; LANES] = std::array::from_fn(|i| x[i]);
-            for i in 0..LANES {
-                x[i] = old[i] * cos[i] + old[i ^ 1] * sin[i];
+            for (i, (x, (&cos, &sin))) in x.iter_mut().zip(cos.iter().zip(sin)).enumerate() {
+                *x = old[i] * cos + old[i ^ 1] * sin;
             }
         }
         let angles = cos[whole..].chunks_exact(2).zip(sin[whole..].chunks_exact(2));
