@@ -146,10 +146,8 @@ impl Link for MpiLink {
             let found = exchange(self, &outgoing, shared, |n| vec![0; n]);
             found.into_iter().map(|one| Message::Bytes(Arc::new(one))).collect()
         };
-        for (rank, one) in messages.into_iter().enumerate() {
-            if rank == own {
-                found[rank] = one;
-            }
+        if let Some(message) = messages.into_iter().nth(own) {
+            found[own] = message;
         }
         Ok(found)
     }
