@@ -12,9 +12,7 @@
 use std::ops::Range;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use rayon::prelude::*;
-
-use crate::autodiff::op::elementwise::update;
+use crate::autodiff::op::elementwise::sum_in_order;
 use crate::autodiff::{Arena, Gradients, Parameters, Tape, Tensor, Threads};
 use crate::model::ParameterId;
 
@@ -347,32 +345,12 @@ impl<'a> Reduction<'a> {
                     (_, place) => Some(&others[place - 1][own.clone()]),
                 };
                 let numbers: Vec<_> = (0..self.n_slots).map(of_slot).collect();
-                add_up(&mut first[own.clone()], &numbers);
+                sum_in_order(&mut first[own.clone()], &numbers);
                 at += own.len();
             }
         }
         Ok(())
     }
-}
-
-/// Numbers that are added up at a time: they stay in the processor's first cache.
-const ADDED: usize = 1 << 11;
-
-/// Adds up numbers in their order; where there are none, those of `own` come, which takes the sum.
-fn add_up(own: &mut [f32], numbers: &[Option<&[f32]>]) {
-    own.par_chunks_mut(ADDED).enumerate().for_each(|(i, own)| {
-        let at = i * ADDED..i * ADDED + own.len();
-        let mut sum = [0.0; ADDED];
-        let sum = &mut sum[..own.len()];
-        for (slot, numbers) in numbers.iter().enumerate() {
-            let numbers = numbers.map_or(&*own, |numbers| &numbers[at.clone()]);
-            match slot {
-                0 => sum.copy_from_slice(numbers),
-                _ => update(sum, numbers, |x, y| x + y),
-            }
-        }
-        own.copy_from_slice(sum);
-    });
 }
 
 /// Where the pieces of one gradient go when they are final.

@@ -13,7 +13,7 @@ use crate::support::files::{coherent, trajectory, wav};
 use crate::support::{MEMORY_BYTES, write};
 
 pub fn cases() -> Vec<Case> {
-    [doubles(), folders(), no_files(), links(), large_files(), permissions(), names()]
+    [doubles(), styles(), folders(), no_files(), links(), large_files(), permissions(), names()]
         .into_iter()
         .flatten()
         .collect()
@@ -37,6 +37,26 @@ fn doubles() -> Vec<Case> {
              ("beats/two-beats.beats.txt", b"0\n1\n".to_vec())],
             "beats/two-beats.beats.txt", "duplicate_id",
             "beats comes twice, from audio/two-beats.beats.txt and {path}; keep one of them"),
+    ]
+}
+
+#[rustfmt::skip]
+fn styles() -> Vec<Case> {
+    let case = |id: &str, name: &[u8], sentence: &str| {
+        let path = format!("motion/{id}/style.txt");
+        let motion = (format!("motion/{id}/trajectory.npy"), trajectory(&coherent(9, 1)));
+        Case::files(id, [motion, (path.clone(), name.to_vec())], &path, "layout", sentence)
+    };
+    let no_name = "{path} has no name of a style; write one in a line: at most 64 letters, digits, spaces, -, _ and ', and no \
+                   number";
+    vec![
+        case("style-number", b"0.5\n", no_name),
+        case("style-empty", b" \n", no_name),
+        case("style-lines", b"house\nbreak\n", no_name),
+        case("style-bytes", b"caf\xe9 \xff", "{path} is not UTF-8 text; write the name of one style in a line"),
+        Case::files("style-alone", [("motion/style-alone/style.txt", b"house".to_vec())],
+            "motion/style-alone", "layout",
+            "folder {path} holds no trajectory.npy or motion.bvh (or .npz, .npy, .vmd); add it or remove the folder"),
     ]
 }
 

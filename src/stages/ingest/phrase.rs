@@ -5,7 +5,6 @@ use std::io::{Read as _, Seek as _};
 use super::layout::Role;
 use super::motion::{ReadMotion, read_dancers, read_group, read_motion};
 use crate::audio::header::{AudioHeader, AudioHeaderError, read_header, read_header_from};
-use crate::excerpt::preview;
 use crate::motion::style_name::{MAX_STYLE_NAME, is_style_name};
 use crate::motion::text::text_of;
 use crate::motion::{Axis, Beats, BeatsPerBarSource, CaptureAccount, ChannelLimits, Dancers};
@@ -318,9 +317,8 @@ fn read_style_name(path: &str, bytes: &[u8]) -> Result<String, Failure> {
     let name = text.trim();
     if !is_style_name(name) {
         return Err(refuse(format!(
-            "{path} has {}; write the name of one style in a line: at most {MAX_STYLE_NAME} letters, digits, spaces, \
+            "{path} has no name of a style; write one in a line: at most {MAX_STYLE_NAME} letters, digits, spaces, \
              -, _ and ', and no number",
-            preview(name.as_bytes())
         )));
     }
     Ok(name.to_owned())
