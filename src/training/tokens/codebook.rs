@@ -77,14 +77,20 @@ impl<E: Element> Codebook<E> {
         self.usage().iter().any(|&n| n > E::ZERO)
     }
 
-    /// c_k ← candidate k, N_k ← 1, m_k ← c_k.
+    /// c_k ← candidate k, N_k ← n, m_k ← n c_k, n the least usage: a row that the next batch does not use is replaced.
+    ///
+    /// Published is N_k ← 1, with 1 as the least usage. With less, rows that nothing is near would stay until 1 has
+    /// faded, 235 steps at μ = 0.99 and a tenth.
     ///
     /// - `codebook`: \[K, d\]; `candidates`: the same, as `candidates` draws them
     pub fn begin(&mut self, codebook: &mut [E], candidates: &[E]) {
         codebook.copy_from_slice(candidates);
+        let least = E::from_f64(self.config.least_usage);
         let [usage, sums] = self.averages();
-        usage.fill(E::ONE);
-        sums.copy_from_slice(candidates);
+        usage.fill(least);
+        for (m, &candidate) in sums.iter_mut().zip(candidates) {
+            *m = least * candidate;
+        }
     }
 
     /// N_k ← μ N_k + (1 − μ) n_k and m_k ← μ m_k + (1 − μ) Σ h, n_k and h the latents that row k stands for in a batch;
@@ -206,6 +212,20 @@ mod tests {
 
     fn streams(seed: u64) -> [Stream; 2] {
         [1, 2].map(|stream| Stream::new(seed, stream))
+    }
+
+    #[test]
+    fn rows_that_the_first_batches_do_not_use_are_replaced_at_once_and_used_ones_stay() {
+        let config = CodebookConfig { decay: 0.99, least_usage: 0.125 };
+        let mut book = Codebook::<f64>::new(&config, 2, 1);
+        let mut codes = [0.0; 2];
+        book.begin(&mut codes, &[1.0, 5.0]);
+        assert_eq!((codes, book.usage()), ([1.0, 5.0], &[0.125; 2][..]));
+        // Row 0 stands for both latents, row 1 for none.
+        book.update(&mut codes, &[1.0, 2.0], &[0, 0], &[7.0, 8.0]);
+        let (n, m) = (0.99 * 0.125 + 0.01 * 2.0, 0.99 * 0.125 + 0.01 * 3.0);
+        assert!((codes[0] - m / n).abs() < 1e-12, "{codes:?}");
+        assert_eq!(codes[1], 8.0);
     }
 
     #[test]
