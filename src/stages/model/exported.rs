@@ -196,13 +196,13 @@ impl Summary for ModelSummary {
         let Self { name, place, rows, files, engine, load_s, timed, .. } = self;
         writeln!(out, "model {name}, {place}\n")?;
         for (name, value) in rows {
-            writeln!(out, "{name:<16}{value}")?;
+            writeln!(out, "{name:<14}{value}")?;
         }
         for file in files {
             let mb = file.n_bytes as f64 / 1e6;
             writeln!(
                 out,
-                "{:<16}{mb:.1} MB, SHA-256 {}, as it should be",
+                "{:<20}{mb:.1} MB, SHA-256 {}, as it should be",
                 file.name,
                 &file.sha256[..16]
             )?;
