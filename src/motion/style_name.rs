@@ -75,11 +75,10 @@ mod tests {
 
     #[test]
     fn recordings_of_aist_tell_their_genre_and_other_names_nothing() {
-        let of = style_of_name;
-        assert_eq!(of("gBR_sBM_cAll_d04_mBR0_ch01"), Some("break"));
-        assert_eq!(of("set/gJB_sFM_c01_d07_mJB3_ch05"), Some("ballet jazz"));
+        assert_eq!(style_of_name("gBR_sBM_cAll_d04_mBR0_ch01"), Some("break"));
+        assert_eq!(style_of_name("set/gJB_sFM_c01_d07_mJB3_ch05"), Some("ballet jazz"));
         for other in ["gXX_sBM_cAll", "gBR_BM", "gBR", "groove_s", "BR_sBM", "mBR0", ""] {
-            assert_eq!(of(other), None, "{other}");
+            assert_eq!(style_of_name(other), None, "{other}");
         }
     }
 

@@ -16,10 +16,11 @@ use ::mpi::{Rank, Threading, initialize_with_threading};
 
 use super::{Link, LinkState, Message, Numbers, RanksError};
 
-/// How long answers that somebody waits for are polled for without a pause: from the beginning, and without a pause once another
-/// process is seen to be there. Large messages may move a little with each poll.
+/// How long a thread that waits for an answer keeps the poll brisk: short pauses, and none once another process is seen to be
+/// there. Large messages may move a little with each poll.
 const BRISK: Duration = Duration::from_millis(20);
-/// Pauses between two polls: then, and later, and while nobody waits: whoever polls takes time from those that compute.
+/// Pauses between two polls: in the time after that, and later or while no thread waits for the answer. Polling takes processor
+/// time from the threads that compute.
 const PAUSES: [Duration; 2] = [Duration::from_micros(40), Duration::from_micros(500)];
 
 /// The world of MPI.
