@@ -13,6 +13,8 @@ PYTHON ?= python3
 TARGET := $(or $(CARGO_TARGET_DIR),target)
 # Tests and demo share the dev profile, so that the dependencies are built once.
 BIN    := $(TARGET)/debug
+# FEATURES='--features mpi' builds and tests with training by several processes; what is built keeps its features.
+FEATURES ?=
 
 .PHONY: help
 help: ## list the targets
@@ -21,7 +23,7 @@ help: ## list the targets
 
 .PHONY: build
 build: ## build the executables (dev profile)
-	$(CARGO) build --locked --bins
+	$(CARGO) build --locked --bins $(FEATURES)
 
 .PHONY: demo
 demo: build setup ## from tests/data to tables, a library, trained networks, a plot and answers (build/demo)
@@ -41,7 +43,7 @@ TABLES := phrases,motion,beats,features,extractions
 DIFF_TABLES = $(BIN)/examples/diff-tables --tables $(TABLES)
 .PHONY: build-diff-tables
 build-diff-tables:
-	$(CARGO) build --locked --example diff-tables
+	$(CARGO) build --locked --example diff-tables $(FEATURES)
 .PHONY: check-tables
 check-tables: build-diff-tables ## compare the demo's tables with what is kept of them (pipelines/demo.tables.json)
 	$(DIFF_TABLES) pipelines/demo.tables.json build/demo/store --tolerance features=1e-4 --tolerance motion=1e-3 \
@@ -103,7 +105,7 @@ setup: ## obtain onnxruntime, with its checksum (.runtime)
 # Unit tests of the library and the executables, the integration tests, and the examples' build.
 .PHONY: check-code
 check-code: build/venv/ready setup
-	MOTIONGEN_TEST_PYTHON='$(CURDIR)/build/venv/bin/python' $(CARGO) test --locked
+	MOTIONGEN_TEST_PYTHON='$(CURDIR)/build/venv/bin/python' $(CARGO) test --locked $(FEATURES)
 
 .PHONY: lint
 lint: check-format ## check formatting and run clippy

@@ -1,6 +1,7 @@
 //! Planners of tokens from training to motion, as a user makes and uses them.
 
 mod evaluation;
+mod group;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -308,9 +309,9 @@ fn mistakes_are_named() {
     let (audio, out) = (song(&dir), dir.at("out"));
     for (flags, expected) in [
         (
-            &["--dancers=3"][..],
-            "--dancers: model m is of the family tokens, which does not know it; leave it out, or name a model of \
-             the family group",
+            &["--best-of=3"][..],
+            "--best-of: model m is of the family tokens, which does not know it; leave it out, or name a model of \
+             the family unet",
         ),
         (
             &["--plan-iterations=0"],

@@ -4,6 +4,7 @@
     make cluster-demo                                  builds first
     pipelines/slurm/demo.py --bin target/debug         with executables that are there already
     … --songs 8 --shards 4                             with some of the songs
+    … --source FOLDER --cost                           with songs of your own; what each way took
 
 Starts munged, slurmctld and two slurmd on loopback, with a configuration, keys and folders of their own. The chain of
 submit.sh runs on them; while a task of generate is at work on node c2, that node is killed whole. Slurm queues its tasks again,
@@ -101,15 +102,15 @@ def run(words, **more):
     return done.stdout
 
 
-def wait_until(what, is_so):
+def wait_until(what, is_so, patience_s=PATIENCE_S):
     """Waits until something is so, and returns it."""
-    until = time.monotonic() + PATIENCE_S
+    until = time.monotonic() + patience_s
     while time.monotonic() < until:
         found = is_so()
         if found:
             return found
         time.sleep(PAUSE_S)
-    raise WentWrong(f"waited {PATIENCE_S} s in vain for {what}")
+    raise WentWrong(f"waited {patience_s} s in vain for {what}")
 
 
 def install_what_is_missing():
@@ -304,6 +305,34 @@ def one_machine(motiongen, songs, store):
         run([motiongen, stage, "--store", store, *flags.get(stage, [])])
 
 
+# Calls an executable and adds a line to a file: seconds by the clock, of the user and of the system.
+METER = """\
+#!/bin/bash
+TIMEFORMAT='%R %U %S'
+took=$({{ time {motiongen} "$@" >&3 2>&4; }} 3>&1 4>&2 2>&1)
+code=$?
+echo "$took" >> {costs}
+exit $code
+"""
+
+
+class Costs:
+    """The processor seconds of processes that end by themselves; those of killed ones are not known."""
+
+    def __init__(self, motiongen, folder, name):
+        self.place = folder / f"{name}.costs"
+        self.program = folder / f"{name}.sh"
+        self.program.write_text(METER.format(motiongen=motiongen, costs=self.place))
+        self.program.chmod(0o755)
+        self.started = time.monotonic()
+
+    def said(self):
+        took_s = time.monotonic() - self.started
+        rows = [[float(word) for word in line.split()] for line in self.place.read_text().splitlines()]
+        cpu_s = sum(user + system for _, user, system in rows)
+        return f"{took_s:.1f} s, {cpu_s:.1f} s of processors in {len(rows)} processes"
+
+
 def two_nodes(cluster, arguments, motiongen, songs, store, logs):
     """Runs the chain on the cluster, kills a node on the way, and returns how many tasks were taken over."""
     chain = submit(arguments, motiongen, songs, store, logs)
@@ -317,7 +346,7 @@ def two_nodes(cluster, arguments, motiongen, songs, store, logs):
         is_at_work = any(path.exists() and path.read_text().startswith("motiongen") for path in names)
         return on_it if is_at_work else None
 
-    lost = wait_until(f"a task of {KILLED_DURING} on {KILLED}", under_way)
+    lost = wait_until(f"a task of {KILLED_DURING} on {KILLED}", under_way, arguments.patience_s)
     cluster.kill(KILLED)
     say(f"node {KILLED} killed, with its slurmd and the tasks {', '.join(lost)} of {KILLED_DURING}")
     is_down = lambda: run(["sinfo", "-h", "-n", KILLED, "-o", "%T"]).strip().startswith("down")
@@ -332,7 +361,7 @@ def two_nodes(cluster, arguments, motiongen, songs, store, logs):
                 subprocess.run(["scontrol", "update", f"jobid={task}", "StartTime=now"], capture_output=True)
         return not waiting
 
-    wait_until("the end of the chain", is_over)
+    wait_until("the end of the chain", is_over, arguments.patience_s)
     n_taken_over = 0
     for stage, job in chain.items():
         tasks = [told for told in run(["scontrol", "-o", "show", "job", job]).splitlines() if told.strip()]
@@ -378,15 +407,20 @@ def demo(arguments):
     for name in [name for name in os.environ if name.startswith(("SLURM_", "SBATCH_", "MOTIONGEN_"))]:
         del os.environ[name]
     one, two = out / "one", out / "two"
-    songs = some_songs(arguments.songs, out / "songs") if arguments.songs else SONGS
-    one_machine(motiongen, songs, one)
-    say("one machine: ingest, extract and generate are done")
+    songs = arguments.source or SONGS
+    if arguments.songs:
+        songs = some_songs(arguments.songs, out / "songs")
+    costs = Costs(motiongen, out, "one") if arguments.cost else None
+    one_machine(costs.program if costs else motiongen, songs, one)
+    say("one machine: ingest, extract and generate are done" + (f" in {costs.said()}" if costs else ""))
     cluster = Cluster(logs)
     try:
         cluster.start()
         say("two nodes are idle")
-        n_taken_over = two_nodes(cluster, arguments, motiongen, songs, two, logs)
-        say("the chain is done")
+        costs = Costs(motiongen, out, "two") if arguments.cost else None
+        program = costs.program if costs else motiongen
+        n_taken_over = two_nodes(cluster, arguments, program, songs, two, logs)
+        say("the chain is done" + (f" in {costs.said()}" if costs else ""))
     finally:
         cluster.stop()
     compare(diff_tables, motiongen, one, two)
@@ -400,9 +434,14 @@ def main():
     parser.add_argument("--bin", type=Path, default=Path("target/debug"), help="folder of the executables")
     parser.add_argument("--out", type=Path, default=Path("build/cluster-demo"), help="folder of stores and logs")
     parser.add_argument("--shards", type=int, default=8, help="tasks of every stage")
-    parser.add_argument("--songs", type=int, help="as many of the songs of tests/data; all of them otherwise")
+    songs = parser.add_mutually_exclusive_group()
+    songs.add_argument("--songs", type=int, help="as many of the songs of tests/data; all of them otherwise")
+    songs.add_argument("--source", type=Path, help="a folder of other songs")
+    parser.add_argument("--patience-s", type=float, default=PATIENCE_S, help="longest wait for the stages")
+    parser.add_argument("--cost", action="store_true", help="say how long either way took, and of how many processors")
     arguments = parser.parse_args()
     arguments.bin = arguments.bin.resolve()
+    arguments.source = arguments.source and arguments.source.resolve()
     # A signal ends the demo as an error does, so that the cluster is stopped.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(75))
     try:

@@ -42,7 +42,7 @@ pub use tokens::{
     Control, Decoding, OnnxPlanner, OnnxTokenizer, PlanRequest, PlanWindow, PlannerEngine,
     PlannerNetworks, Reconstruction, Steering, TokenEngine, TokenGenerator, TokenTrack,
     TokenizerNetworks, TokensCard, TokensNetworks, TokensProvenance, WindowPlan,
-    WithheldConditions, shuffle, steer, tokens_parameters,
+    WithheldConditions, kept_of, shuffle, steer, tokens_parameters,
 };
 pub use track::{
     Generator, OVERLAP_FRAMES, PrimingMotion, RUN_WINDOWS, Track, WeightedConstraints,

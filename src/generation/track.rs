@@ -91,7 +91,8 @@ impl Generator<'_> {
         mut emit: impl FnMut(Array2<f32>) -> Result<(), E>,
     ) -> Result<(), E> {
         let windows = self.windows(track.condition.nrows());
-        let start = track.constraints.map(|c| c.constraints.placement()).unwrap_or_default();
+        let origin = Placement::default();
+        let start = track.constraints.map_or(origin, |c| c.constraints.placement(origin));
         let (mut last, mut n_given): (Option<Quaternion>, usize) = (None, 0);
         let mut give = |mut frames: Array2<f32>,
                         emit: &mut dyn FnMut(Array2<f32>) -> Result<(), E>| {

@@ -176,6 +176,21 @@ fn motion_by_tokens_is_held_against_its_own_networks_and_loses_without_training(
     assert_eq!(kept(), 3);
     assert_eq!(evaluate(&store, &["--run=plan", "--force"]).code, 0);
     assert_eq!((kept(), numbers(&store, "plan")), (3, found));
+    // Dancers of groups have the baselines of soloists, and beside them the numbers of groups.
+    let flags = ["--split=validation", "--run=trio", "--dancers=3", "--consistency=0.5"];
+    assert_eq!(bulk(&store, "plan", &flags).code, 0);
+    let output = evaluate(&store, &["--run=trio"]);
+    assert_eq!(output.code, 0, "{output:?}");
+    let of_groups = numbers(&store, "trio");
+    for key in [
+        ["generated", "least_separation", ""],
+        ["copied", "least_separation", ""],
+        ["untrained", "axis_speed", "x"],
+        ["shuffled_plan", "axis_speed", "x"],
+    ] {
+        assert!(of_groups.contains_key(&key.map(str::to_owned)), "no {key:?}");
+    }
+    assert!(number(&of_groups, ["generated", "least_separation", ""]) >= 0.7 - 1e-5);
 
     let output = evaluate(&store, &["--run=plan0", "--require=sound,follows-music"]);
     assert_eq!(output.code, 1, "{output:?}");

@@ -6,6 +6,7 @@ mod constraints;
 mod control;
 mod eager;
 mod engine;
+mod group;
 mod networks;
 mod planner;
 mod reconstruct;
@@ -17,6 +18,7 @@ pub use card::{TokensCard, TokensNetworks, TokensProvenance};
 pub use constraints::Control;
 pub use control::{Steering, steer};
 pub use engine::TokenEngine;
+pub use group::kept_of;
 pub use networks::{
     PlanWindow, PlannerNetworks, TokenizerNetworks, WindowPlan, WithheldConditions,
 };

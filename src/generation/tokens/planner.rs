@@ -31,8 +31,8 @@ pub struct PlanRequest<'a> {
     /// Constraints on the motion, \[T, 12\] (`PoseConstraint::channels`), of a planner that takes them; none where there
     /// are none.
     pub constraints: Option<ArrayView2<'a, f32>>,
-    /// The first tokens, where they are known.
-    pub given: &'a [u32],
+    /// The tokens from the first on, where they are known.
+    pub given: &'a [Option<u32>],
     /// 1 follows the music, more exaggerates it, 0 ignores it; of two conditions it is that of both.
     pub guidance: f64,
     pub seed: u64,
@@ -101,7 +101,8 @@ impl PlannerEngine {
         if self.is_shuffled {
             // The last draw of the window, which no plan reaches.
             let draw = PLANS + (request.window + 1) * DRAWS_OF_A_WINDOW - 1;
-            let n_given = request.given.len().min(tokens.len());
+            let given = &request.given[..request.given.len().min(tokens.len())];
+            let n_given = given.iter().take_while(|token| token.is_some()).count();
             shuffle(&mut tokens[n_given..], Stream::new(request.seed, draw));
         }
         Ok(tokens)
@@ -148,10 +149,10 @@ impl PlannerEngine {
                 (None, None) => Vec::new(),
             })
         };
+        let mut given = request.given.to_vec();
+        given.resize(n, None);
         match self.config.kind {
             PlannerKind::Masked => {
-                let mut given: Vec<Option<u32>> = request.given.iter().copied().map(Some).collect();
-                given.resize(n, None);
                 let logits = |tokens: &[u32]| -> Result<Array2<f32>, EngineError> {
                     let (found, what) = (logits(tokens)?, "what the planner says");
                     let found_len = found.len();
@@ -170,7 +171,7 @@ impl PlannerEngine {
                     stream(draw).uniform(0, &mut number);
                     number[0]
                 };
-                sample_autoregressive(sampling, request.given, n, codes, logits, uniform)
+                sample_autoregressive(sampling, &given, codes, logits, uniform)
             }
         }
     }

@@ -6,7 +6,6 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use ndarray::{Array2, Array3, ArrayView3};
 
-use super::constraints::Control;
 use super::eager::{EagerPlanner, EagerTokenizer};
 use super::networks::{
     PlanWindow, PlannerNetworks, TokenizerNetworks, WindowPlan, WithheldConditions,
@@ -230,7 +229,9 @@ fn what_is_kept_of_a_plan_changes_no_bit() {
         }
         let kept = PlannerEngine::with(&config, Box::new(kept));
         let whole = PlannerEngine::with(&config, Box::new(whole));
-        for (given, guidance) in [(&[][..], 1.0), (&[31, 7, 7], 2.5), (&[3], 0.0)] {
+        let middle = [Some(3), None, None, Some(30), Some(2)];
+        let beginning = [Some(31), Some(7), Some(7)];
+        for (given, guidance) in [(&[][..], 1.0), (&beginning, 2.5), (&middle, 0.0)] {
             let request = PlanRequest {
                 condition: condition.view(),
                 style,
@@ -243,6 +244,9 @@ fn what_is_kept_of_a_plan_changes_no_bit() {
             let plan = TokenSampling { top_share: 1.0, ..TokenSampling::default() };
             let found = kept.plan(&plan, &request).expect("tokens");
             assert_eq!(found.len(), 10);
+            let is_kept =
+                given.iter().zip(&found).all(|(given, found)| given.is_none_or(|x| x == *found));
+            assert!(is_kept, "{given:?}: {found:?}");
             assert_eq!(found, whole.plan(&plan, &request).expect("tokens"), "{given:?}");
         }
     }
@@ -272,14 +276,7 @@ fn run(kind: PlannerKind, n_frames: usize) -> ([usize; 5], usize) {
         overlap_tokens: 2,
     };
     let condition = condition(n_frames);
-    let track = TokenTrack {
-        condition: condition.view(),
-        phase: None,
-        style: None,
-        constraints: None,
-        control: Control::None,
-        seed: 7,
-    };
+    let track = TokenTrack::new(condition.view(), 7);
     let (mut n_given, mut begun_at_first) = (0, 0);
     let emit = |frames: Array2<f32>| -> Result<(), EngineError> {
         if n_given == 0 {

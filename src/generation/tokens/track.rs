@@ -52,7 +52,27 @@ pub struct TokenTrack<'a> {
     pub constraints: Option<WeightedConstraints<'a>>,
     /// Where they act.
     pub control: Control,
+    /// Where the track begins, unless constraints say otherwise.
+    pub place: Placement,
+    /// Tokens of the windows that are set beforehand, in order ([`super::kept_of`]); none are of a soloist.
+    pub kept: &'a [Vec<Option<u32>>],
     pub seed: u64,
+}
+
+impl<'a> TokenTrack<'a> {
+    /// Returns a track that begins at the origin, by its music and seed alone.
+    pub fn new(condition: ArrayView2<'a, f32>, seed: u64) -> Self {
+        Self {
+            condition,
+            phase: None,
+            style: None,
+            constraints: None,
+            control: Control::None,
+            place: Placement::default(),
+            kept: &[],
+            seed,
+        }
+    }
 }
 
 /// A window that does not change any more.
@@ -106,9 +126,10 @@ impl TokenGenerator<'_> {
         self.windows(n_frames).of_tokens.len()
     }
 
-    /// Makes motion for a track, and gives out its frames in order, `[…, 25]` in metres, as they are final.
+    /// Makes motion for a track, and gives out its frames in order, `[…, 25]` in metres, as they are final; returns the
+    /// plan of each window.
     ///
-    /// The track begins at the origin and faces +Z, unless constraints say otherwise. Same track and seed, same frames.
+    /// Same track and seed, same frames.
     ///
     /// # Errors
     /// What the engines or `emit` say; what the samplers refuse.
@@ -116,9 +137,10 @@ impl TokenGenerator<'_> {
         &self,
         track: &TokenTrack,
         mut emit: impl FnMut(Array2<f32>) -> Result<(), E>,
-    ) -> Result<(), E> {
+    ) -> Result<Vec<Vec<u32>>, E> {
         let windows = self.windows(track.condition.nrows());
-        let start = track.constraints.map(|c| c.constraints.placement()).unwrap_or_default();
+        let start = track.constraints.map_or(track.place, |c| c.constraints.placement(track.place));
+        let mut plans = Vec::with_capacity(windows.of_tokens.len());
         let (mut last, mut n_given) = (None, 0);
         let mut give = |mut frames: Array2<f32>,
                         emit: &mut dyn FnMut(Array2<f32>) -> Result<(), E>| {
@@ -141,11 +163,12 @@ impl TokenGenerator<'_> {
                 None => start,
             };
             let before_it = before.as_ref().map(|before| &before.motion);
-            let motion = self.window(track, &windows, i, (before_it, place))?;
+            let (plan, motion) = self.window(track, &windows, i, (before_it, place))?;
+            plans.push(plan);
             give(joiner.push(motion.clone(), windows.n_final(i)), &mut emit)?;
             before = Some(Window { motion, place });
         }
-        Ok(())
+        Ok(plans)
     }
 
     /// Plans a window and makes its motion, over the origin, in metres, \[n, 25\].
@@ -155,13 +178,16 @@ impl TokenGenerator<'_> {
         windows: &FrameWindows,
         i: usize,
         (before, place): (Option<&Array2<f32>>, Placement),
-    ) -> Result<Array2<f32>, EngineError> {
+    ) -> Result<(Vec<u32>, Array2<f32>), EngineError> {
         let (frames, shift) = (windows.frames(i), windows.shift(i));
         let before = before.filter(|before| shift < before.nrows());
-        let given = match before {
+        let known = match before {
             Some(before) => self.tokens_from(before, shift)?,
             None => Vec::new(),
         };
+        let kept = track.kept.get(i).map_or(&[][..], |kept| kept.get(known.len()..).unwrap_or(&[]));
+        let given: Vec<Option<u32>> =
+            known.into_iter().map(Some).chain(kept.iter().copied()).collect();
         let normalizer = self.tokens.normalizer();
         let asked = track
             .constraints
@@ -209,7 +235,7 @@ impl TokenGenerator<'_> {
         let sampled = self.tokens.decode(&tokens, x, how, noise, refine)?;
         let mut motion = sampled.index_axis(Axis(0), 0).to_owned();
         normalizer.denormalize(motion.view_mut());
-        Ok(motion)
+        Ok((tokens, motion))
     }
 
     /// Returns the tokens of the end of a window, from a frame on, as those of the beginning of the next.

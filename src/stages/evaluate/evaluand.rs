@@ -229,10 +229,10 @@ impl Evaluand {
         let mut groups = (self.is_of_groups && !params.quick)
             .then(|| GroupMeasurer::new(&self.n_frames, truth.as_ref()));
         let sampled = match (params.quick, told, &mut groups) {
-            (false, Some(split), Some(groups)) => {
+            (false, Some(split), Some(groups)) if !self.is_by_tokens() => {
                 self.sampled_groups(store, params, (split, groups), progress)?
             }
-            (false, Some(split), None) => {
+            (false, Some(split), _) => {
                 self.sampled(store, params, truth.as_ref(), split, progress)?
             }
             _ => None,

@@ -16,6 +16,7 @@ use crate::evaluation::window::window_starts;
 use crate::generation::{FamilyCard as _, TokensCard};
 use crate::model::Family;
 use crate::motion::clock;
+use crate::stages::generate::TokensSettings;
 use crate::stages::model_files::{ModelFolder, OpenModel, default_model_cache};
 use crate::stages::{Progress, learned};
 use crate::store::tables::{self, GenerationRow};
@@ -25,6 +26,12 @@ use crate::store::{Location, StoreError, digest};
 pub(super) const BASELINE_SEED: u64 = 2026;
 
 impl Evaluand {
+    /// Returns whether the motions are of a model of tokens, whose dancers have the baselines of soloists.
+    pub(super) fn is_by_tokens(&self) -> bool {
+        let settings = self.generations.first().and_then(|row| row.settings.as_deref());
+        settings.is_some_and(|text| serde_json::from_str::<TokensSettings>(text).is_ok())
+    }
+
     /// Samples the untrained network, and the trained one without music, for windows of the music of a split; none,
     /// and a note, where the model is not there.
     pub(super) fn sampled(

@@ -276,6 +276,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::motion::Placement;
 
     fn asked(text: &str) -> ConstraintsRequest {
         ConstraintsRequest::of_text(text, false).expect("constraints")
@@ -333,7 +334,7 @@ mod tests {
         before.column_mut(2).assign(&ndarray::Array1::range(0.0, 40.0, 1.0));
         let asked = ConstraintsRequest { before: Some((before, 3)), ..asked("") };
         let constraints = asked.of_track(50, ChannelLimits::Wide).expect("constraints");
-        assert_eq!(constraints.placement().z_m, 37.0);
+        assert_eq!(constraints.placement(Placement::default()).z_m, 37.0);
     }
 
     #[test]
@@ -341,7 +342,13 @@ mod tests {
         let table = |text: &str| ConstraintsRequest::of_bytes(text.as_bytes().to_vec(), "csv");
         let path = table("time_s,x,y,z\n0,0.5,0.9,-1\n1,0.25,0.9,0\n").expect("a path");
         let constraints = path.of_track(31, ChannelLimits::Wide).expect("constraints");
-        assert_eq!((constraints.placement().x_m, constraints.placement().z_m), (0.5, -1.0));
+        assert_eq!(
+            (
+                constraints.placement(Placement::default()).x_m,
+                constraints.placement(Placement::default()).z_m
+            ),
+            (0.5, -1.0)
+        );
         assert!(format!("{path:?}").contains(", path: [(0, Value { channel: 0, value: 0.5 })"));
         let said = |text: &str| {
             let path = table(text).expect("a path");

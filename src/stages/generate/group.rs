@@ -7,6 +7,7 @@ use anyhow::{Context as _, bail, ensure};
 use ndarray::{Array2, Array3, ArrayView2, Axis, concatenate};
 use serde::{Deserialize, Serialize};
 
+use super::dancers::score_of_dancers;
 use super::identity::{RunIdentity, SampledMotion};
 use super::maker::{GeneratedMotion, MotionMaker, seed_of};
 use super::music::PhraseMusic;
@@ -16,13 +17,11 @@ use super::settings::OUTPUT_VERSION;
 use super::{make_all, n_workers, name_of_model, run_name};
 use crate::autodiff::Parameters;
 use crate::diffusion::{SamplerConfig, Schedule};
-use crate::evaluation::{Score, derivative_error, score};
 use crate::generation::{
     ConsistencyForm, EngineError, FamilyCard as _, GroupCard, GroupEngine, GroupEstimator as _,
     GroupGenerator, GroupTrack, ModelFileName,
 };
 use crate::model::{GroupNetworks, Parameter};
-use crate::motion::Channel;
 use crate::motion::group::{MAX_DANCERS, RADIUS_M, SeparationError, separate};
 use crate::motion::postprocess::{PostProcessConfig, process};
 use crate::onnx::{Model, values_of};
@@ -307,24 +306,8 @@ impl GroupMaker<'_> {
     ) -> GenerationRow {
         let settings = self.settings;
         let (n_dancers, n_frames, _) = frames.dim();
-        let errors = decoded.outer_iter().map(|dancer| {
-            derivative_error(dancer, Channel::Position.columns(), Channel::Velocity.columns())
-        });
-        let velocity_error = errors.sum::<f64>() / n_dancers as f64;
         let limits = settings.postprocess.limits;
-        let scores: Vec<_> =
-            frames.outer_iter().map(|dancer| score(dancer, limits, bars, velocity_error)).collect();
-        let mean = |values: Vec<Option<f64>>| {
-            let values: Option<Vec<f64>> = values.into_iter().collect();
-            values.map(|values| values.iter().sum::<f64>() / n_dancers as f64)
-        };
-        let sum = |of: fn(&Score) -> usize| scores.iter().map(of).sum::<usize>();
-        let score = Score {
-            total: mean(scores.iter().map(|score| score.total).collect()),
-            n_passed: sum(|score| score.n_passed),
-            n_checks: sum(|score| score.n_checks),
-            locking: mean(scores.iter().map(|score| score.locking).collect()),
-        };
+        let (score, velocity_error) = score_of_dancers(frames, decoded, limits, bars);
         let made = SampledMotion {
             sample,
             candidate: 0,

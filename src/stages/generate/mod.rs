@@ -2,6 +2,7 @@
 
 mod constraints_file;
 mod constraints_text;
+mod dancers;
 mod files;
 mod group;
 mod identity;

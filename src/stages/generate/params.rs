@@ -154,12 +154,13 @@ pub struct Params {
     /// alone: the share of it that is kept, 0 to 1; needs --store with a library.
     #[arg(long, value_name = "X", help_heading = "Sampling", hide_short_help = RARE)]
     pub prime: Option<f64>,
-    /// Dancers, for a model of the family group [default: 3]
+    /// Dancers, for a model of the family group or tokens [default: 3; of the family tokens 1]
     #[arg(long, value_name = "N", help_heading = "Groups")]
     pub dancers: Option<usize>,
     /// Guidance by the score of a model of the family group, from -1 (away from one group, meant for dancers who go
     /// each a way of their own) to 1 (towards one group, meant for unison); docs/groups.md has what it was seen to
-    /// do; other than 0 it takes longer [default: 0]
+    /// do; other than 0 it takes longer; of a model of the family tokens the share of the first dancer's plan that the
+    /// others keep, 0 to 1 [default: 0]
     #[arg(long, value_name = "GAMMA", allow_hyphen_values = true, help_heading = "Groups",
           hide_short_help = RARE)]
     pub consistency: Option<f64>,

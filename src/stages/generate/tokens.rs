@@ -3,11 +3,12 @@
 use std::time::Instant;
 
 use anyhow::{bail, ensure};
-use ndarray::{Array2, ArrayView2, Axis, concatenate};
+use ndarray::{Array2, Array3, ArrayView2, Axis, concatenate, stack};
 use serde::{Deserialize, Serialize};
 
 use super::constraints_file::ConstraintsRequest;
 use super::constraints_text::text_of;
+use super::dancers::score_of_dancers;
 use super::identity::{RunIdentity, SampledMotion};
 use super::maker::{GeneratedMotion, MotionMaker, StopReason, seed_of, worst_misses};
 use super::music::PhraseMusic;
@@ -18,14 +19,15 @@ use super::{
     engine_params, make_all, n_workers, name_of_model, run_name, weights_digest_of_tokens,
 };
 use crate::diffusion::{SamplerConfig, Schedule, TokenSampling};
-use crate::evaluation::{derivative_error, score};
 use crate::generation::{
-    Control, FamilyCard as _, Steering, TokenGenerator, TokenTrack, TokensCard,
-    WeightedConstraints, steer,
+    Constraints, Control, FamilyCard as _, Steering, TokenGenerator, TokenTrack, TokensCard,
+    WeightedConstraints, kept_of, steer,
 };
+use crate::motion::choreography::group::side_by_side;
+use crate::motion::group::{MAX_DANCERS, RADIUS_M, separate};
 use crate::motion::postprocess::{HeldPoses, PostProcessConfig, process, process_holding};
 use crate::motion::style::STYLE_DIM;
-use crate::motion::{Channel, MOTION_DIM};
+use crate::motion::{MOTION_DIM, Placement};
 use crate::stages::failure::{Failure, FailureKind, guarded};
 use crate::stages::model_files::ModelFolder;
 use crate::stages::tokens_model::{OpenTokens, TokenEngines};
@@ -63,6 +65,53 @@ pub struct TokensSettings {
     /// Where constraints act; none where there are none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub control: Option<Control>,
+    /// Of several dancers, how they belong together.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub group: Option<TokensGroup>,
+}
+
+/// How several dancers belong together whose motion is made of tokens.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TokensGroup {
+    pub n_dancers: usize,
+    /// Share of the first dancer's tokens that the others keep, in [0, 1].
+    pub consistency: f64,
+    /// Whether bodies are moved apart where they would touch.
+    pub separation: bool,
+}
+
+impl TokensGroup {
+    /// Returns what is asked for; none for one dancer.
+    fn asked(params: &Params, model: &str) -> anyhow::Result<Option<Self>> {
+        let n_dancers = params.dancers.unwrap_or(1);
+        ensure!(
+            (1..=MAX_DANCERS).contains(&n_dancers),
+            "--dancers {n_dancers} is none of 1 to {MAX_DANCERS}; make larger groups of several"
+        );
+        if n_dancers == 1 {
+            if let Some(share) = params.consistency {
+                bail!(
+                    "--consistency {share}: one dancer of model {model}, of the family tokens, has nobody to share a plan \
+                     with; give --dancers 2 or more, or leave it out"
+                );
+            }
+            return Ok(None);
+        }
+        let consistency = params.consistency.unwrap_or(0.0);
+        ensure!(
+            (0.0..=1.0).contains(&consistency),
+            "--consistency {consistency}: dancers of model {model}, of the family tokens, share from none, 0, to all, 1, of a \
+             plan; give a number from 0 to 1, or name a model of the family group"
+        );
+        if params.stream.is_some() {
+            bail!(
+                "--stream: frames of {n_dancers} dancers are not final before all have been made; leave it out, or give \
+                 --dancers 1"
+            );
+        }
+        let separation = !params.no_separation && !params.postprocess.raw;
+        Ok(Some(Self { n_dancers, consistency, separation }))
+    }
 }
 
 impl TokensSettings {
@@ -74,8 +123,6 @@ impl TokensSettings {
         let only_others = [
             ("--prime", params.prime.is_some(), "unet"),
             ("--best-of", params.best_of.get() > 1, "unet"),
-            ("--dancers", params.dancers.is_some_and(|n| n != 1), "group"),
-            ("--consistency", params.consistency.is_some(), "group"),
         ];
         if let Some((flag, _, family)) = only_others.into_iter().find(|(_, is_given, _)| *is_given)
         {
@@ -135,6 +182,7 @@ impl TokensSettings {
             soft: params.soft,
             no_clock: params.no_clock,
             control: constraints.is_some().then_some(control),
+            group: TokensGroup::asked(params, &card.name)?,
         })
     }
 }
@@ -187,8 +235,12 @@ pub fn run(
     };
     let (place, done) = make_all(params, store, &maker, tokens.n_workers(), progress)?;
     let made_with = format!(
-        "model {name} (family tokens, {}), {} ({}), plans in {} iterations, {} in {} steps, guidance {}",
+        "model {name} (family tokens, {}){}, {} ({}), plans in {} iterations, {} in {} steps, guidance {}",
         card.planner.kind.name(),
+        settings.group.map_or(String::new(), |group| format!(
+            ", {} dancers, consistency {}",
+            group.n_dancers, group.consistency
+        )),
         tokens.name(),
         tokens.n_workers(),
         settings.plan.n_iterations,
@@ -244,43 +296,80 @@ impl TokensMaker<'_> {
         };
         let control = self.settings.control.unwrap_or(Control::None);
         let is_kept = control.decodes() && !self.settings.soft;
-        let kept = constraints.as_ref().filter(|_| is_kept);
-        let seed = seed_of(self.identity.seed, music.phrase_id, sample, 0);
-        let track = TokenTrack {
-            condition: heard.condition.view(),
-            phase: heard.clock_phase(),
-            style: self.settings.style,
-            constraints: constraints
-                .as_ref()
-                .map(|constraints| WeightedConstraints { constraints, strength }),
-            control,
-            seed,
-        };
-        let mut parts: Vec<Array2<f32>> = Vec::new();
-        let emit = |frames: Array2<f32>| -> Result<(), StopReason> {
-            watch(frames.view()).map_err(StopReason::Watcher)?;
-            parts.push(frames);
-            Ok(())
-        };
-        self.generator.run(&track, emit).map_err(|stop| stop.of(music.source))?;
-        let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
-        let decoded =
-            concatenate(Axis(0), &views).unwrap_or_else(|_| Array2::zeros((0, MOTION_DIM)));
-        let mut frames = decoded.clone();
+        let group = self.settings.group;
+        let seed = |dancer| seed_of(self.identity.seed, music.phrase_id, sample, dancer);
+        let places = group
+            .map_or(vec![Placement::default()], |group| side_by_side(group.n_dancers, seed(0)));
         let postprocess = &self.settings.postprocess;
-        let displacement = process_holding(postprocess, &mut frames, bars, &HeldPoses::default());
-        if let Some(constraints) = kept {
-            // Only now is it smooth, and what is missing yet too; what follows from poses follows again.
-            steer(constraints, &mut frames, 0, Steering::Finish);
-            process(&postprocess.without_smoothing(), &mut frames, bars);
+        let (mut first_plans, mut asked) = (Vec::new(), Vec::new());
+        let (mut all_decoded, mut all_frames) = (Vec::new(), Vec::new());
+        let mut displacement = None;
+        for (dancer, &place) in places.iter().enumerate() {
+            // Every dancer's way is the one that is asked for, as far beside it as it begins beside the others.
+            let own = constraints.as_ref().map(|constraints| match group {
+                Some(_) => constraints.moved([place.x_m, place.z_m], n_frames, limits),
+                None => Ok(constraints.clone()),
+            });
+            let refuse = |e| Failure::new(FailureKind::Constraint, music.source, e);
+            let own: Option<Constraints> = own.transpose().map_err(refuse)?;
+            let share = group.map_or(0.0, |group| group.consistency);
+            let kept = kept_of(&first_plans, share, seed(dancer));
+            let track = TokenTrack {
+                phase: heard.clock_phase(),
+                style: self.settings.style,
+                constraints: own
+                    .as_ref()
+                    .map(|constraints| WeightedConstraints { constraints, strength }),
+                control,
+                place,
+                kept: &kept,
+                ..TokenTrack::new(heard.condition.view(), seed(dancer))
+            };
+            let mut parts: Vec<Array2<f32>> = Vec::new();
+            let emit = |frames: Array2<f32>| -> Result<(), StopReason> {
+                watch(frames.view()).map_err(StopReason::Watcher)?;
+                parts.push(frames);
+                Ok(())
+            };
+            let plans = self.generator.run(&track, emit).map_err(|stop| stop.of(music.source))?;
+            if dancer == 0 {
+                first_plans = plans;
+            }
+            let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
+            let decoded =
+                concatenate(Axis(0), &views).unwrap_or_else(|_| Array2::zeros((0, MOTION_DIM)));
+            let mut frames = decoded.clone();
+            let moved = process_holding(postprocess, &mut frames, bars, &HeldPoses::default());
+            displacement = moved.filter(|_| group.is_none());
+            all_decoded.push(decoded);
+            all_frames.push(frames);
+            asked.extend(own);
+        }
+        let [decoded, mut frames] = [&all_decoded, &all_frames].map(|dancers| {
+            let views: Vec<_> = dancers.iter().map(|dancer| dancer.view()).collect();
+            stack(Axis(0), &views).expect("invariant: every dancer has the frames of the music")
+        });
+        if group.is_some_and(|group| group.separation) {
+            frames = separate(frames.view(), RADIUS_M)
+                .map_err(|e| Failure::new(FailureKind::NonFinite, music.source, e))?;
+        }
+        let mut misses = Vec::new();
+        for (mut dancer, constraints) in frames.outer_iter_mut().zip(&asked) {
+            if is_kept {
+                // Only now is it smooth, and what is missing yet too; what follows from poses follows again.
+                let mut motion = dancer.to_owned();
+                steer(constraints, &mut motion, 0, Steering::Finish);
+                process(&postprocess.without_smoothing(), &mut motion, bars);
+                dancer.assign(&motion);
+            }
+            misses.extend(constraints.errors(dancer.view()));
         }
         let seconds = started.elapsed().as_secs_f64();
-        let mut row =
-            self.row(music, (sample, seed), (&frames, &decoded), heard.phase.as_deref(), seconds);
-        let misses = constraints.as_ref().map(|c| c.errors(frames.view())).unwrap_or_default();
+        let phase = heard.phase.as_deref();
+        let mut row = self.row(music, (sample, seed(0)), (&frames, &decoded), phase, seconds);
         [row.control_error_mm, row.control_error_deg] = worst_misses(&misses);
         row.constraints = constraints.as_ref().map(text_of);
-        let [frames, decoded] = [frames, decoded].map(|motion| motion.insert_axis(Axis(0)));
+        row.consistency = group.map(|group| group.consistency);
         Ok(GeneratedMotion { frames, decoded, rows: vec![row], displacement, seconds })
     }
 
@@ -288,18 +377,14 @@ impl TokensMaker<'_> {
         &self,
         music: &PhraseMusic,
         (sample, seed): (usize, u64),
-        (frames, decoded): (&Array2<f32>, &Array2<f32>),
+        (frames, decoded): (&Array3<f32>, &Array3<f32>),
         phase: Option<&[f64]>,
         generate_s: f64,
     ) -> GenerationRow {
         let settings = self.settings;
-        let n_frames = frames.nrows();
-        let velocity_error = derivative_error(
-            decoded.view(),
-            Channel::Position.columns(),
-            Channel::Velocity.columns(),
-        );
-        let score = score(frames.view(), settings.postprocess.limits, phase, velocity_error);
+        let (n_dancers, n_frames, _) = frames.dim();
+        let limits = settings.postprocess.limits;
+        let (score, velocity_error) = score_of_dancers(frames, decoded, limits, phase);
         let made = SampledMotion {
             sample,
             candidate: 0,
@@ -307,7 +392,7 @@ impl TokensMaker<'_> {
             engine: self.generator.tokens.name(),
             sampler: &settings.sampler,
             guidance: settings.guidance,
-            n_dancers: 1,
+            n_dancers,
             n_frames,
             n_windows: self.generator.n_windows(n_frames),
             score: &score,

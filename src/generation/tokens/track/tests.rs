@@ -7,6 +7,7 @@ use crate::audio::{FEATURE_DIM, FeatureScale};
 use crate::autodiff::Parameters;
 use crate::diffusion::{DiffusionConfig, Prediction};
 use crate::generation::control::{Constraints, WantedValue, orientation};
+use crate::generation::tokens::kept_of;
 use crate::generation::walk::walk;
 use crate::model::{Planner, PlannerConfig, PlannerKind, Preset, Tokenizer, TokensConfig};
 use crate::motion::postprocess::{PostProcessConfig, process};
@@ -75,7 +76,7 @@ impl Bench {
         let constraints =
             constraints.map(|constraints| WeightedConstraints { constraints, strength: 1.0 });
         let condition = condition.view();
-        let track = TokenTrack { condition, phase, style: None, constraints, control, seed };
+        let track = TokenTrack { phase, constraints, control, ..TokenTrack::new(condition, seed) };
         let mut parts: Vec<Array2<f32>> = Vec::new();
         let emit = |frames| -> Result<(), EngineError> {
             parts.push(frames);
@@ -135,12 +136,46 @@ fn motion_has_the_phase_of_its_music() {
 }
 
 #[test]
+fn a_dancer_keeps_tokens_of_another_in_every_window() {
+    for kind in [PlannerKind::Masked, PlannerKind::Autoregressive] {
+        let bench = Bench::new(kind, 1);
+        let condition = condition(61);
+        let plans = |kept: &[Vec<Option<u32>>], seed| -> Vec<Vec<u32>> {
+            let track = TokenTrack { kept, ..TokenTrack::new(condition.view(), seed) };
+            let emit = |_| Ok::<_, EngineError>(());
+            bench.generator(2).run(&track, emit).expect("a motion")
+        };
+        let first = plans(&[], 7);
+        assert_eq!(first.iter().map(Vec::len).collect::<Vec<_>>(), [6, 6, 6, 6]);
+        // The first tokens of a window go on from the window before.
+        let generator = bench.generator(2);
+        let windows = generator.windows(61);
+        let n_shared = |i: usize| if i == 0 { 0 } else { 6 - windows.shift(i) / 4 };
+        assert_eq!((0..4).map(n_shared).collect::<Vec<_>>(), [0, 3, 3, 2]);
+        let own = |plans: &[Vec<u32>]| -> Vec<u32> {
+            let behind = plans.iter().enumerate().flat_map(|(i, plan)| &plan[n_shared(i)..]);
+            behind.copied().collect()
+        };
+        let kept = kept_of(&first, 0.5, 8);
+        let shared = plans(&kept, 8);
+        for (i, (kept, plan)) in kept.iter().zip(&shared).enumerate() {
+            for (kept, token) in kept.iter().zip(plan).skip(n_shared(i)) {
+                assert!(kept.is_none_or(|kept| kept == *token), "{}, window {i}", kind.name());
+            }
+        }
+        assert_eq!(own(&plans(&kept_of(&first, 1.0, 8), 8)), own(&first), "{}", kind.name());
+        assert_ne!(own(&shared), own(&first));
+        assert_eq!(plans(&kept_of(&first, 0.0, 8), 8), plans(&[], 8));
+    }
+}
+
+#[test]
 fn a_plan_keeps_what_is_given_and_hears_the_music() {
     for kind in [PlannerKind::Masked, PlannerKind::Autoregressive] {
         let bench = Bench::new(kind, 1);
         let (here, mut elsewhere) = (condition(22), condition(22));
         elsewhere.mapv_inplace(|x| 1.0 - x);
-        let plan = |condition: &Array2<f32>, given: &[u32], seed| {
+        let plan = |condition: &Array2<f32>, given: &[Option<u32>], seed| {
             let request = PlanRequest {
                 condition: condition.view(),
                 style: None,
@@ -152,14 +187,15 @@ fn a_plan_keeps_what_is_given_and_hears_the_music() {
             };
             bench.planner.plan(&bench.plan, &request)
         };
-        let tokens = plan(&here, &[31, 7], 1).expect("tokens");
-        assert_eq!((tokens.len(), &tokens[..2]), (6, &[31, 7][..]));
-        assert_eq!(plan(&here, &[31, 7], 1).expect("tokens"), tokens);
+        let given = [Some(31), Some(7), None, Some(2)];
+        let tokens = plan(&here, &given, 1).expect("tokens");
+        assert_eq!((tokens.len(), &tokens[..2], tokens[3]), (6, &[31, 7][..], 2));
+        assert_eq!(plan(&here, &given, 1).expect("tokens"), tokens);
         let plans = |condition: &Array2<f32>| -> Vec<Vec<u32>> {
             (0..5).map(|seed| plan(condition, &[], seed).expect("tokens")).collect()
         };
         assert_ne!(plans(&here), plans(&elsewhere), "{}", kind.name());
-        let error = plan(&here, &[32], 1).expect_err("no such token").to_string();
+        let error = plan(&here, &[None, Some(32)], 1).expect_err("no such token").to_string();
         assert_eq!(
             error,
             "token 32 is none of the 32 that the planner knows, 0 to 31; give tokens of the tokenizer that it was \

@@ -76,6 +76,12 @@ impl Formation {
     }
 }
 
+/// Returns the places of `n` dancers side by side, facing the audience at +Z, around the origin; the seed decides their
+/// distance.
+pub fn side_by_side(n: usize, seed: u64) -> Vec<Placement> {
+    Formation::Line.places(n, &mut Chance::new(seed, 0))
+}
+
 fn at(x_m: f64, z_m: f64) -> Placement {
     Placement { x_m, z_m, yaw_rad: 0.0 }
 }

@@ -32,7 +32,7 @@ use crate::motion::quaternion::{
     Quaternion, from_axis_angle, make_sign_continuous, mul, nearer, rotate, slerp_as_signed,
 };
 use crate::units::frames_to_s;
-pub use formation::{Formation, MIN_SPACING_M};
+pub use formation::{Formation, MIN_SPACING_M, side_by_side};
 pub use plan::{GroupSpan, MIN_SPAN_S};
 pub use unison::{Part, Timing, Unison};
 

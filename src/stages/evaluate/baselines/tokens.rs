@@ -11,7 +11,7 @@ use super::cache::{self, BaselineKeyWindow, key_windows};
 use super::{BaselineMotion, MusicWindow, check_windows, decoded_windows};
 use crate::audio::FeatureScale;
 use crate::diffusion::{DiffusionConfig, Schedule};
-use crate::generation::{Control, EngineError, TokenGenerator, TokenTrack, TokensCard};
+use crate::generation::{EngineError, TokenGenerator, TokenTrack, TokensCard};
 use crate::model::{PlannerConfig, TokensConfig, condition};
 use crate::motion::Normalizer;
 use crate::stages::Progress;
@@ -58,7 +58,7 @@ pub struct TokensBaselineRequest<'a> {
     pub threads: NonZeroUsize,
 }
 
-/// Reads the settings of a run, as far as baselines are made by them: without constraints.
+/// Reads the settings of a run, as far as baselines are made by them: without constraints, of one dancer.
 ///
 /// # Errors
 /// One sentence for settings that this program does not know, or that the model cannot be sampled with.
@@ -74,7 +74,7 @@ pub fn settings_of_run(row: &GenerationRow, card: &TokensCard) -> anyhow::Result
             "guidance is {}; it must be 0 or more",
             settings.guidance
         );
-        Ok(TokensSettings { constraints: None, ..settings })
+        Ok(TokensSettings { constraints: None, group: None, ..settings })
     };
     read().with_context(|| {
         format!(
@@ -189,18 +189,18 @@ fn make_all(
         let clock = clock.map(|clock| clock.view());
         let heard = condition(card.planner.condition(), window.features.view(), clock);
         let track = TokenTrack {
-            condition: heard.view(),
-            // As for a UNet: the phase would tell what it is asked to make.
-            phase: None,
+            // As for a UNet without its phase, which would tell what it is asked to make.
             style: settings.style,
-            constraints: None,
-            control: Control::None,
-            seed: seed_of(*seed, &window.phrase_id, window.first_frame, 0),
+            ..TokenTrack::new(
+                heard.view(),
+                seed_of(*seed, &window.phrase_id, window.first_frame, 0),
+            )
         };
-        generator.run(&track, |frames| -> Result<(), EngineError> {
+        let emit = |frames| -> Result<(), EngineError> {
             parts.push(frames);
             Ok(())
-        })
+        };
+        generator.run(&track, emit).map(drop)
     };
     decoded_windows((windows, *threads), &settings.postprocess, decode, progress)
 }

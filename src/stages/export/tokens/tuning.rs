@@ -6,7 +6,7 @@ use ndarray::{Array2, Axis, concatenate};
 
 use super::{TrainedTokens, engines};
 use crate::diffusion::{SamplerConfig, Schedule, TokenSampling};
-use crate::generation::{Control, EngineError, SamplingDefaults, TokenGenerator, TokenTrack};
+use crate::generation::{EngineError, SamplingDefaults, TokenGenerator, TokenTrack};
 use crate::model::condition;
 use crate::stages::Progress;
 use crate::stages::export::tuning::{SEED, tuned};
@@ -58,17 +58,9 @@ pub fn sampling_defaults(
         };
         let made = windows.iter().enumerate().map(|(i, window)| {
             let (condition, seed) = (window.heard.view(), SEED + i as u64);
-            let control = Control::None;
-            let track = TokenTrack {
-                condition,
-                phase: None,
-                style: None,
-                constraints: None,
-                control,
-                seed,
-            };
+            let track = TokenTrack::new(condition, seed);
             let mut parts: Vec<Array2<f32>> = Vec::new();
-            generator.run(&track, |frames| -> Result<(), EngineError> {
+            let _plans = generator.run(&track, |frames| -> Result<(), EngineError> {
                 parts.push(frames);
                 Ok(())
             })?;
