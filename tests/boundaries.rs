@@ -7,6 +7,7 @@ use std::time::{Duration, SystemTime};
 use motiongen::store::tables::PhraseRow;
 use motiongen::store::{Commit, Item, Ledger, Location, Row as _};
 
+use crate::library::{clicks, constructed, from, library, write_captures, write_songs};
 use crate::support::files::{coherent, trajectory, wav};
 use crate::support::{
     Dir, MEMORY_BYTES, confined, failures, finish, ingest, ingest_command, phrases, run, tree,
@@ -84,6 +85,32 @@ fn a_walk_does_not_leave_the_source_by_a_folder() {
     assert_eq!(output.code, 1, "{output:?}");
     assert_eq!(failures(&dir.at("store")).keys().collect::<Vec<_>>(), ["proc"]);
     assert_eq!(phrases(&dir.at("store")).len(), 1);
+}
+
+#[test]
+fn a_library_takes_songs_and_captures_of_its_folders_alone() {
+    let dir = Dir::new();
+    let (songs, captures, store) = (write_songs(&dir), write_captures(&dir), dir.at("store"));
+    dir.write("elsewhere/song.wav", clicks(104.0, 8.5));
+    let capture = std::fs::read(captures.join("cmu.npy")).expect("a capture");
+    dir.write("elsewhere/walk.npy", capture);
+    symlink(dir.at("elsewhere"), songs.join("album")).expect("a link");
+    symlink(dir.at("elsewhere"), captures.join("moves")).expect("a link");
+    let output = library(&store, &from(&songs, &captures, &["--takes", "1"]));
+    assert_eq!(output.code, 1, "{output:?}");
+    let failed: Vec<_> =
+        failures(&store).into_values().map(|row| (row.phrase_id, row.kind)).collect();
+    let expected = ["album", "moves"].map(|id| (id.to_owned(), "symlink".to_owned()));
+    assert_eq!(failed, expected);
+    let n_songs = |store: &Path| {
+        let songs = constructed(store).into_values().filter_map(|row| row.song_hash);
+        songs.collect::<std::collections::BTreeSet<_>>().len()
+    };
+    assert_eq!(n_songs(&store), 3);
+    let followed = dir.at("followed");
+    let flags = from(&songs, &captures, &["--takes", "1", "--follow-links"]);
+    let output = library(&followed, &flags);
+    assert_eq!((output.code, n_songs(&followed)), (0, 4), "{output:?}");
 }
 
 /// Makes a file that nobody has touched for three days.

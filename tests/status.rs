@@ -137,6 +137,18 @@ fn what_is_left_is_what_the_stages_would_do_shard_by_shard() {
 }
 
 #[test]
+fn links_that_leave_the_source_are_failures_here_too() {
+    let dir = Dir::new();
+    dir.write("s/own.wav", wav(0.5));
+    dir.write("elsewhere/one.wav", wav(0.4));
+    dir.write("elsewhere/two.wav", wav(0.6));
+    std::os::unix::fs::symlink(dir.at("elsewhere"), dir.at("s/album")).expect("a link");
+    let store = dir.at("store");
+    assert_eq!(ingest(&dir.at("s"), &store, &[]).code, 1);
+    assert_eq!(counts(&store, "ingest", None), [1, 1, 0, 0]);
+}
+
+#[test]
 fn replaced_files_are_stale_and_touched_ones_only_until_they_are_seen() {
     let dir = Dir::new();
     let (source, store) = (source(&dir), dir.at("store"));

@@ -10,6 +10,7 @@ mod leases;
 mod objects;
 mod parts;
 mod sources;
+mod stops;
 
 use std::fmt;
 use std::io::Write as _;

@@ -4,6 +4,7 @@ killed on the way; says whether both runs ended with the same bits.
 
     pipelines/mpi/demo.py --bin target/debug
     pipelines/mpi/demo.py --bin target/debug --store build/demo/store      phrases of a store that is there already
+    … --kills 5                                                            kills at random moments, of any rank
 
 A store is copied, not written to.
 """
@@ -11,6 +12,7 @@ A store is copied, not written to.
 import argparse
 import os
 import pathlib
+import random
 import shutil
 import signal
 import subprocess
@@ -55,7 +57,10 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--bin", type=pathlib.Path, default=pathlib.Path("target/debug"))
     parser.add_argument("--store", type=pathlib.Path, help="store of phrases to train on; made from tests/data otherwise")
+    parser.add_argument("--kills", type=int, default=1, help="how often a rank is killed")
+    parser.add_argument("--seed", type=int, default=0, help="of which rank is killed, and when")
     arguments = parser.parse_args()
+    chance = random.Random(arguments.seed)
     motiongen = (arguments.bin / "motiongen").resolve()
     launcher = [HERE / "mpirun.sh", "--oversubscribe", "--bind-to", "none", "-n", "2"]
     launcher[1:1] = ["--allow-run-as-root"] if os.geteuid() == 0 else []
@@ -74,23 +79,30 @@ def main():
         print(f"one process: {time.monotonic() - started:.0f} s", flush=True)
 
         started = time.monotonic()
-        process = subprocess.Popen([*launcher, *command(stores["two"], 1)], stdout=subprocess.DEVNULL)
         checkpoints = stores["two"] / "runs/mpi/diffusion"
-        try:
-            while process.poll() is None and len(list(checkpoints.glob("step-*"))) < 2:
-                time.sleep(0.01)
-            ranks = ranks_of(motiongen, stores["two"])
-            if len(ranks) != 2:
-                raise SystemExit(f"{len(ranks)} ranks are at work where 2 should be")
-            os.kill(ranks[1], signal.SIGKILL)
-            code = process.wait()
-        finally:
-            if process.poll() is None:
-                process.terminate()
-                process.wait()
-        print(f"two ranks, one killed after {time.monotonic() - started:.0f} s: exit code {code}", flush=True)
-        if code != 75:
-            raise SystemExit("a job of which a rank was killed should end with 75")
+        for _ in range(arguments.kills):
+            known = set(checkpoints.glob("step-*"))
+            process = subprocess.Popen([*launcher, *command(stores["two"], 1)], stdout=subprocess.DEVNULL)
+            try:
+                # Every start brings the run a checkpoint farther, so that any number of kills comes to an end.
+                while process.poll() is None and not set(checkpoints.glob("step-*")) - known:
+                    time.sleep(0.01)
+                # Up to about as long as five steps take.
+                time.sleep(chance.uniform(0, 1))
+                ranks = ranks_of(motiongen, stores["two"])
+                if len(ranks) != 2:
+                    raise SystemExit(f"{len(ranks)} ranks are at work where 2 should be")
+                rank = chance.randrange(2)
+                os.kill(ranks[rank], signal.SIGKILL)
+                code = process.wait()
+            finally:
+                if process.poll() is None:
+                    process.terminate()
+                    process.wait()
+            after = max(path.name for path in checkpoints.glob("step-*"))
+            print(f"two ranks, one killed after {after}, {time.monotonic() - started:.0f} s: exit code {code}", flush=True)
+            if code != 75:
+                raise SystemExit("a job of which a rank was killed should end with 75")
         subprocess.run([*launcher, *command(stores["two"], 1)], check=True, stdout=subprocess.DEVNULL)
         print(f"the same command again: done after {time.monotonic() - started:.0f} s", flush=True)
         for network in ("diffusion", "decoder"):

@@ -309,7 +309,8 @@ def one_machine(motiongen, songs, store):
 METER = """\
 #!/bin/bash
 TIMEFORMAT='%R %U %S'
-took=$({{ time {motiongen} "$@" >&3 2>&4; }} 3>&1 4>&2 2>&1)
+exec 3>&1 4>&2
+took=$({{ time {motiongen} "$@" >&3 2>&4; }} 2>&1)
 code=$?
 echo "$took" >> {costs}
 exit $code

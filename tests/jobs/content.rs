@@ -11,7 +11,7 @@ use super::{stage, succeed};
 use crate::generate::modelled;
 use crate::support::files::{coherent, npz, wav};
 use crate::support::{Dir, failures, finish, ingest, motiongen, phrases, rows, tree};
-use crate::train::{features, train};
+use crate::train::{features, losses, train};
 
 /// Returns the usual flags that are not given otherwise, and those that are.
 fn unless_given<'a>(usual: &[&'a str], more: &[&'a str]) -> Vec<&'a str> {
@@ -270,6 +270,48 @@ fn the_log_of_one_configuration_is_not_that_of_another() {
         let ratio = first.expect("a rate") / second.expect("a rate");
         assert!((ratio - 100.0).abs() < 1e-6, "the rates of the run before: {ratio}");
     }
+}
+
+/// Nor for that of other data, or of a run of other steps, on whose number learning rates depend.
+#[test]
+fn the_log_of_other_data_or_of_more_steps_is_not_that_of_a_run() {
+    let dir = Dir::new();
+    let store = crate::train::make_store(&dir);
+    let with = |run: &str, more: &[&str]| {
+        let usual = ["--steps=2", "--save-every-steps=2", "--decoder-steps=1", "--warmup-steps=0"];
+        let output = train(&store, run, &unless_given(&usual, more));
+        assert_eq!(output.code, 0, "{output:?}");
+        losses(&store, run, "diffusion")
+    };
+    // What a kill leaves of a run that had written its parts and nothing else.
+    let forget = || {
+        std::fs::remove_dir_all(store.join("commits/train")).expect("commits");
+        std::fs::remove_dir_all(store.join("runs/a")).expect("a run");
+    };
+    let first = with("a", &[]);
+    forget();
+    let of_rates = |rows: Vec<TrainingLogRow>| -> Vec<(i64, Option<f64>)> {
+        let mut rates: Vec<_> = rows
+            .into_iter()
+            .filter(|row| row.run == "a" && row.stage == "diffusion" && row.kind == "step")
+            .map(|row| (row.step, row.learning_rate))
+            .collect();
+        rates.sort_by_key(|(step, _)| *step);
+        rates
+    };
+    with("a", &["--steps=4"]);
+    let rates = of_rates(rows(&store));
+    assert_eq!(rates.len(), 4);
+    // Half way down a cosine: of two steps the second has half of the peak, of four the third.
+    assert_eq!(rates[2].1, Some(1.5e-3), "the rates of a run of two steps: {rates:?}");
+    assert!(rates[1].1 > Some(2.5e-3), "the rates of a run of two steps: {rates:?}");
+    forget();
+    let id = phrases(&store).into_values().find(|row| row.split == "train").expect("a phrase");
+    replace_features(&dir, &store, &id.phrase_id);
+    succeed(&mut stage("extract", &store, &[]));
+    let again = with("a", &[]);
+    assert_ne!(again, first, "the losses on what the files held before");
+    assert_eq!(again, with("b", &[]));
 }
 
 fn touch(path: &Path) {

@@ -19,7 +19,7 @@ fn compacted(location: &Location) -> Compaction {
 }
 
 /// Everything but where it lies.
-fn said(location: &Location) -> Seen {
+pub(super) fn said(location: &Location) -> Seen {
     Seen { parts: Vec::new(), ..seen(location) }
 }
 

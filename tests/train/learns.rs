@@ -147,6 +147,32 @@ fn training_ends_when_nothing_improves_and_when_time_is_over() {
 }
 
 #[test]
+fn the_checkpoint_of_least_loss_is_kept_or_the_one_that_moves_most_as_real_motion_does() {
+    let dir = Dir::new();
+    let store = make_store(&dir);
+    let kept = |run: &str, more: &[&str]| {
+        let common = ["--steps=60", "--decoder-steps=1", "--validate-every=2", "--warmup-steps=0"];
+        let output = train(&store, run, &[&common[..], more].concat());
+        assert_eq!(output.code, 0, "{output:?}");
+        let mut validations = log(&store, run, "diffusion");
+        validations.retain(|row| row.kind == "validation");
+        let (name, _) = newest(&store, run, "diffusion", "best");
+        let step = name.strip_prefix("best-").and_then(|name| name.strip_suffix(".safetensors"));
+        (validations, step.and_then(|step| step.parse::<i64>().ok()).expect("a step"))
+    };
+    let least = |rows: &[TrainingLogRow], value: fn(&TrainingLogRow) -> Option<f64>| {
+        let value = |row: &TrainingLogRow| value(row).expect("a number");
+        rows.iter().min_by(|a, b| value(a).total_cmp(&value(b))).expect("a validation").step
+    };
+    let (rows, step) = kept("loss", &[]);
+    assert!(rows.len() > 5 && rows.iter().all(|row| row.sampled_distance.is_none()), "{rows:?}");
+    assert_eq!(step, least(&rows, |row| row.loss));
+    let (rows, step) = kept("motion", &["--keep=motion"]);
+    assert_eq!(step, least(&rows, |row| row.sampled_distance));
+    assert_ne!(step, least(&rows, |row| row.loss), "a run that tells the two apart");
+}
+
+#[test]
 fn a_dry_run_writes_nothing() {
     let dir = Dir::new();
     let store = make_store(&dir);

@@ -153,6 +153,11 @@ mod tests {
         };
         assert_eq!(refusal(|c| c.blocks = 0), "blocks is 0; it must be at least 1");
         assert_eq!(refusal(|c| c.max_dancers = 17), "max_dancers is 17; it must be at most 16");
+        assert_eq!(refusal(|c| c.width = 16_392), "width is 16392; it must be at most 16384");
+        assert_eq!(
+            refusal(|c| c.n_steps = usize::MAX),
+            format!("n_steps is {}; it must be at most 33554432", usize::MAX)
+        );
         assert_eq!(
             refusal(|c| c.heads = 7),
             "a width of 48 does not divide into pairs of 7 heads; change heads or the width"

@@ -181,6 +181,11 @@ mod tests {
         );
         assert_eq!(refusal(|c| c.codes = 1), "codes is 1; it must be at least 2");
         assert_eq!(refusal(|c| c.depth = 9), "depth is 9; it must be at most 8");
+        assert_eq!(refusal(|c| c.width = 16_386), "width is 16386; it must be at most 16384");
+        assert_eq!(
+            refusal(|c| c.n_steps = usize::MAX),
+            format!("n_steps is {}; it must be at most 33554432", usize::MAX)
+        );
         assert_eq!(
             refusal(|c| c.width = 49),
             "width is 49; it must be even, since steps are embedded as pairs of a cosine and a sine"

@@ -104,8 +104,8 @@ impl Evaluand {
         let mut motions = Vec::new();
         let mut n_frames = Vec::new();
         for (item, (row, split)) in generations.iter().zip(splits).enumerate() {
-            let keyframes = keyframes(row)?;
-            for dancer in 0..row.count_dancers().max(1) {
+            let n_dancers = row.count_dancers().max(1);
+            for (dancer, keyframes) in keyframes(row, n_dancers)?.into_iter().enumerate() {
                 motions.push(EvaluationMotion {
                     phrase_id: row.phrase_id.clone(),
                     sample: row.sample,
@@ -113,7 +113,7 @@ impl Evaluand {
                     dancer,
                     split,
                     misses: [row.control_error_mm, row.control_error_deg],
-                    keyframes: keyframes.clone(),
+                    keyframes,
                 });
                 n_frames.push(usize::try_from(row.n_frames).unwrap_or(0));
             }

@@ -3,6 +3,8 @@
 use anyhow::Context as _;
 
 use crate::evaluation::keyframe::Keyframe;
+use crate::motion::Placement;
+use crate::motion::choreography::group::side_by_side;
 use crate::motion::postprocess::PostProcessConfig;
 use crate::stages::generate::{GroupSettings, MotionSettings, TokensSettings, keyframes_of};
 use crate::store::tables::GenerationRow;
@@ -46,12 +48,26 @@ impl Making {
     }
 }
 
-/// Reads what a motion was asked to do, from the text that generate wrote down.
+/// Reads what each of `n_dancers` was asked to do, from the text that generate wrote down: the dancers of a group go beside each
+/// other along what it says.
 ///
 /// # Errors
 /// One sentence for a text that is no such thing.
-pub fn keyframes(row: &GenerationRow) -> anyhow::Result<Vec<Keyframe>> {
-    let Some(text) = &row.constraints else { return Ok(Vec::new()) };
+pub fn keyframes(row: &GenerationRow, n_dancers: usize) -> anyhow::Result<Vec<Vec<Keyframe>>> {
+    let Some(text) = &row.constraints else { return Ok(vec![Vec::new(); n_dancers]) };
     let n_frames = usize::try_from(row.n_frames).unwrap_or(0);
-    keyframes_of(text, n_frames).with_context(|| format!("motion {}", row.generation))
+    let asked =
+        keyframes_of(text, n_frames).with_context(|| format!("motion {}", row.generation))?;
+    if n_dancers < 2 {
+        return Ok(vec![asked; n_dancers]);
+    }
+    let beside = |place: &Placement| {
+        let by_m = [place.x_m, 0.0, place.z_m];
+        let moved = |keyframe: &Keyframe| {
+            let axis = |i: usize| keyframe.position_m[i].map(|x| x + by_m[i]);
+            Keyframe { position_m: std::array::from_fn(axis), ..*keyframe }
+        };
+        asked.iter().map(moved).collect()
+    };
+    Ok(side_by_side(n_dancers, row.seed as u64).iter().map(beside).collect())
 }

@@ -344,6 +344,25 @@ mod tests {
     }
 
     #[test]
+    fn a_first_model_is_whole_as_soon_as_it_has_a_card() {
+        let (_folder, [store, _]) = stores();
+        let card = format!("models/m/{}", file_names::CARD);
+        for i in 0..20 {
+            std::thread::scope(|scope| {
+                let reader = scope.spawn(|| {
+                    while store.read_if_there(&card).expect("readable").is_none() {}
+                    version(&store)
+                });
+                published(&store, &files(i)).expect("published");
+                assert_eq!(reader.join().expect("a reader"), Some(format!(" of {i}")));
+            });
+            for ListedObject { path, .. } in store.list("models").expect("listed") {
+                store.remove(&path).expect("removed");
+            }
+        }
+    }
+
+    #[test]
     fn a_pointer_of_others_is_passed_over() {
         let (_folder, [store, _]) = stores();
         published(&store, &files(1)).expect("published");

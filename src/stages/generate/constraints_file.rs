@@ -404,6 +404,14 @@ mod tests {
                 "{said}"
             );
         }
+        // JSON has greater numbers than TOML.
+        let json = r#"{"keyframe": [{"frame": 18446744073709551615, "position_y": 0.5}]}"#;
+        let last = ConstraintsRequest::of_text(json, true).expect("JSON");
+        let said = last.of_track(31, ChannelLimits::Wide).expect_err("behind the end").to_string();
+        assert!(
+            said.ends_with("but the track has 31 frames (1.03 s); move it or leave it out"),
+            "{said}"
+        );
     }
 
     #[test]

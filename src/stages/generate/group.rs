@@ -326,3 +326,26 @@ impl GroupMaker<'_> {
         GenerationRow { consistency: Some(settings.consistency), ..row }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_guides_has_the_sign_of_the_consistency_that_was_asked_for() {
+        let settings = |consistency| GroupSettings {
+            output_version: OUTPUT_VERSION,
+            n_dancers: 3,
+            consistency,
+            consistency_form: ConsistencyForm::default(),
+            consistency_scale: 4.0,
+            sampler: SamplerConfig::fast27(),
+            guidance: 1.0,
+            overlap_frames: 30,
+            postprocess: PostProcessConfig::default(),
+            separation: true,
+            no_clock: false,
+        };
+        assert_eq!([-0.5, 0.0, 1.0].map(|x| settings(x).gamma()), [-2.0, 0.0, 4.0]);
+    }
+}

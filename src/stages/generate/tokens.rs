@@ -25,7 +25,9 @@ use crate::generation::{
 };
 use crate::motion::choreography::group::side_by_side;
 use crate::motion::group::{MAX_DANCERS, RADIUS_M, separate};
-use crate::motion::postprocess::{HeldPoses, PostProcessConfig, process, process_holding};
+use crate::motion::postprocess::{
+    Displacement, HeldPoses, PostProcessConfig, process, process_holding,
+};
 use crate::motion::style::STYLE_DIM;
 use crate::motion::{MOTION_DIM, Placement};
 use crate::stages::failure::{Failure, FailureKind, guarded};
@@ -252,6 +254,15 @@ pub fn run(
     Ok(Box::new(GenerateSummary { place, done, model: name, made_with, dry_run, took_s }))
 }
 
+/// A dancer as it was decoded.
+struct Dancer {
+    /// Tokens of every window.
+    plans: Vec<Vec<u32>>,
+    decoded: Array2<f32>,
+    /// What is asked of this dancer.
+    constraints: Option<Constraints>,
+}
+
 /// Generates motions by tokens.
 struct TokensMaker<'a> {
     generator: TokenGenerator<'a>,
@@ -294,76 +305,42 @@ impl TokensMaker<'_> {
             Some(Ok(constraints)) => Some(constraints),
             None => None,
         };
-        let control = self.settings.control.unwrap_or(Control::None);
-        let is_kept = control.decodes() && !self.settings.soft;
         let group = self.settings.group;
         let seed = |dancer| seed_of(self.identity.seed, music.phrase_id, sample, dancer);
         let places = group
             .map_or(vec![Placement::default()], |group| side_by_side(group.n_dancers, seed(0)));
-        let postprocess = &self.settings.postprocess;
-        let (mut first_plans, mut asked) = (Vec::new(), Vec::new());
-        let (mut all_decoded, mut all_frames) = (Vec::new(), Vec::new());
-        let mut displacement = None;
-        for (dancer, &place) in places.iter().enumerate() {
+        let mut dancers: Vec<Dancer> = Vec::with_capacity(places.len());
+        for (i, &place) in places.iter().enumerate() {
             // Every dancer's way is the one that is asked for, as far beside it as it begins beside the others.
             let own = constraints.as_ref().map(|constraints| match group {
                 Some(_) => constraints.moved([place.x_m, place.z_m], n_frames, limits),
                 None => Ok(constraints.clone()),
             });
             let refuse = |e| Failure::new(FailureKind::Constraint, music.source, e);
-            let own: Option<Constraints> = own.transpose().map_err(refuse)?;
-            let share = group.map_or(0.0, |group| group.consistency);
-            let kept = kept_of(&first_plans, share, seed(dancer));
+            let constraints: Option<Constraints> = own.transpose().map_err(refuse)?;
+            let kept = match (group, dancers.first()) {
+                (Some(group), Some(first)) => kept_of(&first.plans, group.consistency, seed(i)),
+                _ => Vec::new(),
+            };
+            let weighted = |constraints| WeightedConstraints { constraints, strength };
             let track = TokenTrack {
                 phase: heard.clock_phase(),
                 style: self.settings.style,
-                constraints: own
-                    .as_ref()
-                    .map(|constraints| WeightedConstraints { constraints, strength }),
-                control,
+                constraints: constraints.as_ref().map(weighted),
+                control: self.settings.control.unwrap_or(Control::None),
                 place,
                 kept: &kept,
-                ..TokenTrack::new(heard.condition.view(), seed(dancer))
+                ..TokenTrack::new(heard.condition.view(), seed(i))
             };
-            let mut parts: Vec<Array2<f32>> = Vec::new();
-            let emit = |frames: Array2<f32>| -> Result<(), StopReason> {
-                watch(frames.view()).map_err(StopReason::Watcher)?;
-                parts.push(frames);
-                Ok(())
-            };
-            let plans = self.generator.run(&track, emit).map_err(|stop| stop.of(music.source))?;
-            if dancer == 0 {
-                first_plans = plans;
-            }
-            let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
-            let decoded =
-                concatenate(Axis(0), &views).unwrap_or_else(|_| Array2::zeros((0, MOTION_DIM)));
-            let mut frames = decoded.clone();
-            let moved = process_holding(postprocess, &mut frames, bars, &HeldPoses::default());
-            displacement = moved.filter(|_| group.is_none());
-            all_decoded.push(decoded);
-            all_frames.push(frames);
-            asked.extend(own);
+            let (plans, decoded) = self.decoded(&track, music.source, watch)?;
+            dancers.push(Dancer { plans, decoded, constraints });
         }
-        let [decoded, mut frames] = [&all_decoded, &all_frames].map(|dancers| {
-            let views: Vec<_> = dancers.iter().map(|dancer| dancer.view()).collect();
-            stack(Axis(0), &views).expect("invariant: every dancer has the frames of the music")
-        });
-        if group.is_some_and(|group| group.separation) {
-            frames = separate(frames.view(), RADIUS_M)
-                .map_err(|e| Failure::new(FailureKind::NonFinite, music.source, e))?;
-        }
-        let mut misses = Vec::new();
-        for (mut dancer, constraints) in frames.outer_iter_mut().zip(&asked) {
-            if is_kept {
-                // Only now is it smooth, and what is missing yet too; what follows from poses follows again.
-                let mut motion = dancer.to_owned();
-                steer(constraints, &mut motion, 0, Steering::Finish);
-                process(&postprocess.without_smoothing(), &mut motion, bars);
-                dancer.assign(&motion);
-            }
-            misses.extend(constraints.errors(dancer.view()));
-        }
+        let (frames, decoded, displacement) = self.finished(&dancers, music.source, bars)?;
+        let asked = dancers.iter().map(|dancer| dancer.constraints.as_ref());
+        let misses: Vec<_> = asked
+            .zip(frames.outer_iter())
+            .flat_map(|(asked, frames)| asked.map(|c| c.errors(frames)).unwrap_or_default())
+            .collect();
         let seconds = started.elapsed().as_secs_f64();
         let phase = heard.phase.as_deref();
         let mut row = self.row(music, (sample, seed(0)), (&frames, &decoded), phase, seconds);
@@ -371,6 +348,63 @@ impl TokensMaker<'_> {
         row.constraints = constraints.as_ref().map(text_of);
         row.consistency = group.map(|group| group.consistency);
         Ok(GeneratedMotion { frames, decoded, rows: vec![row], displacement, seconds })
+    }
+
+    /// Plans and decodes a dancer; returns the plans of its windows, and its motion.
+    fn decoded(
+        &self,
+        track: &TokenTrack,
+        source: &str,
+        watch: &mut dyn FnMut(ArrayView2<f32>) -> std::io::Result<()>,
+    ) -> Result<(Vec<Vec<u32>>, Array2<f32>), Failure> {
+        let mut parts: Vec<Array2<f32>> = Vec::new();
+        let emit = |frames: Array2<f32>| -> Result<(), StopReason> {
+            watch(frames.view()).map_err(StopReason::Watcher)?;
+            parts.push(frames);
+            Ok(())
+        };
+        let plans = self.generator.run(track, emit).map_err(|stop| stop.of(source))?;
+        let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
+        let decoded =
+            concatenate(Axis(0), &views).unwrap_or_else(|_| Array2::zeros((0, MOTION_DIM)));
+        Ok((plans, decoded))
+    }
+
+    /// Returns what users get of dancers, \[N, T, 25\], what was decoded, and how far fusion moved a soloist: each dancer is
+    /// post-processed, bodies are apart, and then constraints are met.
+    fn finished(
+        &self,
+        dancers: &[Dancer],
+        source: &str,
+        bars: Option<&[f64]>,
+    ) -> Result<(Array3<f32>, Array3<f32>, Option<Displacement>), Failure> {
+        let TokensSettings { postprocess, group, soft, .. } = self.settings;
+        let views: Vec<_> = dancers.iter().map(|dancer| dancer.decoded.view()).collect();
+        let decoded =
+            stack(Axis(0), &views).expect("invariant: every dancer has the frames of the music");
+        let (mut frames, mut displacement) = (decoded.clone(), None);
+        for mut dancer in frames.outer_iter_mut() {
+            let mut motion = dancer.to_owned();
+            let moved = process_holding(postprocess, &mut motion, bars, &HeldPoses::default());
+            displacement = moved.filter(|_| group.is_none());
+            dancer.assign(&motion);
+        }
+        if group.is_some_and(|group| group.separation) {
+            frames = separate(frames.view(), RADIUS_M)
+                .map_err(|e| Failure::new(FailureKind::NonFinite, source, e))?;
+        }
+        let is_kept = self.settings.control.is_some_and(Control::decodes) && !soft;
+        let asked = dancers.iter().map(|dancer| dancer.constraints.as_ref());
+        for (mut dancer, asked) in frames.outer_iter_mut().zip(asked) {
+            if let Some(constraints) = asked.filter(|_| is_kept) {
+                // Only now is it smooth, and what is missing yet too; what follows from poses follows again.
+                let mut motion = dancer.to_owned();
+                steer(constraints, &mut motion, 0, Steering::Finish);
+                process(&postprocess.without_smoothing(), &mut motion, bars);
+                dancer.assign(&motion);
+            }
+        }
+        Ok((frames, decoded, displacement))
     }
 
     fn row(

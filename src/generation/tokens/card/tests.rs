@@ -70,6 +70,18 @@ fn networks_that_do_not_fit_each_other_are_refused() {
         "m: the denoiser of a model of tokens predicts clean motion, and the diffusion says otherwise; export the \
          model again"
     );
+    let sizes: [(fn(&mut TokensCard), &str); 3] = [
+        (|card| card.tokens.width = 4_000_000, "width is 4000000; it must be at most 16384"),
+        (
+            |card| (card.tokens.n_steps, card.diffusion.n_steps) = (1 << 20, 1 << 20),
+            "n_steps 1048576 and width 48 make a table of 50331648 values; at most 33554432 are kept, so lower one of \
+             the two",
+        ),
+        (|card| card.planner.layers = 1_000_000, "layers is 1000000; it must be at most 64"),
+    ];
+    for (change, expected) in sizes {
+        assert_eq!(refusal(change), format!("m: {expected}"));
+    }
     assert_eq!(
         refusal(|card| card.family = Family::Group),
         "m: is a model of the family group, and one of the family tokens is needed"

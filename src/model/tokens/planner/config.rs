@@ -258,6 +258,7 @@ mod tests {
         assert_eq!(refusal(|c| c.codes = 1), "codes is 1; it must be at least 2");
         assert_eq!(refusal(|c| c.layers = 0), "layers is 0; it must be at least 1");
         assert_eq!(refusal(|c| c.depth = 9), "depth is 9; it must be at most 8");
+        assert_eq!(refusal(|c| c.width = 16_392), "width is 16392; it must be at most 16384");
         assert_eq!(
             refusal(|c| c.frames_per_token = 6),
             "a token stands for 6 frames; it must be 1, 2, 4, 8 or 16, since each level of the encoder halves them"
