@@ -263,6 +263,16 @@ struct Dancer {
     constraints: Option<Constraints>,
 }
 
+/// Dancers as users get them.
+struct FinishedDancers {
+    /// \[N, T, 25\]
+    frames: Array3<f32>,
+    /// As they were decoded, \[N, T, 25\].
+    decoded: Array3<f32>,
+    /// How far fusion moved the poses of a soloist.
+    displacement: Option<Displacement>,
+}
+
 /// Generates motions by tokens.
 struct TokensMaker<'a> {
     generator: TokenGenerator<'a>,
@@ -335,7 +345,8 @@ impl TokensMaker<'_> {
             let (plans, decoded) = self.decoded(&track, music.source, watch)?;
             dancers.push(Dancer { plans, decoded, constraints });
         }
-        let (frames, decoded, displacement) = self.finished(&dancers, music.source, bars)?;
+        let FinishedDancers { frames, decoded, displacement } =
+            self.finished(&dancers, music.source, bars)?;
         let asked = dancers.iter().map(|dancer| dancer.constraints.as_ref());
         let misses: Vec<_> = asked
             .zip(frames.outer_iter())
@@ -370,14 +381,13 @@ impl TokensMaker<'_> {
         Ok((plans, decoded))
     }
 
-    /// Returns what users get of dancers, \[N, T, 25\], what was decoded, and how far fusion moved a soloist: each dancer is
-    /// post-processed, bodies are apart, and then constraints are met.
+    /// Finishes dancers: each is post-processed, bodies are moved apart, and then constraints are met.
     fn finished(
         &self,
         dancers: &[Dancer],
         source: &str,
         bars: Option<&[f64]>,
-    ) -> Result<(Array3<f32>, Array3<f32>, Option<Displacement>), Failure> {
+    ) -> Result<FinishedDancers, Failure> {
         let TokensSettings { postprocess, group, soft, .. } = self.settings;
         let views: Vec<_> = dancers.iter().map(|dancer| dancer.decoded.view()).collect();
         let decoded =
@@ -404,7 +414,7 @@ impl TokensMaker<'_> {
                 dancer.assign(&motion);
             }
         }
-        Ok((frames, decoded, displacement))
+        Ok(FinishedDancers { frames, decoded, displacement })
     }
 
     fn row(

@@ -2,6 +2,9 @@ use super::*;
 use crate::generation::card::{CardError, MODEL_FORMAT, own_channels, own_features};
 use crate::model::{PlannerKind, Preset};
 
+/// A fault that a card may have.
+type Change = fn(&mut TokensCard);
+
 fn card() -> TokensCard {
     let tokens = TokensConfig::of(Preset::Tiny).expect("a preset of the family");
     let planner = PlannerConfig::of(Preset::Tiny, PlannerKind::Masked, &tokens).expect("a preset");
@@ -70,7 +73,7 @@ fn networks_that_do_not_fit_each_other_are_refused() {
         "m: the denoiser of a model of tokens predicts clean motion, and the diffusion says otherwise; export the \
          model again"
     );
-    let sizes: [(fn(&mut TokensCard), &str); 3] = [
+    let sizes: [(Change, &str); 3] = [
         (|card| card.tokens.width = 4_000_000, "width is 4000000; it must be at most 16384"),
         (
             |card| (card.tokens.n_steps, card.diffusion.n_steps) = (1 << 20, 1 << 20),
