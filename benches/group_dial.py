@@ -5,7 +5,8 @@
 
 For every γ groups are generated, and within windows of 8 s the velocities of every two dancers are correlated, each in
 the heading frame of its body: r0 at the same frame, r at the best lag up to 2.1 s. Means over groups with their standard
-errors, and the mean jerk, which tells what it costs.
+errors, how different dancers are, and the mean jerk, which tells what it costs; then Spearman's correlation of r0, r and the
+difference with γ, of each song and of the means.
 """
 
 import argparse
@@ -59,6 +60,19 @@ def jerk(motion: np.ndarray) -> float:
     return float(np.abs(np.diff(motion[..., 6:9], axis=1)).mean() * FPS)
 
 
+def difference(motion: np.ndarray) -> float:
+    """Root mean square difference of the heading velocities of two dancers, m/s."""
+    velocity = heading_velocity(motion)
+    pairs = [(i, j) for i in range(len(velocity)) for j in range(i + 1, len(velocity))]
+    return float(np.sqrt(np.mean([((velocity[i] - velocity[j]) ** 2).mean() for i, j in pairs])))
+
+
+def spearman(x: list[float], y: list[float]) -> float:
+    """Correlation of ranks; there are no ties."""
+    ranks = [np.argsort(np.argsort(values)) for values in (x, y)]
+    return float(np.corrcoef(ranks)[0, 1])
+
+
 def with_error(values: list[float]) -> str:
     return f"{np.mean(values):.3f} ± {np.std(values) / np.sqrt(len(values)):.3f}"
 
@@ -74,7 +88,8 @@ def main() -> None:
     parser.add_argument("--dancers", type=int, default=4)
     parser.add_argument("--samples", type=int, default=2)
     arguments = parser.parse_args()
-    print("| γ | groups | r0 | r | jerk, m/s³ |\n|---|---|---|---|---|")
+    print("| γ | groups | r0 | r | difference, m/s | jerk, m/s³ |\n|---|---|---|---|---|---|")
+    by_song: dict[str, list[np.ndarray]] = {}
     for gamma in arguments.gamma:
         with tempfile.TemporaryDirectory() as folder:
             options = {
@@ -93,10 +108,24 @@ def main() -> None:
             subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
             files = sorted(pathlib.Path(folder).rglob("*.npy"))
             motions = [np.load(file).astype(np.float64) for file in files]
+            songs = [file.name.split(".")[0] for file in files]
         pairs = [correlations(motion) for motion in motions]
         r0, r = ([pair[k] for pair in pairs] for k in range(2))
+        apart = [difference(motion) for motion in motions]
         jerks = np.mean([jerk(motion) for motion in motions])
-        print(f"| {gamma:g} | {len(motions)} | {with_error(r0)} | {with_error(r)} | {jerks:.1f} |", flush=True)
+        print(
+            f"| {gamma:g} | {len(motions)} | {with_error(r0)} | {with_error(r)} | {with_error(apart)} | {jerks:.1f} |",
+            flush=True,
+        )
+        numbers = np.array([r0, r, apart])
+        for song in sorted(set(songs)):
+            of_song = numbers[:, [name == song for name in songs]].mean(axis=1)
+            by_song.setdefault(song, []).append(of_song)
+    print("\n| song | ρ of r0 | ρ of r | ρ of difference |\n|---|---|---|---|")
+    rows = by_song | {"means": list(np.mean(list(by_song.values()), axis=0))}
+    for song, found in rows.items():
+        rho = [spearman(arguments.gamma, [of_gamma[k] for of_gamma in found]) for k in range(3)]
+        print(f"| {song} | " + " | ".join(f"{x:.2f}" for x in rho) + " |")
 
 
 if __name__ == "__main__":

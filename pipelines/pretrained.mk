@@ -39,7 +39,7 @@ pretrained:
 # The model of groups: songs of tests/data and composed ones, groups of two to five.
 GROUP_STORE  ?= $(OUT)/group-store
 GROUP_CONFIG ?= pipelines/group.toml
-GROUP_TRAIN  ?= --preset small --steps 4000
+GROUP_TRAIN  ?= --preset tiny --steps 1200
 GROUP_INTO   ?= models/group
 GROUP        := group
 
