@@ -13,13 +13,13 @@ use crate::store_suite::commits::{STAGE, commit, item, ledger, outcome, snapshot
 
 /// Everything that readers see of a stage.
 #[derive(Debug, PartialEq)]
-pub(super) struct Seen {
+pub(super) struct StageContents {
     pub rows: Vec<(String, String)>,
     pub items: BTreeMap<String, (Item, String, u64)>,
     pub parts: Vec<(String, Vec<String>)>,
 }
 
-pub(super) fn seen(location: &Location) -> Seen {
+pub(super) fn contents_of(location: &Location) -> StageContents {
     let taken = StoreSnapshot::take(location).unwrap_or_else(|e| panic!("{}", chain(&e)));
     let ledger = taken.ledger(STAGE).expect("a ledger");
     let items = ledger.ids().map(|id| {
@@ -39,7 +39,7 @@ pub(super) fn seen(location: &Location) -> Seen {
         dead.sort();
         (live.part.path, dead)
     });
-    Seen { rows: visible(&snapshot(location)), items, parts: parts.collect() }
+    StageContents { rows: visible(&snapshot(location)), items, parts: parts.collect() }
 }
 
 /// Commits that know of each other or not, some of them forgetting, in an order that `seed` decides.
@@ -94,14 +94,14 @@ fn a_catalogue_says_what_the_manifests_say() {
             if round < 4 {
                 checkpoint(location, &[STAGE]);
             }
-            let with = seen(location);
+            let with = contents_of(location);
             n_catalogues = n_catalogues.max(catalogues(location).len());
             let kept: Vec<_> = catalogues(location)
                 .into_iter()
                 .map(|path| (path.clone(), read(location, &path)))
                 .collect();
             without_catalogues(location);
-            assert_eq!(with, seen(location), "seed {seed}, round {round}");
+            assert_eq!(with, contents_of(location), "seed {seed}, round {round}");
             for (path, bytes) in kept {
                 put(location, &path, &bytes);
             }
@@ -140,7 +140,7 @@ fn few_commits_have_no_catalogue() {
 fn a_catalogue_that_is_damaged_or_of_others_is_passed_over() {
     let Backend { location, .. } = &backends("damaged").swap_remove(0);
     history(location, 11, 20);
-    let expected = seen(location);
+    let expected = contents_of(location);
     checkpoint(location, &[STAGE]);
     let path = catalogues(location).pop().expect("a catalogue");
     let bytes = read(location, &path);
@@ -150,7 +150,7 @@ fn a_catalogue_that_is_damaged_or_of_others_is_passed_over() {
     };
     for cut in [0, 1, 7, bytes.len() / 2, bytes.len() - 1] {
         replace(&bytes[..cut]);
-        assert_eq!(seen(location), expected, "cut at {cut}");
+        assert_eq!(contents_of(location), expected, "cut at {cut}");
     }
     // A list of commits that reads well and says something else.
     let position = |text: &[u8]| bytes.windows(text.len()).position(|window| window == text);
@@ -161,7 +161,7 @@ fn a_catalogue_that_is_damaged_or_of_others_is_passed_over() {
         let mut flipped = bytes.clone();
         flipped[place] ^= 0x10;
         replace(&flipped);
-        assert_eq!(seen(location), expected, "byte {place} of {}", bytes.len());
+        assert_eq!(contents_of(location), expected, "byte {place} of {}", bytes.len());
     }
     // A catalogue of another stage, under a higher number.
     replace(&bytes);
@@ -173,7 +173,7 @@ fn a_catalogue_that_is_damaged_or_of_others_is_passed_over() {
     let ids: Vec<String> =
         Ledger::read(location, "train").expect("a ledger").ids().map(str::to_owned).collect();
     assert_eq!(ids, ["run/0"]);
-    assert_eq!(seen(location), expected);
+    assert_eq!(contents_of(location), expected);
 }
 
 #[test]
@@ -195,14 +195,14 @@ fn whoever_comes_by_may_write_it_at_the_same_time() {
     for backend in &backends("raced") {
         let location = &backend.location;
         history(location, 21, 24);
-        let expected = seen(location);
+        let expected = contents_of(location);
         std::thread::scope(|scope| {
             for _ in 0..4 {
                 scope.spawn(|| checkpoint(location, &[STAGE]));
             }
         });
         assert!(!catalogues(location).is_empty(), "{backend}");
-        assert_eq!(seen(location), expected, "{backend}");
+        assert_eq!(contents_of(location), expected, "{backend}");
     }
 }
 

@@ -10,7 +10,7 @@ use motiongen::store::{
 };
 use ndarray::Array2;
 
-use super::catalogue::{Seen, history, seen};
+use super::catalogue::{StageContents, contents_of, history};
 use super::{Backend, backends, chain, paths, put};
 use crate::store_suite::commits::{STAGE, commit, item, ledger, outcome, snapshot, visible};
 
@@ -19,8 +19,8 @@ fn compacted(location: &Location) -> Compaction {
 }
 
 /// Everything but where it lies.
-pub(super) fn said(location: &Location) -> Seen {
-    Seen { parts: Vec::new(), ..seen(location) }
+pub(super) fn said(location: &Location) -> StageContents {
+    StageContents { parts: Vec::new(), ..contents_of(location) }
 }
 
 /// Returns the parts of all tables that are there, whether they count or not.

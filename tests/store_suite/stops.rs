@@ -18,7 +18,7 @@ use object_store::{
     ObjectStore, PutMultipartOptions, PutOptions, PutPayload, PutResult, Result,
 };
 
-use super::catalogue::{Seen, history};
+use super::catalogue::{StageContents, history};
 use super::commits::{STAGE, item, ledger, outcome};
 use super::compaction::said;
 
@@ -191,7 +191,7 @@ fn stopped_everywhere(memory: &InMemory, work: Work) -> usize {
         let stopping = Location::with_client("memory://stopped", Arc::new(stopping), "st");
         let ended = work(&stopping);
         let location = location_of(&copy);
-        let found: Seen = said(&location);
+        let found: StageContents = said(&location);
         assert!(found == before || found == after, "after {n_allowed} writes: {found:?}");
         assert!(
             ended.is_err() || found == after,

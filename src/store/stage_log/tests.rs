@@ -1,7 +1,7 @@
 use std::time::Duration;
 
-use super::super::{Commit, Ledger, compact, vacuum};
 use super::*;
+use crate::store::{Commit, Ledger, compact, vacuum};
 
 const STAGE: &str = "ingest";
 const N_ITEMS: usize = 600;
