@@ -15,6 +15,7 @@ import subprocess
 import tempfile
 
 import numpy as np
+from scipy.stats import spearmanr
 
 FPS = 30
 WINDOW_FRAMES = 240
@@ -65,12 +66,6 @@ def difference(motion: np.ndarray) -> float:
     velocity = heading_velocity(motion)
     pairs = [(i, j) for i in range(len(velocity)) for j in range(i + 1, len(velocity))]
     return float(np.sqrt(np.mean([((velocity[i] - velocity[j]) ** 2).mean() for i, j in pairs])))
-
-
-def spearman(x: list[float], y: list[float]) -> float:
-    """Correlation of ranks; there are no ties."""
-    ranks = [np.argsort(np.argsort(values)) for values in (x, y)]
-    return float(np.corrcoef(ranks)[0, 1])
 
 
 def with_error(values: list[float]) -> str:
@@ -124,7 +119,7 @@ def main() -> None:
     print("\n| song | ρ of r0 | ρ of r | ρ of difference |\n|---|---|---|---|")
     rows = by_song | {"means": list(np.mean(list(by_song.values()), axis=0))}
     for song, found in rows.items():
-        rho = [spearman(arguments.gamma, [of_gamma[k] for of_gamma in found]) for k in range(3)]
+        rho = [spearmanr(arguments.gamma, [of_gamma[k] for of_gamma in found]).statistic for k in range(3)]
         print(f"| {song} | " + " | ".join(f"{x:.2f}" for x in rho) + " |")
 
 

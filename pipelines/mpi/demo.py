@@ -84,7 +84,7 @@ def main():
             known = set(checkpoints.glob("step-*"))
             process = subprocess.Popen([*launcher, *command(stores["two"], 1)], stdout=subprocess.DEVNULL)
             try:
-                # Every start brings the run a checkpoint farther, so that any number of kills comes to an end.
+                # Each start writes at least one new checkpoint before the kill, so that the run gets on whatever --kills is.
                 while process.poll() is None and not set(checkpoints.glob("step-*")) - known:
                     time.sleep(0.01)
                 # Up to about as long as five steps take.

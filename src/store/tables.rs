@@ -221,7 +221,7 @@ rows! {
         settings: Option<String>, "JSON", "What determines the motion beside its music, the model's weights and the seed: sampler, guidance, candidates, style, overlap, priming, post-processing, and of constraints the digest. None where release 0.1 made it.";
         content_hash: Option<String>, "BLAKE3", "`content_hash` of the phrase that it was made for, as it was then; where `phrases` has another, the motion is for music that was replaced. None in rows of versions 1 and 2.";
         n_dancers: Option<i32>, "dancers", "Dancers in the motion, 1 of a soloist. None in rows of versions before 4, where it is 1.";
-        consistency: Option<f64>, "", "γ, the guidance towards consistency (above 0) or diversity (below 0), from -1 to 1; none where it was not asked for.";
+        consistency: Option<f64>, "", "Of a model of groups γ, the guidance towards consistency (above 0) or diversity (below 0), from -1 to 1; of several dancers by a model of tokens the share of the first dancer's tokens that the others keep, from 0 to 1; none otherwise.";
         time: TimestampUs, "", "When it was made.";
     }
 }

@@ -1,4 +1,4 @@
-//! A commit, a compaction or a vacuum that is stopped at any of its writes loses nothing, and whoever comes next ends it.
+//! A commit, a compaction or a vacuum may stop at any of its writes: nothing is lost, and the same work run again completes it.
 
 use std::fmt;
 use std::sync::Arc;
@@ -22,14 +22,14 @@ use super::catalogue::{StageContents, history};
 use super::commits::{STAGE, item, ledger, outcome};
 use super::compaction::said;
 
-/// A store in memory that refuses every write but the first few.
+/// A store in memory that accepts the first writes and refuses all later ones.
 #[derive(Debug)]
 struct Stopping {
     inner: Arc<InMemory>,
     writes: Arc<Writes>,
 }
 
-/// Writes that are allowed, and those that were asked for.
+/// How many writes are accepted, and how many were requested.
 #[derive(Debug)]
 struct Writes {
     n_allowed: usize,
@@ -177,8 +177,10 @@ fn commits(location: &Location) -> std::result::Result<(), StoreError> {
     commit.publish().map(|_| ())
 }
 
-/// Does work on copies of a store, each stopped one write later, and returns how many writes it takes. What is said
-/// stays as it was until the work is done, and whoever does it next leaves what one that was not stopped leaves.
+/// Runs `work` on copies of a store and stops it after 0, 1, 2, … writes; returns how many writes it takes in all.
+///
+/// After every stop a reader sees the store either as it was before or as it is when the work is done. The same work,
+/// run again without a stop, ends in the same state as work that never stopped.
 fn stopped_everywhere(memory: &InMemory, work: Work) -> usize {
     let whole = Arc::new(memory.fork());
     let before = said(&location_of(&whole));

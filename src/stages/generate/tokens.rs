@@ -407,7 +407,7 @@ impl TokensMaker<'_> {
         let asked = dancers.iter().map(|dancer| dancer.constraints.as_ref());
         for (mut dancer, asked) in frames.outer_iter_mut().zip(asked) {
             if let Some(constraints) = asked.filter(|_| is_kept) {
-                // Only now is it smooth, and what is missing yet too; what follows from poses follows again.
+                // After smoothing, so that the correction is smooth, too; velocities then follow from the poses again.
                 let mut motion = dancer.to_owned();
                 steer(constraints, &mut motion, 0, Steering::Finish);
                 process(&postprocess.without_smoothing(), &mut motion, bars);

@@ -189,7 +189,7 @@ fn make_all(
         let clock = clock.map(|clock| clock.view());
         let heard = condition(card.planner.condition(), window.features.view(), clock);
         let track = TokenTrack {
-            // As for a UNet without its phase, which would tell what it is asked to make.
+            // Without the phase, as for a UNet: it would tell the network what it is asked to make.
             style: settings.style,
             ..TokenTrack::new(
                 heard.view(),
