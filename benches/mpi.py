@@ -4,8 +4,9 @@
     benches/mpi.py --motiongen target/debug/motiongen --store build/demo/store --preset base --steps 12
 
 The store is copied; runs go into the copy. Both train with the same parts (--side-by-side 2), so they end with the same bits,
-which is checked. Times are medians over the steps behind the first three, from the table of training; memory is the
-largest VmHWM and the last VmRSS before the end of each rank, from /proc.
+which is checked. Times are medians over the steps behind the first three, from the table of training, as is the memory of the first
+rank behind each of these steps. The second only waits behind the last step, so that its memory is the median of the greater
+half of VmRSS in /proc. "At most" is VmHWM of the whole run, validation and checkpoints included.
 """
 
 import argparse
@@ -21,7 +22,7 @@ HERE = pathlib.Path(__file__).resolve().parent.parent
 
 
 def ranks_of(motiongen, store):
-    """Processes of motiongen that train in a store: process number → (VmRSS, VmHWM) in bytes."""
+    """Processes of motiongen that train in a store: rank → (VmRSS, VmHWM) in bytes."""
     found = {}
     for entry in pathlib.Path("/proc").iterdir():
         if not entry.name.isdigit():
@@ -30,12 +31,15 @@ def ranks_of(motiongen, store):
             words = (entry / "cmdline").read_bytes().split(b"\0")
             if words[0] != str(motiongen).encode() or str(store).encode() not in words:
                 continue
+            environment = (entry / "environ").read_bytes().split(b"\0")
             lines = (entry / "status").read_text().splitlines()
         except OSError:
             continue
         sizes = {line.split(":")[0]: line.split()[1] for line in lines if line.startswith("Vm")}
         if "VmRSS" in sizes:
-            found[int(entry.name)] = (int(sizes["VmRSS"]) * 1024, int(sizes["VmHWM"]) * 1024)
+            # Open MPI says it so; a process by itself is the first.
+            rank = next((line.split(b"=")[1] for line in environment if line.startswith(b"OMPI_COMM_WORLD_RANK=")), b"0")
+            found[int(rank)] = (int(sizes["VmRSS"]) * 1024, int(sizes["VmHWM"]) * 1024)
     return found
 
 
@@ -45,8 +49,8 @@ def run(motiongen, command, store):
     process = subprocess.Popen(command)
     seen = {}
     while process.poll() is None:
-        for pid, sizes in ranks_of(motiongen, store).items():
-            seen.setdefault(pid, []).append(sizes)
+        for rank, sizes in ranks_of(motiongen, store).items():
+            seen.setdefault(rank, []).append(sizes)
         time.sleep(0.25)
     if process.returncode != 0:
         raise SystemExit(f"{' '.join(map(str, command))} ended with {process.returncode}")
@@ -54,15 +58,17 @@ def run(motiongen, command, store):
     def memory(sizes):
         resident = sorted(rss for rss, _ in sizes)
         return statistics.median(resident[len(resident) // 2:]), max(peak for _, peak in sizes)
-    return time.monotonic() - started, [memory(seen[pid]) for pid in sorted(seen)]
+    return time.monotonic() - started, [memory(seen[rank]) for rank in sorted(seen)]
 
 
 def steps(motiongen, store, name, batch_size):
-    """Seconds of each step but the first three."""
-    sql = f"SELECT samples_per_s FROM training_log WHERE run = '{name}' AND stage = 'diffusion' AND kind = 'step' ORDER BY step"
+    """Each step but the first three: (seconds, resident bytes of the first rank)."""
+    sql = ("SELECT samples_per_s, rss_bytes FROM training_log "
+           f"WHERE run = '{name}' AND stage = 'diffusion' AND kind = 'step' ORDER BY step")
     told = subprocess.run([motiongen, "query", "--store", store, sql, "--format", "csv"], check=True,
                           capture_output=True, text=True).stdout.split()
-    return [batch_size / float(rate) for rate in told[1:]][3:]
+    rows = [line.split(",") for line in told[1:]]
+    return [(batch_size / float(rate), int(rss)) for rate, rss in rows][3:]
 
 
 def main():
@@ -90,7 +96,9 @@ def main():
                 name = f"{what[0]}-{turn}"
                 command = [*start, motiongen, *usual, "--run", name, "--threads", threads]
                 wall_s, memory = run(motiongen, list(map(str, command)), store)
-                times = steps(motiongen, store, name, arguments.batch_size)
+                taken = steps(motiongen, store, name, arguments.batch_size)
+                times = [seconds for seconds, _ in taken]
+                memory[0] = statistics.median(rss for _, rss in taken), memory[0][1]
                 told = ", ".join(f"{rss / 1e6:.0f} MB (at most {peak / 1e6:.0f})" for rss, peak in memory)
                 print(f"{what}: step {statistics.median(times):.3f} s (of {len(times)}, {min(times):.3f} to {max(times):.3f}), "
                       f"memory {told}, whole run {wall_s:.0f} s", flush=True)

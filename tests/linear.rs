@@ -45,8 +45,8 @@ fn put_model(store: &Location) {
     }
 }
 
-/// Returns what every stage asks of a store of `n` phrases.
-fn costs(n: usize) -> BTreeMap<&'static str, Traffic> {
+/// Writes the motion and the features of `n` phrases.
+fn write_source(n: usize) -> Dir {
     let dir = Dir::new();
     for i in 0..n {
         let id = format!("p{:05}", i * 7919 % 100_003);
@@ -54,23 +54,49 @@ fn costs(n: usize) -> BTreeMap<&'static str, Traffic> {
         dir.write(format!("source/motion/{id}/trajectory.npy"), trajectory(&frames));
         dir.write(format!("source/audio_features/{id}/features.npz"), features_npz(N_FRAMES));
     }
-    let name = format!("linear-{n}");
-    let url = format!("memory://{name}");
+    dir
+}
+
+type Costs = BTreeMap<&'static str, Traffic>;
+
+/// Counts what a piece of work asks of the store in memory of that name.
+fn count(costs: &mut Costs, store: &str, what: &'static str, work: &dyn Fn()) {
+    let before = memory_traffic(store);
+    work();
+    let after = memory_traffic(store);
+    let cost = Traffic {
+        n_requests: after.n_requests - before.n_requests,
+        read_bytes: after.read_bytes - before.read_bytes,
+    };
+    costs.insert(what, cost);
+}
+
+/// Fails where the second costs are more than `MOST` times the first.
+#[track_caller]
+fn assert_linear(once: &Costs, twice: &Costs) {
+    let (mut dear, mut all) = (Vec::new(), String::new());
+    for (what, once) in once {
+        let twice = &twice[what];
+        let bytes = twice.read_bytes as f64 / once.read_bytes.max(1) as f64;
+        let requests = twice.n_requests as f64 / once.n_requests.max(1) as f64;
+        all += &format!("{what}: {once:?}, {twice:?}: {bytes:.2}, {requests:.2}\n");
+        if bytes > MOST || requests > MOST {
+            dear.push(what);
+        }
+    }
+    assert!(dear.is_empty(), "{dear:?} cost more than {MOST} times as much:\n{all}");
+}
+
+/// Returns what every stage asks of a store of `n` phrases.
+fn costs(n: usize) -> Costs {
+    let dir = write_source(n);
+    let (name, url) = (format!("linear-{n}"), format!("memory://linear-{n}"));
     put_model(&Location::open(&url, &ClientOptions::default()).expect("a store"));
     let store = format!("--store={url}");
     let source = format!("--source={}", dir.at("source").display());
     let page = format!("--output={}", dir.at("page.html").display());
     let mut costs = BTreeMap::new();
-    let mut count = |what: &'static str, work: &dyn Fn()| {
-        let before = memory_traffic(&name);
-        work();
-        let after = memory_traffic(&name);
-        let cost = Traffic {
-            n_requests: after.n_requests - before.n_requests,
-            read_bytes: after.read_bytes - before.read_bytes,
-        };
-        costs.insert(what, cost);
-    };
+    let mut count = |what, work: &dyn Fn()| count(&mut costs, &name, what, work);
     let ingest = [store.as_str(), &source, "--batch-phrases=8"];
     count("ingest", &|| run_stage::<Ingest>(&ingest));
     count("ingest again", &|| run_stage::<Ingest>(&ingest));
@@ -88,7 +114,8 @@ fn costs(n: usize) -> BTreeMap<&'static str, Traffic> {
     count("tokenize", &|| run_stage::<Tokenize>(&[&store, "--run=t"]));
     count("tokenize again", &|| run_stage::<Tokenize>(&[&store, "--run=t"]));
     count("evaluate", &|| run_stage::<Evaluate>(&[&store, "--run=g", "--quick"]));
-    count("library", &|| run_stage::<Library>(&[&store, "--compose=1", "--takes=1"]));
+    let composed = format!("--compose={}", n / 64);
+    count("library", &|| run_stage::<Library>(&[&store, &composed, "--takes=1"]));
     count("view", &|| run_stage::<View>(&[&store, "--phrase=p00000", &page]));
     #[cfg(feature = "query")]
     count("query", &|| run_stage::<Query>(&[&store, "select count(*) from phrases"]));
@@ -97,18 +124,46 @@ fn costs(n: usize) -> BTreeMap<&'static str, Traffic> {
 
 #[test]
 fn twice_the_phrases_cost_twice_as_much() {
-    let (once, twice) = (costs(256), costs(512));
-    let (mut dear, mut all) = (Vec::new(), String::new());
-    for (what, once) in &once {
-        let twice = &twice[what];
-        let bytes = twice.read_bytes as f64 / once.read_bytes.max(1) as f64;
-        let requests = twice.n_requests as f64 / once.n_requests.max(1) as f64;
-        all += &format!("{what}: {once:?}, {twice:?}: {bytes:.2}, {requests:.2}\n");
-        if bytes > MOST || requests > MOST {
-            dear.push(what);
-        }
-    }
-    assert!(dear.is_empty(), "{dear:?} cost more than {MOST} times as much:\n{all}");
+    assert_linear(&costs(256), &costs(512));
+}
+
+/// Returns what stages whose batches hold up to 512 phrases ask of a store of `n` phrases, without the ingest.
+fn costs_of_large_batches(n: usize) -> Costs {
+    let dir = write_source(n);
+    let (name, store) = (format!("large-{n}"), format!("--store=memory://large-{n}"));
+    run_stage::<Ingest>(&[&store, &format!("--source={}", dir.at("source").display())]);
+    let mut costs = BTreeMap::new();
+    let mut count = |what, work: &dyn Fn()| count(&mut costs, &name, what, work);
+    count("extract", &|| run_stage::<Extract>(&[&store]));
+    count("extract again", &|| run_stage::<Extract>(&[&store]));
+    let tokens = ["--family=tokens", "--run=t", "--preset=tiny", "--steps=1", "--batch-size=2"];
+    run_stage::<Train>(&[&[store.as_str(), "--window-frames=24"][..], &tokens].concat());
+    count("tokenize", &|| run_stage::<Tokenize>(&[&store, "--run=t"]));
+    costs
+}
+
+#[test]
+fn twice_the_batches_of_512_phrases_cost_twice_as_much() {
+    assert_linear(&costs_of_large_batches(1031), &costs_of_large_batches(2062));
+}
+
+/// Returns what a stage would cost that read the whole store for each 64 phrases, as `generate` of 0.1 did.
+fn costs_of_a_quadratic_stage(n: usize) -> Costs {
+    let dir = write_source(n);
+    let (name, store) = (format!("quadratic-{n}"), format!("--store=memory://quadratic-{n}"));
+    let source = format!("--source={}", dir.at("source").display());
+    run_stage::<Ingest>(&[&store, &source, "--batch-phrases=8"]);
+    run_stage::<Extract>(&[&store]);
+    let mut costs = BTreeMap::new();
+    let extract = || (0..n / 64).for_each(|_| run_stage::<Extract>(&[&store]));
+    count(&mut costs, &name, "extract", &extract);
+    costs
+}
+
+#[test]
+#[should_panic(expected = "[\"extract\"] cost more than 2.2 times as much")]
+fn a_stage_that_reads_everything_for_each_batch_is_refused() {
+    assert_linear(&costs_of_a_quadratic_stage(131), &costs_of_a_quadratic_stage(262));
 }
 
 /// Requests that counting a table and looking a phrase up may take each; opening a phrase's page over a network takes

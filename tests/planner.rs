@@ -314,6 +314,16 @@ fn mistakes_are_named() {
              the family unet",
         ),
         (
+            &["--dancers=2", "--consistency-scale=0.5"],
+            "--consistency-scale: model m is of the family tokens, which does not know it; leave it out, or name a model \
+             of the family group",
+        ),
+        (
+            &["--dancers=2", "--consistency-form=mean"],
+            "--consistency-form: model m is of the family tokens, which does not know it; leave it out, or name a model \
+             of the family group",
+        ),
+        (
             &["--plan-iterations=0"],
             "tokens are drawn in 0 iterations; it must be 1 to 100000, and 10 are usual",
         ),

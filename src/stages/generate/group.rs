@@ -54,6 +54,13 @@ pub fn refuse_for_soloists(params: &Params, model: &str) -> anyhow::Result<()> {
     if let Some(gamma) = params.consistency {
         bail!("--consistency {gamma}: model {model} {is_group}, or leave --consistency out");
     }
+    let of_gamma = [
+        ("--consistency-form", params.consistency_form.is_some()),
+        ("--consistency-scale", params.consistency_scale.is_some()),
+    ];
+    if let Some((flag, _)) = of_gamma.into_iter().find(|(_, is_given)| *is_given) {
+        bail!("{flag}: model {model} {is_group}, or leave {flag} out");
+    }
     Ok(())
 }
 
@@ -110,8 +117,9 @@ impl GroupSettings {
             "--consistency {consistency} is not from -1 to 1; give -1 for dancers who go each a way of their own, 1 \
              for unison"
         );
-        let consistency_form = ConsistencyForm::from(params.consistency_form);
-        let consistency_scale = params.consistency_scale;
+        let consistency_form =
+            params.consistency_form.map(ConsistencyForm::from).unwrap_or_default();
+        let consistency_scale = params.consistency_scale.unwrap_or(1.0);
         ensure!(
             consistency_scale.is_finite() && consistency_scale >= 0.0,
             "--consistency-scale {consistency_scale} is no factor; give a number from 0 up"

@@ -36,9 +36,8 @@ pub enum SamplerName {
 }
 
 /// The forms of --consistency by the names of the flag.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum ConsistencyFormName {
-    #[default]
     Direction,
     Estimate,
     Noise,
@@ -166,14 +165,13 @@ pub struct Params {
     pub consistency: Option<f64>,
     /// What --consistency moves at every step: the estimate, by a set length along the gradient, or by the gradient as it
     /// is; or, more slowly, the noise that is predicted (Dhariwal and Nichol) or the mean of the step (the paper), by the
-    /// gradient through the network.
-    #[arg(long, value_name = "FORM", value_enum, default_value_t, help_heading = "Groups",
-          hide_short_help = RARE)]
-    pub consistency_form: ConsistencyFormName,
+    /// gradient through the network. For a model of the family group [default: direction]
+    #[arg(long, value_name = "FORM", value_enum, help_heading = "Groups", hide_short_help = RARE)]
+    pub consistency_form: Option<ConsistencyFormName>,
     /// How far --consistency 1 or -1 goes: standard deviations of what is open yet a step, by a direction; a factor of the
-    /// gradient, by the other forms.
-    #[arg(long, value_name = "S", default_value_t = 1.0, help_heading = "Groups", hide_short_help = RARE)]
-    pub consistency_scale: f64,
+    /// gradient, by the other forms. For a model of the family group [default: 1]
+    #[arg(long, value_name = "S", help_heading = "Groups", hide_short_help = RARE)]
+    pub consistency_scale: Option<f64>,
     /// Let bodies touch where they were sampled so, instead of moving them apart.
     #[arg(long, help_heading = "Groups", hide_short_help = RARE)]
     pub no_separation: bool,

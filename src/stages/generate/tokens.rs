@@ -125,6 +125,8 @@ impl TokensSettings {
         let only_others = [
             ("--prime", params.prime.is_some(), "unet"),
             ("--best-of", params.best_of.get() > 1, "unet"),
+            ("--consistency-form", params.consistency_form.is_some(), "group"),
+            ("--consistency-scale", params.consistency_scale.is_some(), "group"),
         ];
         if let Some((flag, _, family)) = only_others.into_iter().find(|(_, is_given, _)| *is_given)
         {
