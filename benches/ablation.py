@@ -2,7 +2,7 @@
 """Measures what each choice of the pipeline brings on songs that nothing was learned from.
 
     make bench-ablation                                        builds first; hours
-    python benches/ablation.py --bin target/release/motiongen --seeds 0 --only clock,default
+    python benches/ablation.py --bin target/release/motiongen --seeds 0 --only 'clock;default'
 
 Each row trains the preset `tiny` anew for every seed through the commands that a user has: ingest, extract,
 library, train, export, generate, evaluate. By steps, so that a busy machine measures the same. What is done is

@@ -57,8 +57,8 @@ pub fn smoothest(n: usize, n_pinned: usize, missing: &[Missing], closeness: Clos
     let variances = [position, velocity, acceleration, 1.0, REACH_FRAMES.powi(-6)];
     let mut known: Vec<Option<f64>> = vec![None; n];
     known[..n_pinned.min(n)].fill(Some(0.0));
-    for of in missing.iter().filter(|of| of.derivative == 0 && of.frame < n) {
-        known[of.frame] = (closeness == Closeness::Exact).then_some(of.value);
+    for asked in missing.iter().filter(|asked| asked.derivative == 0 && asked.frame < n) {
+        known[asked.frame] = (closeness == Closeness::Exact).then_some(asked.value);
     }
     let mut equations = Vec::with_capacity(2 * n + missing.len());
     let mut add = |first: usize, differences: &[f64], value: f64, group: usize| {
@@ -145,7 +145,7 @@ mod tests {
         assert_eq!(exact(90, &missing), rough);
         // But for two frames, which go between their neighbours.
         let missing: Vec<_> =
-            missing.into_iter().filter(|of| !(40..42).contains(&of.frame)).collect();
+            missing.into_iter().filter(|asked| !(40..42).contains(&asked.frame)).collect();
         let u = exact(90, &missing);
         assert!(
             u.iter().zip(&rough).enumerate().all(|(t, (u, x))| (40..42).contains(&t) || u == x)

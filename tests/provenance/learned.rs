@@ -228,7 +228,8 @@ fn fine_tuning_adds_what_it_learned_from_and_no_more() {
     finetune(&store, &["--num-phrases=4"]);
     let (by_train, by_finetune) = (list(&store, "train"), list(&store, "finetune"));
     let counts = |listed: &LearnedFrom| {
-        [&listed.trained_on, &listed.validated_on].map(|of| (of.songs.len(), of.phrases.len()))
+        [&listed.trained_on, &listed.validated_on]
+            .map(|side| (side.songs.len(), side.phrases.len()))
     };
     assert_eq!(counts(&by_train), [(13, 13), (3, 3)]);
     assert_eq!(counts(&by_finetune), [(4, 4), (3, 3)]);

@@ -78,7 +78,7 @@ impl Rotary {
         x.par_chunks_mut(rows * channels).enumerate().for_each(|(i, chunk)| {
             for (row, x) in chunk.chunks_exact_mut(channels).enumerate() {
                 let frame = (i * rows + row) % frames;
-                let [cos, sin] = [&cosines, &sines].map(|of| &of[frame * dim..][..dim]);
+                let [cos, sin] = [&cosines, &sines].map(|angles| &angles[frame * dim..][..dim]);
                 x[..turned].chunks_exact_mut(dim).for_each(|x| turn_head(x, cos, sin));
             }
         });

@@ -189,10 +189,9 @@ impl TokenGenerator<'_> {
         let given: Vec<Option<u32>> =
             known.into_iter().map(Some).chain(kept.iter().copied()).collect();
         let normalizer = self.tokens.normalizer();
-        let asked = track
-            .constraints
-            .filter(|_| track.control.plans())
-            .and_then(|of| window_constraints(of.constraints, &frames, place, normalizer));
+        let asked = track.constraints.filter(|_| track.control.plans()).and_then(|request| {
+            window_constraints(request.constraints, &frames, place, normalizer)
+        });
         let request = PlanRequest {
             constraints: asked.as_ref().map(|asked| asked.view()),
             condition: track.condition.slice(s![frames.clone(), ..]),
